@@ -25,7 +25,7 @@ from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.render.logs_page import page
+from spelgen.render.arm_pages import logs_page
 from spelgen.settings.log_mapping import LogMapping
 
 
@@ -192,7 +192,7 @@ def test_the_page_tells_what_the_text_tells_and_draws_every_joint(loaded, arm, l
     result = check_logs(
         [hostile, replace(log, name="b", t=np.where(np.arange(2000) > 999, log.t + 2, log.t))], loaded
     )
-    shown = Page(page(result, arm, np.eye(3)))
+    shown = Page(logs_page(result, arm, np.eye(3)))
     assert shown.links == ["data:,", "#top"]
     assert (
         shown.tags.count("svg") == 2 * 3 * 3 + 2 * 3

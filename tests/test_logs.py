@@ -17,9 +17,9 @@ from spelgen.errors import LogError, SpelgenErrors
 from spelgen.logs.checks import check
 from spelgen.logs.filtering import low_pass, regular_times, resampled
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
+from spelgen.logs.tuning import shows_accelerations
 from spelgen.logs.windows import cut_windows, split_validation
 
 JOINTS = ("a", "b")

@@ -15,7 +15,6 @@ import numpy as np
 
 from spelgen.arm.arm import Chain
 from spelgen.arm.rational import IDENTITY, ZERO, turn_about
-from spelgen.certificate.tuning import TUNING
 
 
 def is_plain(arm: Chain) -> bool:
@@ -34,7 +33,8 @@ class Axes:
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
         generator = random.Random(0)  # reproducible reports
         # per configuration: directions (n, 3) and twists (n, 6) of the axes
-        self._configurations = [_configuration(arm, generator) for _ in range(TUNING.configurations)]
+        # two are enough: each alone fails to refute with a probability of about the degree divided by 1e6
+        self._configurations = [_configuration(arm, generator) for _ in range(2)]
 
     def parallel(self, a: int, b: int) -> bool:
         return all(_are_parallel(axes[a], axes[b]) for axes, _ in self._configurations)
@@ -120,13 +120,16 @@ def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarra
     angular velocity (3,). All numbers are rational.
     """
     axes, twists = [], []
+    numbers = range(
+        1, 10**6
+    )  # numerators and denominators: the more, the rarer is a relation that holds by chance
     rotation, origin = IDENTITY, ZERO
     for body in arm.bodies:
         origin = origin + rotation @ np.array(body.translation)
         rotation = rotation @ np.array(body.rotation)
         axis = rotation[:, 2]
         axes.append(axis)
-        t = Fraction(generator.randrange(1, TUNING.grid), generator.randrange(1, TUNING.grid))
+        t = Fraction(generator.choice(numbers), generator.choice(numbers))
         if body.joint_type == "prismatic":
             twists.append(np.concatenate([axis, ZERO]))
             origin = origin + t * axis

@@ -32,10 +32,6 @@ class BristleReach:
         return int(self.values.shape[1])
 
 
-# Samples that are computed at a time: several arrays of this size are in memory.
-BLOCK = 2**14
-
-
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
     """Return the typical break-away displacements, (n, K) [rad, m], of joints of these types; motors: C, (n, n)."""
     return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
@@ -79,8 +75,9 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
         at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
-    for start in range(0, len(q), BLOCK):
-        block = slice(start, start + BLOCK)
+    size = 2**14  # samples that are computed at a time: several arrays of this size are in memory
+    for start in range(0, len(q), size):
+        block = slice(start, start + size)
         corner = latest[block], drives
         moved = torch.from_numpy(path[block] - turned_at[corner])
         z[block] = moved_bristles(turned_with[corner], moved[..., None], reach).numpy()

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from spelgen.design import BREAKAWAY
-from spelgen.settings.joint import JointSettings
+from spelgen.settings.settings import JointSettings
 
 
 class DampedJoint(Protocol):
@@ -87,9 +87,6 @@ def joint_friction(
 
 BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolute"])))
 
-# [rad/s, m/s] Velocity at which the additional dry friction of slow motion has fallen to 1/e.
-STRIBECK_VELOCITY = 0.1
-
 
 @dataclass(frozen=True)
 class FrictionModel:
@@ -155,7 +152,8 @@ class FrictionModel:
             dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
         effects = [rise, speed, *dry, np.ones_like(speed)]
         if self.stribeck:
-            effects.append(sign * np.exp(-((speed / STRIBECK_VELOCITY) ** 2)))
+            # falls to 1/e at 0.1 rad/s or m/s
+            effects.append(sign * np.exp(-((speed / 0.1) ** 2)))
         if self.polynomial:
             effects += [speed * np.abs(speed), speed**3]
         return np.stack(effects, axis=-2)

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.dynamics.protocol import residual_terms
-from spelgen.runtime.masked_mlp import MaskedMLP
-from spelgen.runtime.parts import Network
-from spelgen.runtime.residual_dynamics import ResidualDynamics
+from spelgen.runtime.networks import MaskedMLP, MaskedNetwork
+from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.residual_terms import ResidualDynamics
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,8 @@ def without_idle_residuals(model: Model) -> Model:
     return reduced
 
 
-def _is_idle(network: Network | None) -> bool:
-    """Return whether a network is zero for all inputs; a network that does not exist is."""
+def _is_idle(network: MaskedNetwork | None) -> bool:
+    """Return True if a network is zero for all inputs; a network that does not exist is."""
     if not isinstance(network, MaskedMLP):
         return network is None
     # Only the last layer counts: hidden layers start at random weights.
@@ -118,13 +118,11 @@ def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
         return torch.zeros_like(q)
     terms = model.residuals
     pose = terms.at(q, model.prepare().residual)
-    torque: Tensor = (pose.mass @ qdd.unsqueeze(-1)).squeeze(-1) + terms.nonlinear(pose, qd)
-    return torque
+    return applied(pose.mass, qdd) + terms.nonlinear(pose, qd)
 
 
 def friction_factor(model: object, q: Tensor) -> Tensor:
     """Return the factor of the residual terms on friction, (..., n), at q (..., n)."""
     if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.ones_like(q)
-    factor: Tensor = model.residuals.at(q, model.prepare().residual).friction
-    return factor
+    return model.residuals.at(q, model.prepare().residual).friction

@@ -24,7 +24,7 @@ from spelgen.urdf.read import read_urdf
 
 
 def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
-    """Return the method for states (..., n) that are arrays or tensors; their batches are broadcast."""
+    """Decorate a method of arrays so that states (..., n) may be tensors, and their batches are broadcast."""
 
     @wraps(method)
     def on_arrays(self: PinocchioDynamics, *states: Any) -> object:
@@ -135,10 +135,6 @@ class PinocchioDynamics:
         return result.reshape(*batch, *result.shape[1:])
 
 
-# Width of the tanh in place of the sign of the velocity, for Coulomb friction of a URDF [rad/s, m/s].
-COULOMB_SMOOTHING_VELOCITY = 0.05
-
-
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
     """Return the dynamics of these joints of a URDF and of their mimic joints; all other joints are locked at zero.
 
@@ -160,11 +156,12 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
         if name in by_joint:
             model.armature[model.joints[model.getJointId(name)].idx_v] = by_joint[name].armature
     moving = [robot.joint[name] for name in joints]
-    friction = joint_friction(moving, by_joint, COULOMB_SMOOTHING_VELOCITY, speeds)
+    # width of the tanh in place of the sign of the velocity [rad/s, m/s]
+    friction = joint_friction(moving, by_joint, 0.05, speeds)
     return PinocchioDynamics(model, constraint, friction, motors.inputs)
 
 
 def drives_known(urdf: Path, joints: Sequence[str]) -> bool:
-    """Return whether the settings of a URDF specify rotors or friction of these joints."""
+    """Return True if the settings of a URDF specify rotors or friction of these joints."""
     drives = load_settings(urdf).joints
     return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in drives.items() if k in joints)

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard, runtime_che
 import torch
 
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
-from spelgen.runtime.residual_dynamics import ResidualDynamics
-from spelgen.runtime.residual_terms import ResidualTerms
+from spelgen.runtime.residual_terms import ResidualDynamics, ResidualTerms
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
@@ -65,7 +64,7 @@ def residual_terms(model: object) -> ResidualTerms | None:
 
 
 def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
-    """Return whether friction depends on the state z of bristles, the last argument of all calls."""
+    """Return True if friction depends on the state z of bristles, the last argument of all calls."""
     return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 
 

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Body, make_arm
+from spelgen.arm.arm import Body, lump_links, make_arm
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.tip import last_link
 
 

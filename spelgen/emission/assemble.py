@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -13,10 +14,9 @@ from torch import Tensor
 from spelgen import runtime
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.dynamics.prepared import PreparedModel
-from spelgen.emission.entry_sums import Sums, entry_sums
-from spelgen.emission.parts import base_class, model_parts
+from spelgen.emission.parts import Sums, base_class, entry_sums, model_parts
 from spelgen.emission.source import Call, Code
-from spelgen.emission.text import header
+from spelgen.emission.text import header, read_source, require_unedited
 from spelgen.errors import ModuleError
 from spelgen.labels import printable
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
@@ -69,6 +69,17 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
         raise ModuleError(f"a specification of no model ({reason})", do="build it again") from problem
     model.spec = spec
     return model
+
+
+def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
+    """Return the model of a module that `spelgen build` wrote, with the initial weights of ``seed``.
+
+    module: the file, or its text. Raises ModuleError for a file that was edited or is no such module.
+    """
+    is_text = isinstance(module, str) and "\n" in module
+    file = None if is_text else Path(module)
+    text = str(module) if file is None else read_source(file)
+    return assemble(require_unedited(text, file), seed)
 
 
 def spec_of(model: object) -> ModelSpec | None:

@@ -6,7 +6,6 @@ import json
 from dataclasses import dataclass
 
 WIDTH = 110
-_FEW = 3  # equal items that are written one by one
 _STEP = 4  # blanks per level of indentation
 SKIP = "  # fmt: skip"  # for ruff: numbers are read row by row
 
@@ -97,8 +96,8 @@ def _items(value: object) -> list[tuple[str, object]]:
 
 
 def _alike(value: object) -> bool:
-    """Test whether a value is a tuple of equal items."""
-    return isinstance(value, tuple) and len(value) > _FEW and value.count(value[0]) == len(value)
+    """Test whether a value is a tuple of equal items, of which more than three are written as a product."""
+    return isinstance(value, tuple) and len(value) > 3 and value.count(value[0]) == len(value)
 
 
 def _joined(value: object) -> str:

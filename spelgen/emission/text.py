@@ -1,20 +1,24 @@
-"""ModelSpec -> the text of a module. Pure: the same specification gives the same bytes.
+"""ModelSpec -> the text of a module, and back. Pure: the same specification gives the same bytes.
 
-Text from a URDF becomes string literals and JSON strings in docstrings, never code.
+Text from a URDF becomes string literals and JSON strings in docstrings, never code. Nothing of a module's file is
+executed.
 """
 
 from __future__ import annotations
 
+import ast
 import json
 import re
+from pathlib import Path
 from textwrap import fill, wrap
 
-from spelgen.emission.entry_sums import Sums, entry_sums, term_names
-from spelgen.emission.parts import ModelParts, model_parts
+from spelgen.emission.parts import ModelParts, Sums, entry_sums, model_parts, term_names
 from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call
 from spelgen.emission.standalone import bundle, load_runtime
+from spelgen.errors import ModuleError
+from spelgen.files import read_bytes
 from spelgen.labels import counted, entry_name, joint_ranges, joints_in_ranges
-from spelgen.spec import ModelSpec
+from spelgen.spec import ModelSpec, spec_from_json
 from spelgen.templates import render
 
 _UNITS = {"revolute": ("rad", "Nm"), "prismatic": ("m", "N")}
@@ -38,6 +42,9 @@ _EXAMPLE = """\
     tau = model.inverse_dynamics(q, qd, qdd)
     V = model.potential_energy(q)  # (100,) [J]
     H = model.hamiltonian(q, model.momentum(q, qd))"""
+# Largest module that is read [bytes]: the largest that `spelgen build` writes has a tenth.
+MAX_MODULE = 2**22
+_EXPECTED = "a module written by this version of `spelgen build`"
 
 
 def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
@@ -220,3 +227,58 @@ def _number(value: float) -> str:
     # Six digits if they are exact: URDFs have few digits.
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
+
+
+def read_source(path: Path) -> str:
+    """Return the text of the module at ``path``. Raises ModuleError."""
+    if not path.exists():
+        raise ModuleError("no such file", file=path, do="build it with `spelgen build`")
+    content = read_bytes(path, ModuleError, _EXPECTED, MAX_MODULE)
+    try:
+        return content.decode("utf-8").replace("\r\n", "\n")
+    except ValueError as problem:
+        raise _no_module(problem, path) from None
+
+
+def read_spec(path: Path | str) -> ModelSpec:
+    """Return the specification in the module at ``path``. Raises ModuleError."""
+    return parse_spec(read_source(Path(path)), Path(path))
+
+
+def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
+    """Return the specification in the text of a module, which may be edited. Raises ModuleError."""
+    try:
+        for node in ast.parse(text).body:
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
+                names = [target.id for target in node.targets if isinstance(target, ast.Name)]
+                if names == ["FACTS"]:
+                    raise ModuleError(
+                        "a module of an earlier version of spelgen", file=file, expected=_EXPECTED,
+                        do="build it again with `spelgen build`, and train it again",
+                    )  # fmt: skip
+                if names == ["SPEC"]:
+                    return spec_from_json(str(node.value.value), file)
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
+        raise _no_module(problem, file) from None
+    raise _no_module(None, file)
+
+
+def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
+    """Return the specification in the text of a module. Raises ModuleError if the text differs from its module."""
+    spec = parse_spec(text, file)
+    if text in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
+        return spec
+    raise ModuleError(
+        "a module that was edited, or written by another version of spelgen", file=file, expected=_EXPECTED,
+        do="build it again, or use the edited one from Python: `from MODULE import Model; spelgen.fit(Model(), logs)`",
+    )  # fmt: skip
+
+
+def _no_module(problem: Exception | None, file: Path | None) -> ModuleError:
+    reason = f" ({type(problem).__name__})" if problem is not None else ""
+    return ModuleError(
+        f"no specification of spelgen in it{reason}",
+        file=file,
+        expected=_EXPECTED,
+        do="build it again, or check the path",
+    )

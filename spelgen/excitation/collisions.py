@@ -15,10 +15,9 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from spelgen.arm.arm import Chain
+from spelgen.arm.arm import Chain, lump_links
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.pinocchio_arm import body_constraint, kinematic_model
 from spelgen.excitation.surroundings import Surroundings
 from spelgen.excitation.trajectory import Motion, MotionBounds

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from pydantic import Field
 
-from spelgen.settings.messages import validated
 from spelgen.settings.values import Group, Number, Positive
-from spelgen.settings.yaml_document import read_document
+from spelgen.settings.yaml_document import read_document, validated
 
 
 class Box(Group):

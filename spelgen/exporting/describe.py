@@ -20,8 +20,15 @@ from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
 from spelgen.dynamics.tip import last_link, tip_kinematics
 from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.errors import RunError
-from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, TrainedModel
-from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.exporting.description import (
+    EntryPoint,
+    Harmonics,
+    Residuals,
+    Servos,
+    SigmoidNetwork,
+    TrainedModel,
+    entry_points,
+)
 from spelgen.listing import Listing
 from spelgen.live.noise import NoiseLevels
 from spelgen.runtime.friction_laws import FrictionConstants
@@ -30,11 +37,9 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 if TYPE_CHECKING:
     from spelgen.dynamics.prepared import PreparedModel
     from spelgen.emission.assemble import ArmModel
-    from spelgen.runtime.encoding import JointEncoding
+    from spelgen.runtime.networks import JointEncoding
     from spelgen.runtime.parts import Layers
     from spelgen.runtime.residual_terms import ResidualTerms
-
-_MAX_NAME_LENGTH = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +157,13 @@ def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _letters_and_digits(text: str) -> str:
-    return re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:_MAX_NAME_LENGTH]
+    # all functions and macros of an export start with it: 40 characters keep their lines readable
+    return re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:40]
 
 
 def array(value: Tensor) -> np.ndarray:
     """Return a copy of a tensor (...,) as a float64 array of the same shape."""
-    values: np.ndarray = value.detach().double().cpu().numpy().copy()
-    return values
+    return np.array(value.detach().double().cpu())
 
 
 def servos_of(model: ArmModel) -> Servos | None:
@@ -203,10 +208,7 @@ def _network(
     """
     if layers is None or not any(tensor.any() for tensor in layers[-1]):
         return None
-    weights, biases = [], []
-    for weight, bias in layers:
-        weights.append(array(weight))
-        biases.append(array(bias))
+    weights, biases = (list(map(array, tensors)) for tensors in zip(*layers, strict=True))
     # inputs become (cos q, sin q, q) of all joints
     first, second = np.hsplit(weights[0], 2)
     slopes, revolute = first * array(encoding.slope), array(encoding.revolute)

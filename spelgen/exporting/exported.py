@@ -71,13 +71,10 @@ class Exported:
         """
         path = Path(path)
         require_fitting(self.to, path)
-        if EXPORTERS[self.to].suffix:
-            paths = [path.with_name(path.stem + name) for name in self.files]
-            outputs = paths
-        else:
-            paths = [path / name for name in self.files]
-            outputs = [path]  # an existing folder is not replaced either
-        for output in outputs:
+        is_folder = not EXPORTERS[self.to].suffix
+        paths = [path / name if is_folder else path.with_name(path.stem + name) for name in self.files]
+        # an existing folder is not replaced either
+        for output in [path] if is_folder else paths:
             if output.exists() and not force:
                 raise RunError("this output exists already", file=output, do="force replaces it")
         for file, content in zip(paths, self.files.values(), strict=True):
@@ -132,11 +129,10 @@ def with_readme(
     title, result = f"Dynamics of {trained.robot} {exporter.title}", f"{'; '.join(summary)}."
     name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"
     text = readme(title, use, trained.joint_names, conventions, result)
-    if example:
-        text += "\n".join(["", "```python", *example, "```", ""]).encode()
-    for table in trained.intervals:
-        lines = map(printable, table.text().splitlines())
-        text += "\n".join(["", "```text", *lines, "```", ""]).encode()
+    blocks = [("python", example)] if example else []
+    blocks += [("text", list(map(printable, table.text().splitlines()))) for table in trained.intervals]
+    for language, lines in blocks:
+        text += "\n".join(["", f"```{language}", *lines, "```", ""]).encode()
     return Exported(to, trained.robot, {**files, name: text}, tuple(summary))
 
 

@@ -72,8 +72,7 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
     # without torch's metadata of each node, two thirds of the file
     for described in (content, content.graph, *content.graph.node):
         described.ClearField("metadata_props")
-    serialised: bytes = content.SerializeToString()
-    return serialised
+    return bytes(content.SerializeToString())
 
 
 @contextmanager

@@ -17,15 +17,12 @@ from spelgen.dynamics.prepared import batched_jacobians
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.entry_points import ENTRY_POINTS
+from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.tuning import TUNING
 from spelgen.structure.nominal import working_range
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
-
-# Speeds of joints without a velocity limit [rad/s], [m/s].
-_NOMINAL_SPEEDS = {"revolute": 1.0, "prismatic": 0.3}
 
 Values = dict[str, np.ndarray]
 """Inputs or outputs of an entry point by name, (states, ...) each."""
@@ -136,7 +133,8 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
 
 def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
     """Return the velocity limits of the URDF, or nominal speeds of joints without a limit, (n,) [rad/s, m/s]."""
-    return np.array([joint.velocity or _NOMINAL_SPEEDS[joint.joint_type] for joint in coordinates])
+    nominal = {"revolute": TUNING.angular_speed, "prismatic": TUNING.linear_speed}
+    return np.array([joint.velocity or nominal[joint.joint_type] for joint in coordinates])
 
 
 def relative(values: np.ndarray, expected: np.ndarray) -> float:

@@ -42,8 +42,7 @@ class NearestFriction(NamedTuple):
     @property
     def coulomb(self) -> np.ndarray:
         """Mean Coulomb friction of both directions, (n,): a URDF and MuJoCo have one number."""
-        mean: np.ndarray = (self.forward - self.backward) / 2
-        return mean
+        return np.asarray((self.forward - self.backward) / 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.entry_points import ENTRY_POINTS, select_names
+from spelgen.exporting.description import ENTRY_POINTS, select_names
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Parity, Values, check_parity
 from spelgen.exporting.tuning import TUNING

@@ -6,8 +6,8 @@ import numpy as np
 import yaml
 from lxml import etree
 
+from spelgen.arm.arm import lump_links
 from spelgen.arm.chain import choose_chain
-from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.body_regressor import about_center
 from spelgen.dynamics.parameters import friction_factor
 from spelgen.exporting.describe import Trained, array
@@ -77,8 +77,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
         _remove(element, "dynamics")
         values = {"damping": _number(friction.viscous[index]), "friction": _number(friction.coulomb[index])}
         etree.SubElement(element, "dynamics", values)
-    text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
-    return text + b"\n"
+    return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8")) + b"\n"
 
 
 def _settings_text(projection: RigidBodyProjection) -> str:
@@ -96,8 +95,7 @@ def _settings_text(projection: RigidBodyProjection) -> str:
         joint["rotor_inertia"] = _rounded(projection.armature[index] / gear**2)
         joint["viscous"] = _rounded(friction.viscous[index])
         joint["coulomb"] = [_rounded(friction.forward[index]), _rounded(friction.backward[index])]
-    text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-    return text
+    return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
 
 def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
@@ -124,8 +122,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         for section, constants in sections.items():
             joints[name][section] = {key: _plain(values[index]) for key, values in constants.items()}
     content["joints"] = joints
-    text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-    return text
+    return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
 
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:

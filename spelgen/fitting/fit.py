@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import FittedBaselines, arm_of_model
-from spelgen.baselines.registry import fit_baselines
+from spelgen.baselines.registry import FittedBaselines, arm_of_model, fit_baselines
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, RunError, SpelgenError
 from spelgen.files import write_json

@@ -22,7 +22,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.messages import validated
+from spelgen.settings.yaml_document import validated
 
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 
@@ -122,9 +122,9 @@ class Objective(ABC):
         self._checkpoint = checkpoint
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Fit until an end is reached, by default at once; call ``save`` to keep a `checkpoint`.
+        """Run the fit until a stopping criterion holds, and return it; call ``save`` to write a `checkpoint`.
 
-        KeyboardInterrupt may end it anywhere.
+        By default nothing is left to do after `begin`. KeyboardInterrupt may be raised at any time.
         """
         return "finished"
 

@@ -13,7 +13,7 @@ from spelgen.fitting.servo.objective import ServoObjective
 from spelgen.fitting.torque.objective import TorqueObjective
 from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.fitting.window.rollout import RolloutObjective
-from spelgen.logs.rates import shows_accelerations
+from spelgen.logs.tuning import shows_accelerations
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig, fit_config
 

@@ -62,7 +62,8 @@ class RunFolder:
         A folder is a run if it has config.json, which is written last. Raises RunError if there is one, unless forced.
         """
         self.require_free(force=force)
-        robot = self._robot_files(urdf)  # before anything is removed: they may be this very run's copies
+        # read before anything is removed: the files may be the copies in this run folder
+        robot = self._robot_files(urdf)
         # first the files that mark a run
         old_files = (
             self.config, self.urdf, self.settings, self.mapping, self.metrics, self.checkpoint, self.weights,

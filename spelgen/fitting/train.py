@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from spelgen.emission.loading import load_module
+from spelgen.emission.assemble import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
 from spelgen.fitting.fit import AUTOMATIC, QUIET, RunOptions, fit, sample_rates
 from spelgen.fitting.fitted import Fit

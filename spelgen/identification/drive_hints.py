@@ -132,7 +132,7 @@ class DriveLog:
 
 @dataclass(frozen=True)
 class Coupling:
-    """Coupling of two joints: the speed of the motor of `joint` is its own joint's plus `ratio` times that of
+    """Coupling of two joints: the motor of `joint` rotates with its own joint and, `ratio` times as fast, with
     `moved_by`.
 
     logged_at: whether logged torques act at the joints, or at the motors (in the units of the joints).
@@ -287,7 +287,7 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
 
 
 def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
-    """Return whether errors per block (B,) fell below the fraction `gain`, significantly for the best candidate."""
+    """Return True if errors per block (B,) fell below the fraction `gain`, significantly for the best candidate."""
     if mended.mean() >= gain * logged.mean():
         return False
     # between -1 and 1, so that no single block dominates

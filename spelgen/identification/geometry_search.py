@@ -114,7 +114,7 @@ def _rank(fit: HypothesisFit) -> float:
 def single_changes(
     problem: GeometryProblem, base: HypothesisFit, scalings: Sequence[Scaling]
 ) -> list[HypothesisFit]:
-    """Return the fits with one change in addition to those of the base."""
+    """Return the fits with one change in addition to the changes of the base."""
     reading = base.hypothesis
     changed = [*_senses(reading), *_swapped(reading), *_scaled(reading, scalings)]
     fits = [problem.fit(hypothesis) for hypothesis in changed]

@@ -46,7 +46,7 @@ def reduce(blocks: Iterable[Columns]) -> Triangles:
 
 
 def varying(tau: np.ndarray) -> np.ndarray:
-    """Return whether torques (S, n) vary by more than the rounding errors of a constant, (n,)."""
+    """Return True if torques (S, n) vary by more than the rounding errors of a constant, (n,)."""
     return np.asarray(tau.std(axis=0) > TUNING.negligible * np.abs(tau).max(axis=0))
 
 

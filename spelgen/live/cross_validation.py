@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import arm_of_model
+from spelgen.baselines.registry import arm_of_model
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
 from spelgen.dynamics.protocol import residual_terms
@@ -84,7 +84,7 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         others = [log for j, other in enumerate(folds) if j != k for log in other]
         tested.append((fitted_to(fit, others), fold))
     levels = find_levels(tested, *limits(arm, fit.model.n))
-    # the digits that a run folder keeps
+    # rounded to the digits that a run folder contains
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
 

@@ -21,9 +21,8 @@ from spelgen.logs.trajectory import Trajectory, joined_column
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 _TIME_CONSTANTS = np.geomspace(0.1, 6.4, 7)  # [s] time constants of the disturbance
-_RATIOS = np.array(
-    [0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5]
-)  # [1] standard deviation of the disturbance divided by that of white noise
+# [1] standard deviation of the disturbance divided by the one of white noise
+_RATIOS = np.array([0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5])
 
 WINDOWS = (25, 50)  # lengths of the trials of the payload filter, in blocks: 5 and 10 s
 

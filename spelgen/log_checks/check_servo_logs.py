@@ -13,10 +13,9 @@ from spelgen.listing import Listing, number
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.logs.checks import Findings, run_checks
-from spelgen.logs.commands import delayed_commands
 from spelgen.logs.filtering import derivative
 from spelgen.logs.joint_signals import is_factor, mapping_line
-from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
+from spelgen.logs.trajectory import Trajectory, delayed_commands, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
 if TYPE_CHECKING:
@@ -145,7 +144,7 @@ class ServoLogs:
             if odd is not None:
                 summary.notes.append(odd)
             for check, found in run_checks(POSITION_CHECKS, JointEvidence(coordinate, report)):
-                summary.add(check, found, f"joint {coordinate.name!r}")
+                summary.add(check, found.message, f"joint {coordinate.name!r}")
         for log in self._logs:
             if log.sample_rate < 20.0:
                 message = f"{log.sample_rate:.3g} Hz: delays and friction need 20 Hz or more"

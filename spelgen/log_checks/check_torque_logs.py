@@ -32,7 +32,6 @@ from spelgen.log_checks.robot_checks import (
 )
 from spelgen.logs.bags import BAG
 from spelgen.logs.checks import Check, Findings, run_checks
-from spelgen.logs.joint_signals import Advice
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_torques, split_at_gaps
@@ -101,7 +100,7 @@ class TorqueLogs:
                 weightless = _without_gravity(problem, evidence)
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
-        has_errors, faults = bool(summary.errors), dict[Check[JointEvidence], dict[str, str | Advice]]()
+        has_errors, faults = bool(summary.errors), dict[Check[JointEvidence], dict[str, str]]()
         for joint in evidence:
             passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
             if has_errors:  # one message per cause
@@ -110,9 +109,9 @@ class TorqueLogs:
                 passed.add(WITHOUT_GRAVITY)
             for check, found in run_checks(CHECKS, joint, passed):
                 if check.severity == "error":
-                    faults.setdefault(check, {})[joint.coordinate.name] = found
+                    faults.setdefault(check, {})[joint.coordinate.name] = found.message
                 else:
-                    summary.add(check, found, f"joint {joint.coordinate.name!r}")
+                    summary.add(check, found.message, f"joint {joint.coordinate.name!r}")
         for check, joints in faults.items():
             where = f"joint {', '.join(map(repr, joints))}, tau"
             summary.add(check, next(iter(joints.values())), where)

@@ -106,7 +106,7 @@ class Remedies:
         return keys
 
     def _change(self, code: str, reading: Hypothesis) -> tuple[np.ndarray, str]:
-        """Return a mask (n,) of the joints that a change affects, and a statement of what the log contains."""
+        """Return a mask (n,) of the joints that a change affects, and a text that describes the content of the log."""
         unchanged, order = self.unchanged, np.arange(len(reading.offset))
         motion = reading.motion_scale / unchanged.motion_scale
         torque = reading.torque_scale / unchanged.torque_scale
@@ -150,7 +150,7 @@ class Remedies:
         return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
     def _is_minor(self, best: Hypothesis) -> bool:
-        """Return whether the difference may be an error of the URDF or of the mounting, not of the log."""
+        """Return True if the difference may be an error of the URDF or of the mounting, not of the log."""
         if best.codes == ("torque-unit",):
             factor = np.abs(np.log(best.torque_scale / self.unchanged.torque_scale)).max()
             return bool(factor < np.log(10.0))  # inertials of a URDF are never so wrong

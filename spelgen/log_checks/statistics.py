@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.tuning import is_dense
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from spelgen.errors import LogError
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings, load_mapping
-from spelgen.settings.yaml_document import YamlDocument
+from spelgen.settings.yaml_document import YamlDocument, validated
 from spelgen.urdf.robot import Robot
 
 GivenMapping = LogMapping | Mapping[str, object] | Path | str | None

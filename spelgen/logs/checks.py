@@ -15,21 +15,25 @@ import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
-from spelgen.logs.joint_signals import Advice, JointSignals, is_factor, joint_keys, mapping_line
-from spelgen.logs.jump_checks import (
+from spelgen.logs.joint_signals import (
+    Advice,
+    JointSignals,
     find_dropouts,
+    find_elastic,
     find_frozen,
-    find_held,
     find_jumps,
-    find_too_rare,
-    find_unsigned_velocity,
+    is_factor,
+    joint_keys,
+    mapping_line,
 )
-from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
-from spelgen.logs.resonance import find_elastic
 from spelgen.logs.trajectory import Trajectory, gap_ends
+from spelgen.logs.tuning import SLOWEST, is_dense, shows_accelerations
 from spelgen.logs.unit_checks import (
+    find_held,
     find_time_unit,
+    find_too_rare,
     find_units,
+    find_unsigned_velocity,
     find_wrong_velocity,
     velocity_agreement,
     velocity_products,
@@ -66,30 +70,34 @@ class Findings:
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
-    def add(self, check: Check[Any], found: str | Advice, where: str, file: Path | None = None) -> None:
-        """Add the finding of a check; to an error, how to accept it. A finding with a line is an error."""
-        do, message = check.do, found if isinstance(found, str) else found.message
-        if isinstance(found, Advice):
-            do = mapping_line(found.keys)
-        elif check.severity != "error":
+    def add(
+        self,
+        check: Check[Any],
+        message: str,
+        where: str,
+        file: Path | None = None,
+        keys: Mapping[str, object] | None = None,
+    ) -> None:
+        """Add the message of a check. With keys of the group `logs` that remedy it, a finding is an error."""
+        if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
             return
-        do = f"{do}; --accept {check.code} if it is right"
+        do = f"{mapping_line(keys) if keys else check.do}; --accept {check.code} if it is right"
         self.errors.append(LogError(message, file=file, element=where, expected=check.expected, do=do))
 
 
 def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
-) -> list[tuple[Check[Subject], str | Advice]]:
-    """Return the checks with a finding, and their findings; accepted: codes of checks that are omitted."""
-    results: dict[str, tuple[Check[Subject], str | Advice]] = {}
+) -> list[tuple[Check[Subject], Advice]]:
+    """Return the checks with a finding, and their findings. accepted: codes of checks that are omitted."""
+    results: dict[str, tuple[Check[Subject], Advice]] = {}
     for check in checks:
         # one message per cause: velocities in degrees would also fail the check of derivatives
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         found = check.find(subject)
         if found is not None:
-            results[check.code] = check, found
+            results[check.code] = check, Advice(found) if isinstance(found, str) else found
     return list(results.values())
 
 
@@ -202,92 +210,64 @@ class LogChecks:
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
         self.products = np.zeros((2 * len(joints),) * 2)
         self._joints, self._kinds = joints, joint_types
-        self._results: dict[tuple[str, Check[Any]], list[tuple[str | Advice, str, Path | None]]] = {}
+        self._results: dict[tuple[str, Check[Any]], list[tuple[Advice, str, Path | None]]] = {}
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
         """Add a trajectory."""
         self._count += 1
-        for clock_check, found in run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted):
-            self._add(str(found), clock_check, found, trajectory)
-        for result, messages in ((REPAIRED, trajectory.repairs), (REMARKED, trajectory.remarks)):
-            for message in messages:
-                self._add(message, result, message, trajectory)
+        found: list[tuple[Check[Any], Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
+        found += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
+        found += [(REMARKED, Advice(message)) for message in trajectory.remarks]
+        for check, advice in found:
+            self._add(advice.message, check, advice, trajectory)
         products = velocity_products(trajectory)
         self.products += products
         factors, correlations = velocity_agreement(products)
         for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
-            columns = trajectory.q[:, k], trajectory.qd[:, k]
-            signals = JointSignals(
-                trajectory, k, kind, self._joints, *columns, factors[k], correlations[:, k].tolist()
-            )
-            for joint_check, found in run_checks(CHECKS, signals, trajectory.accepted):
-                self._add(joint, joint_check, found, trajectory)
+            columns, fits = (trajectory.q[:, k], trajectory.qd[:, k]), correlations[:, k].tolist()
+            signals = JointSignals(trajectory, k, kind, self._joints, *columns, float(factors[k]), fits)
+            for check, advice in run_checks(CHECKS, signals, trajectory.accepted):
+                self._add(joint, check, advice, trajectory)
 
-    def _add(self, group: str, check: Check[Any], found: str | Advice, trajectory: Trajectory) -> None:
-        where = f"trajectory {trajectory.name}"
-        self._results.setdefault((group, check), []).append((found, where, trajectory.file))
+    def _add(self, group: str, check: Check[Any], advice: Advice, trajectory: Trajectory) -> None:
+        occurrence = advice, f"trajectory {trajectory.name}", trajectory.file
+        self._results.setdefault((group, check), []).append(occurrence)
 
     def findings(self) -> Findings:
-        """Return the findings: an error for each check, of all its joints; a note for each joint or message."""
+        """Return the findings: errors per check, with all its joints; notes per check and joint, or message."""
         summary = Findings()
-        joints_of: dict[Check[Any], list[str]] = {}
+        groups: dict[tuple[Check[Any], str], list[str]] = {}
         for (group, check), occurrences in self._results.items():
-            found, where, file = occurrences[0]
             # joints at rest are a finding only if they never move
-            if check.everywhere and len(occurrences) < self._count:
-                continue
-            if check.severity == "error" or isinstance(found, Advice):
-                joints_of.setdefault(check, []).append(group)
-                continue
-            place = f"{where}, joint {group!r}" if group in self._joints else where
-            summary.add(check, f"{found}{_more(occurrences)}", place, file)
-        for check, joints in joints_of.items():
-            occurrences = self._results[joints[0], check]
-            found, where, file = occurrences[0]
-            place = f"{where}, joint {', '.join(map(repr, joints))}"
-            if isinstance(found, Advice):
-                found = Advice(f"{found.message}{_more(occurrences)}", self._keys(check, joints))
-            else:
-                found += _more(occurrences)
-            summary.add(check, found, place, file)
+            if not check.everywhere or len(occurrences) == self._count:
+                is_error = check.severity == "error" or occurrences[0][0].is_line
+                groups.setdefault((check, "" if is_error else group), []).append(group)
+        for (check, _), names in groups.items():
+            occurrences = self._results[names[0], check]
+            advice, where, file = occurrences[0]
+            message = advice.message
+            if len(occurrences) > 1:
+                message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
+            if names[0] in self._joints:
+                where += f", joint {', '.join(map(repr, names))}"
+            entries = {name: self._results[name, check][0][0].joint for name in names}
+            keys = {**advice.keys, **(self._joint_keys(entries) if advice.joint else {})}
+            summary.add(check, message, where, file, keys)
         return summary
 
-    def _keys(self, check: Check[Any], joints: Sequence[str]) -> dict[str, Any]:
-        """Return the keys of the group `logs` that remedy the findings of a check about some joints."""
-        keys: dict[str, Any] = {}
-        for joint in joints:
-            for found, _, _ in self._results[joint, check]:
-                if isinstance(found, Advice):
-                    keys = _merged(keys, found.keys)
-        entries = keys.get("joints", {})
-        first: Mapping[str, Any] = entries.get(joints[0], {})
-        if first.keys() != {"units"}:
-            return keys
-        # the unit of a joint that rests, or moves little, is that of most others
+    def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
+        """Return the keys of joints in the group `logs`; joints that rest or move little have the units of most."""
+        first, *_ = entries
+        units, kinds = entries[first].get("units", {}), dict(zip(self._joints, self._kinds, strict=True))
+        ratio = SCALES.get(units.get("qd"), 1.0) / SCALES.get(units.get("q"), 1.0)
         factors, _ = velocity_agreement(self.products)
-        ratio = SCALES.get(first["units"].get("qd"), 1.0) / SCALES.get(first["units"].get("q"), 1.0)
-        is_linear = self._kinds[self._joints.index(joints[0])] == "prismatic"
-        kin = [k for k, kind in enumerate(self._kinds) if (kind == "prismatic") == is_linear]
-        for k in kin if 2 * len(joints) > len(kin) else ():
-            if np.isnan(factors[k]) or is_factor(factors[k], ratio):
-                entries.setdefault(self._joints[k], {"units": dict(first["units"])})
+        kin = [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[first] == "prismatic")]
+        is_shared = entries[first].keys() == {"units"} and 2 * len(entries) > len(kin)
+        for joint, factor in zip(self._joints, factors.tolist(), strict=True):
+            if is_shared and joint in kin and (np.isnan(factor) or is_factor(factor, ratio)):
+                entries.setdefault(joint, {"units": dict(units)})
         return joint_keys(entries, self._joints)
-
-
-def _more(occurrences: Sequence[object]) -> str:
-    """Return how many more trajectories show a finding, in brackets."""
-    count = len(occurrences) - 1
-    return f" (and in {counted(count, 'more trajectory')})" if count else ""
-
-
-def _merged(keys: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested keys with those of others."""
-    result = dict(keys)
-    for key, value in others.items():
-        known = result.get(key)
-        result[key] = _merged(known, value) if isinstance(known, dict) else value
-    return result
 
 
 def check(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +16,6 @@ import pyarrow.csv
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import LogFormat, LogTable, table_layout
-from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
@@ -119,13 +119,8 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
     Raises LogError for any other file that begins with numbers.
     """
-    columns = [*STAMP]
-    names: list[str] = []
-    for cell in cells[len(STAMP) :]:
-        if is_number(cell):
-            break
-        names.append(cell)
-        columns.append(f"name_{cell}")
+    names = list(takewhile(lambda cell: not is_number(cell), cells[len(STAMP) :]))
+    columns = [*STAMP, *(f"name_{name}" for name in names)]
     labels = len(columns)
     for quantity in FIELDS:
         if len(columns) < len(cells):
@@ -141,12 +136,14 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
 def _decoded_head(file: Path) -> tuple[str, str]:
     """Return the encoding and the first characters of a file."""
+    # of the head, from which encoding, delimiter and decimal point are detected
+    size = 2**16
     with file.open("rb") as source:
-        head = source.read(TUNING.csv_head)
+        head = source.read(size)
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16", head.decode("utf-16", "ignore")
     # the head may end in the middle of a UTF-8 character
-    errors = "strict" if len(head) < TUNING.csv_head else "ignore"
+    errors = "strict" if len(head) < size else "ignore"
     try:
         return "utf-8", head.decode("utf-8", errors)
     except UnicodeDecodeError:

@@ -132,7 +132,7 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
         if path.suffix == ".csv":
             pa.csv.write_csv(table, unfinished)
         else:
-            pa.parquet.write_table(table, unfinished, row_group_size=TUNING.row_group)
+            pa.parquet.write_table(table, unfinished, row_group_size=2**16)
     return path
 
 

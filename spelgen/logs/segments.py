@@ -72,16 +72,15 @@ class LogSegments:
 
     def trajectories(self) -> Iterator[Trajectory | LogError]:
         """Yield each kept recording, or the error of its times, and remove its segments."""
+        # each segment is released once it is joined: their memory is not needed twice
         segments, self._segments = self._segments[::-1], []
         while segments:
             group = [segments.pop()]
             while segments and segments[-1].recording == group[0].recording:
                 group.append(segments.pop())
             first = group[0]
-            values, rows = first.values, first.rows
-            if len(group) > 1:
-                values = np.concatenate([x.values for x in group])
-                rows = np.concatenate([x.rows for x in group])
+            values = np.concatenate([x.values for x in group]) if len(group) > 1 else first.values
+            rows = np.concatenate([x.rows for x in group])
             try:
                 values, repairs = in_time_order(values, rows, first.layout)
                 yield make_trajectory(values, first.layout, first.name, repairs)

@@ -85,26 +85,23 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     if metadata.get(UNITS_KEY) == UNITS:
         mapping = mapping.in_si()
     columns = [mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))]
-    missing = []
     for name in columns:
+        element = f"column {name}"
         if columns.count(name) > 1:
             got, expected = "one column for several joints", "'{joint}' in its name under 'logs'"
-            raise LogError(got, file=file, element=f"column {name}", expected=expected)
-        if schema.names.count(name) > 1:
-            places = ", ".join(str(k) for k, other in enumerate(schema.names, start=1) if other == name)
-            got = f"the same name for the columns {places}"
-            raise LogError(
-                got, file=file, element=f"column {name}", expected="it once", do="rename one of them"
-            )
-        if name not in schema.names and not list_element(name, schema.names):
-            missing.append(name)
+            raise LogError(got, file=file, element=element, expected=expected)
+        places = [str(k) for k, other in enumerate(schema.names, start=1) if other == name]
+        if len(places) > 1:
+            got = f"the same name for the columns {', '.join(places)}"
+            raise LogError(got, file=file, element=element, expected="it once", do="rename one of them")
+    missing = [x for x in columns if x not in schema.names and not list_element(x, schema.names)]
     if missing:
         raise missing_columns(missing, schema.names, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
     # lists cannot be names of recordings
     if labels and pa.types.is_nested(schema.field(labels).type):
-        kind = schema.field(labels).type
-        raise LogError(f"values of type {kind}", file=file, element=f"column {labels}", expected="names")
+        got = f"values of type {schema.field(labels).type}"
+        raise LogError(got, file=file, element=f"column {labels}", expected="names")
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
@@ -121,27 +118,19 @@ def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
 
 def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
     """Return the columns of a file that contain the columns of a layout, each once."""
-    stored: dict[str, None] = {}
-    for name in layout.columns:
-        element = list_element(name, columns)
-        stored[name if element is None else element[0]] = None
-    if layout.labels:
-        stored[layout.labels] = None
-    return list(stored)
+    elements = [list_element(name, columns) or (name, 0) for name in layout.columns]
+    labels = [layout.labels] if layout.labels else []
+    return list(dict.fromkeys([name for name, _ in elements] + labels))
 
 
 def missing_columns(
     missing: Sequence[str], columns: Collection[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> LogError:
     """Return the error for missing columns, with a remedy."""
-    quantities, expected = mapping.quantities, [mapping.columns.t]
-    for quantity in quantities:
-        expected.append(getattr(mapping.columns, quantity).replace("{joint}", "<joint>"))
-    of_quantity = {x: [mapping.column(x, joint) for joint in joints] for x in quantities}
-    unlogged = []
-    for joint, *names in zip(joints, *of_quantity.values(), strict=True):
-        if set(names) <= set(missing):
-            unlogged.append(joint)
+    of_quantity = {x: [mapping.column(x, joint) for joint in joints] for x in mapping.quantities}
+    patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]
+    of_joints = dict(zip(joints, zip(*of_quantity.values(), strict=True), strict=True))
+    unlogged = [joint for joint, names in of_joints.items() if set(names) <= set(missing)]
     if unlogged and len(unlogged) < len(joints):
         logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (
@@ -155,16 +144,16 @@ def missing_columns(
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
         do = _renaming(missing[0], columns, of_quantity, [mapping.log_name(joint) for joint in joints])
-    listed = TUNING.listed
-    return LogError(
-        f"only the columns {shortened(list(columns), listed)}", file=file,
-        element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, listed)}",
-        expected=", ".join(expected), do=do,
-    )  # fmt: skip
+    element = f"missing column{'s' * (len(missing) > 1)} {shortened(missing, TUNING.listed)}"
+    got, expected = (
+        f"only the columns {shortened(list(columns), TUNING.listed)}",
+        ", ".join([mapping.columns.t, *patterns]),
+    )
+    return LogError(got, file=file, element=element, expected=expected, do=do)
 
 
 def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequence[str]) -> bool:
-    """Return whether a log has commands of all joints and no torques."""
+    """Return True if a log has commands of all joints and no torques."""
     commands = {mapping.column("u", joint) for joint in joints}
     torques = {mapping.column("tau", joint) for joint in joints}
     return commands <= set(columns) and torques.isdisjoint(columns)
@@ -174,13 +163,12 @@ def _renaming(
     name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
 ) -> str:
     """Return the advice to rename an unused column of the same joint, or else to write the names in the settings."""
-    joint, used = "", set(chain(*of_quantity.values()))
-    for names in of_quantity.values():
-        if name in names:
-            joint = joints[names.index(name)]
-    unused = [column for column in columns if column not in used]
+    named = [
+        joint for names in of_quantity.values() for x, joint in zip(names, joints, strict=True) if x == name
+    ]
+    unused = [column for column in columns if column not in chain(*of_quantity.values())]
     for close in difflib.get_close_matches(name, unused, n=5):
-        if names_joint(close, joint):
+        if names_joint(close, "".join(named[-1:])):
             return f"rename the column {close!r} to {name!r}?"
     return (
         "rename the columns, or write their names under 'logs' in the robot's YAML: "
@@ -189,7 +177,7 @@ def _renaming(
 
 
 def names_joint(column: str, joint: str) -> bool:
-    """Return whether a column's name contains a joint's name as a separate word: `q_1` has 1, `q_12` has not."""
+    """Return True if a column's name contains a joint's name as a separate word: `q_1` has 1, `q_12` has not."""
     return re.search(rf"(?<![0-9a-z]){re.escape(joint)}(?![0-9a-z])", column, re.IGNORECASE) is not None
 
 

@@ -9,13 +9,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 from math import log
-from typing import NamedTuple
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
 from spelgen.logs.joint_signals import Advice, JointSignals
+from spelgen.logs.jumps import held_samples
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.logs.tuning import SIGNALS
+from spelgen.logs.tuning import SIGNALS, shows_accelerations
 from spelgen.settings.log_mapping import SCALES, TIMES
 
 TURNS = 4 * np.pi  # [rad] A joint with limits turns less: larger positions are in another unit.
@@ -55,62 +57,47 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return products[:n, n:].diagonal() / np.where(qd_squares > 0, qd_squares, np.nan), correlations
 
 
-class UnitReading(NamedTuple):
-    """Reading of q and qd of a joint in other units.
-
-    units: by quantity, empty for the unchanged joint. distance: of the ratio of dq/dt to qd from 1, plus a penalty for
-    each other unit. counts: per revolution, if q is in counts.
-    """
-
-    units: dict[str, str]
-    distance: float
-    counts: int = 0
-
-
 def find_units(signals: JointSignals) -> str | Advice | None:
     """Find other units than the mapping states: q is more than two turns, or a multiple of the integral of qd."""
+    mapping, joint = signals.trajectory.mapping, signals.joint
     if signals.step > SIGNALS.slowest_step:
         return None  # the times are in another unit
-    is_stated = signals.turns or signals.trajectory.mapping.unit("q", signals.joint) is not None
-    is_far = np.ptp(signals.q) > TURNS and not is_stated and signals.kind != "prismatic"
+    is_far = np.ptp(signals.q) > TURNS and signals.kind != "prismatic" and not signals.turns
+    is_far &= mapping.unit("q", joint) is None
     message = f"q that changes {signals.factor:.3g} times as fast as qd"
     if is_far:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
-    best = min(_unit_readings(signals, is_far), key=lambda x: x.distance, default=None)
-    if best is None or best.distance > log(SIGNALS.unit_factor):
+    distance, keys = min(_unit_readings(signals, is_far), key=itemgetter(0), default=(np.inf, {}))
+    if distance > log(1.25):
         return message if is_far else None
-    if not best.units:
-        return None
-    keys: dict[str, object] = {"units": best.units}
-    if best.counts:
-        keys["counts_per_turn"] = best.counts
-    units = " and ".join(f"{name} in {unit}" for name, unit in best.units.items())
-    return Advice(f"{message}: {units}", {"joints": {signals.joint: keys}})
+    units = " and ".join(f"{name} in {unit}" for name, unit in keys.get("units", {}).items())
+    return Advice(f"{message}: {units}", keys) if keys else None
 
 
-def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[UnitReading]:
-    """Yield the readings of a joint in units that its mapping does not state. is_far: q is more than two turns."""
-    mapping, span = signals.trajectory.mapping, float(np.ptp(signals.q))
+def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Yield the keys of a joint for all units that its mapping does not state.
+
+    Before them, the distance of the ratio of dq/dt to qd from 1, in which another unit costs something. is_far: q is
+    more than two turns.
+    """
+    mapping, joint = signals.trajectory.mapping, signals.joint
     # without velocities only the range shows a unit
     is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
     is_known &= "qd" in mapping.quantities
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
-    if mapping.unit("q", signals.joint):
+    if mapping.unit("q", joint):
         positions = positions[:1]
-    if not is_known or mapping.unit("qd", signals.joint):
+    if not is_known or mapping.unit("qd", joint):
         speeds = speeds[:1]
     for q, qd in product(positions, speeds):
         scale = SCALES.get(q, 1.0)
-        if is_far and span * scale > TURNS:
-            continue
-        units = {} if q == positions[0] else {"q": q}
-        if qd != speeds[0]:
-            units["qd"] = qd
+        units = {name: x for name, x in (("q", q), ("qd", qd)) if x in SCALES}
         distance = abs(log(signals.factor * scale / SCALES.get(qd, 1.0))) if is_known else 0.0
-        yield UnitReading(units, distance + SIGNALS.rare_unit * len(units))
-    for counts in 2 ** np.arange(10, 21) if is_known and "turns" in positions else ():
-        distance = abs(log(signals.factor * 2 * np.pi / counts))
-        yield UnitReading({"q": "counts"}, distance + SIGNALS.rare_unit, int(counts))
+        if not is_far or np.ptp(signals.q) * scale <= TURNS:
+            yield distance + 0.02 * len(units), {"units": units} if units else {}
+    for counts in (2 ** np.arange(10, 21)).tolist() if is_known and "turns" in positions else ():
+        distance = abs(log(signals.factor * 2 * np.pi / counts)) + 0.02
+        yield distance, {"units": {"q": "counts"}, "counts_per_turn": counts}
 
 
 def find_time_unit(signals: JointSignals) -> str | Advice | None:
@@ -126,15 +113,13 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
         message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
     if unit is None or is_stated:
         return message if step > SIGNALS.slowest_step else None
-    return Advice(message, {"units": {"t": unit}})
+    return Advice(message, keys={"units": {"t": unit}})
 
 
 def time_unit(step: float) -> str | None:
     """Return the unit of time in which a step between samples is plausible for a robot's log; None if there is none."""
-    for unit, size in TIMES.items():
-        if SIGNALS.fastest_step <= step * size <= SIGNALS.slowest_step:
-            return unit
-    return None
+    slowest, fastest = SIGNALS.slowest_step, SIGNALS.fastest_step
+    return next((unit for unit, size in TIMES.items() if fastest <= step * size <= slowest), None)
 
 
 def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
@@ -150,19 +135,57 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         return message  # of two samples every correlation is 1
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
-        return Advice(f"{message}; its sense is opposite", {"velocity": "differentiated"})
-    trajectory, joint, mapping = signals.trajectory, signals.joint, signals.trajectory.mapping
+        return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
+    trajectory, mapping, k = signals.trajectory, signals.trajectory.mapping, signals.number
     for other, fit in zip(signals.joints, signals.correlations, strict=True):
         if fit > max(SIGNALS.agreement, correlation):
             columns = {"qd": mapping.column("qd", other)}
-            message += f"; that of joint {other!r} is"
-            return Advice(message, {"joints": {joint: {"columns": columns}}})
+            return Advice(f"{message}; that of joint {other!r} is", {"columns": columns})
     exchanged = velocity_products(replace(trajectory, q=trajectory.qd, qd=trajectory.q))
     factors, correlations = velocity_agreement(exchanged)
-    if (
-        correlations[signals.number, signals.number] > SIGNALS.agreement
-        and abs(factors[signals.number] - 1) < 0.5
-    ):
-        columns = {"q": mapping.column("qd", joint), "qd": mapping.column("q", joint)}
-        return Advice(f"{message}; q is the derivative of qd", {"joints": {joint: {"columns": columns}}})
+    if correlations[k, k] > SIGNALS.agreement and abs(factors[k] - 1) < 0.5:
+        columns = {"q": mapping.column("qd", signals.joint), "qd": mapping.column("q", signals.joint)}
+        return Advice(f"{message}; q is the derivative of qd", {"columns": columns})
     return message
+
+
+def find_held(signals: JointSignals) -> str | None:
+    """Find signals whose values are held over several rows."""
+    rate = signals.trajectory.sample_rate
+    for name in signals.measured:
+        often = held_samples(signals.signal(name))
+        if often > 1:
+            rates = f"{rate / often:.3g} times a second in rows at {rate:.3g} Hz"
+            return f"{name} that changes {rates}: each value lasts {often} samples"
+    return None
+
+
+def find_too_rare(signals: JointSignals) -> str | Advice | None:
+    """Find held signals from which no acceleration can be computed; arms under servos need none."""
+    rate = signals.trajectory.sample_rate
+    if signals.trajectory.u is not None or not shows_accelerations(rate):
+        return None
+    held = {name: held_samples(signals.signal(name)) for name in signals.measured}
+    message = find_held(signals)
+    if message is None or shows_accelerations(rate / max(held.values())):
+        return None
+    # positions that are new show the velocities
+    is_mended = all(often == 1 for name, often in held.items() if name != "qd")
+    return Advice(message, keys={"velocity": "differentiated"}) if is_mended else message
+
+
+def find_unsigned_velocity(signals: JointSignals) -> str | None:
+    """Find velocities that are the magnitude of dq/dt."""
+    # largest velocity of the rarer sign, relative to the largest velocity, of a signal without sign
+    trajectory, qd, share = signals.trajectory, signals.qd, 0.05
+    lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
+    # the velocity noise of a joint at rest has both signs
+    if trajectory.mapping.velocity == "differentiated" or lowest > share * highest or len(qd) < 3:
+        return None
+    speed = np.gradient(signals.q, trajectory.t)
+    backward, forward = sorted((-np.quantile(speed, 0.02), np.quantile(speed, 0.98)))
+    if backward < share * forward or abs(qd).std() == 0:
+        return None
+    if not np.corrcoef(np.abs(speed), np.abs(qd))[0, 1] > 0.9:
+        return None
+    return f"qd that is the magnitude of dq/dt: from {qd.min():.3g} to {qd.max():.3g} while q goes both ways"

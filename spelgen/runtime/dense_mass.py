@@ -10,7 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.parts import Intermediates, Layers, Network, Rows
+from spelgen.runtime.networks import MaskedNetwork
+from spelgen.runtime.parts import Intermediates, Layers, Rows
 from spelgen.runtime.rows import Joint, vector
 
 
@@ -49,7 +50,7 @@ class DenseMass(nn.Module):
     (U^-1 A)^T diag(1 / e) U^-1 A, where A is the moving columns of C^-1.
     """
 
-    def __init__(self, joints: Sequence[Joint], *, mean: Rows, network: Network) -> None:
+    def __init__(self, joints: Sequence[Joint], *, mean: Rows, network: MaskedNetwork) -> None:
         super().__init__()
         self.size = 3 * len(joints)
         factor = nominal_factor(joints, mean)

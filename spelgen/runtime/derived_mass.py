@@ -1,4 +1,4 @@
-"""M(q) from the fewest functions and constants: M = sum_j f_j(q) B_j + sum_k c_k A_k + armature."""
+"""M(q) from the fewest functions and constants: M = sum_j f_j(q) B_j + sum_k c_k A_k + armature; or from constants."""
 
 from __future__ import annotations
 
@@ -8,19 +8,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.parts import Entries, Intermediates, Layers, Network
+from spelgen.runtime.networks import MaskedNetwork
+from spelgen.runtime.parts import Entries, Intermediates, Layers
 from spelgen.runtime.rows import Constant, Function, Joint, vector
 
 
-class DerivedMass(nn.Module):
-    """M(q), (..., n, n): ``entries(*functions, *constants)`` and the armature.
-
-    M is positive definite for all q and all parameters: if M - margin C is not, with C the nominal mean of
-    M, it is replaced by M' = C + t (M - C). t = 2^-k is the first such power with t |M - C| <= 1 - margin,
-    where |.| is an upper bound of the norm relative to C. t is piecewise constant, so that the derivatives
-    of M' are t times the derivatives of M. C has the zeros and linear relations of M, which therefore
-    hold in M'.
-    """
+class LinearMass(nn.Module):
+    """The constants and the armature of an M that is linear in functions of q and constants."""
 
     parameter_groups = (
         ("raw_constants", "mass_constants", "kg m^2, kg m, kg"),
@@ -32,26 +26,18 @@ class DerivedMass(nn.Module):
         joints: Sequence[Joint],
         entries: Entries,
         *,
-        functions: Sequence[Function],
         constants: Sequence[Constant],
-        network: Network,
-        margin: float,
+        functions: Sequence[Function] | None = None,
     ) -> None:
         super().__init__()
-        self.entries, self.network = entries, network
+        self.entries = entries
         self.constant_scale = nn.Buffer(vector(x.scale for x in constants))
-        self.function_mean = nn.Buffer(vector(f.mean for f in functions))
-        self.function_scale = nn.Buffer(vector(f.scale for f in functions))
+        if functions is not None:
+            self.function_mean = nn.Buffer(vector(f.mean for f in functions))
+            self.function_scale = nn.Buffer(vector(f.scale for f in functions))
         self.raw_constants = nn.Parameter(vector(x.initial / x.scale for x in constants))
         self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
         self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # logarithm
-        center = self._by_outputs()[-1].detach()
-        self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)  # C and margin C
-        size = center.diagonal().rsqrt()
-        relative = size.unsqueeze(-1) * size
-        eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # bound of the norm relative to C per entry of M - C, divided by 1 - margin
-        self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def armature(self) -> Tensor:
         """Return the rotor inertia on the joint side, part of the diagonal of M, (n,) [kg m^2, kg]."""
@@ -60,6 +46,65 @@ class DerivedMass(nn.Module):
     def constants(self) -> Tensor:
         """Return the constants of M, (constants,) [kg m^2, kg m, kg]."""
         return self.constant_scale * self.raw_constants
+
+
+class ConstantMass(LinearMass):
+    """M, (..., n, n), that does not depend on q: ``entries(*constants)`` and the armature.
+
+    The absolute values of the constants are used, so that M stays positive definite.
+    """
+
+    def constants(self) -> Tensor:
+        """Return the constants of M, (constants,) [kg m^2, kg m, kg]."""
+        return self.constant_scale * (self.raw_constants.abs() + 1e-6)
+
+    def prepare(self) -> Tensor:
+        """Return M, (n, n)."""
+        return self.entries(*self.constants().unbind()) + torch.diag(self.armature())
+
+    def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """Return M, (..., n, n), and the encoding, (..., 2 n), which has the shape of its derivatives."""
+        return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
+
+    def kinetic_vjp(self, qd: Tensor, intermediates: Tensor) -> Tensor:
+        """Return d(1/2 qd^T M qd) / d encoding, (..., 2 n): zero."""
+        return torch.zeros_like(intermediates)
+
+    def jvp(self, rate: Tensor, intermediates: Tensor) -> Tensor:
+        """Return dM/dt, (..., n, n): zero."""
+        n = len(self.raw_armature)
+        return rate.new_zeros(*rate.shape[:-1], n, n)
+
+
+class DerivedMass(LinearMass):
+    """M(q), (..., n, n): ``entries(*functions, *constants)`` and the armature.
+
+    M is positive definite for all q and all parameters: if M - margin C is not, with C the nominal mean of
+    M, it is replaced by M' = C + t (M - C). t = 2^-k is the first such power with t |M - C| <= 1 - margin,
+    where |.| is an upper bound of the norm relative to C. t is piecewise constant, so that the derivatives
+    of M' are t times the derivatives of M. C has the zeros and linear relations of M, which therefore
+    hold in M'.
+    """
+
+    def __init__(
+        self,
+        joints: Sequence[Joint],
+        entries: Entries,
+        *,
+        functions: Sequence[Function],
+        constants: Sequence[Constant],
+        network: MaskedNetwork,
+        margin: float,
+    ) -> None:
+        super().__init__(joints, entries, constants=constants, functions=functions)
+        self.network = network
+        center = self._by_outputs()[-1].detach()
+        self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)  # C and margin C
+        size = center.diagonal().rsqrt()
+        relative = size.unsqueeze(-1) * size
+        eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
+        # bound of the norm relative to C per entry of M - C, divided by 1 - margin
+        self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
         """Return dM / d output per output of the network, then M at zero outputs, (outputs + 1, n, n)."""

@@ -12,8 +12,8 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from spelgen.errors import OptionError, SettingsError, suggestion
-from spelgen.settings.messages import validated
 from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
+from spelgen.settings.yaml_document import validated
 
 Objective = Literal["torque", "momentum", "rollout", "servo"]
 Optimizer = Literal["adamw", "lbfgs"]
@@ -127,8 +127,9 @@ class FitConfig(Group):
 
     def record(self, *, rigid_bodies: bool) -> dict[str, object]:
         """Return the options that apply, for config.json."""
-        unused = self.unused(rigid_bodies=rigid_bodies)
-        return self.model_dump(mode="json", exclude_none=True, exclude=set(unused))
+        return self.model_dump(
+            mode="json", exclude_none=True, exclude=set(self.unused(rigid_bodies=rigid_bodies))
+        )
 
     @classmethod
     def unused(cls, *, rigid_bodies: bool) -> tuple[str, ...]:
@@ -194,9 +195,8 @@ class OnWindows(FitConfig):
         update: dict[str, object] = {"optimizer": optimizer, "batch": None, "learning_rate": None}
         decay = DEFAULTS.lbfgs_decay
         if optimizer == "adamw":
-            update["batch"] = self.batch or DEFAULTS.batch
+            decay, update["batch"] = DEFAULTS.adamw_decay, self.batch or DEFAULTS.batch
             update["learning_rate"] = self.learning_rate or DEFAULTS.learning_rate
-            decay = DEFAULTS.adamw_decay
         if self.weight_decay is None:
             update["weight_decay"] = decay
         return self.model_copy(update=update)
@@ -243,18 +243,11 @@ class ServoFit(FitConfig):
 
 
 WindowConfig = MomentumFit | Rollout
-CONFIGS: dict[str, type[FitConfig]] = {
-    "torque": TorqueFit,
-    "momentum": MomentumFit,
-    "rollout": Rollout,
-    "servo": ServoFit,
-}
-
-
+CONFIGS: dict[str, type[FitConfig]] = {x.objective: x for x in (TorqueFit, MomentumFit, Rollout, ServoFit)}
 OWNERS: dict[str, list[str]] = {}
-for _objective, _config in CONFIGS.items():
+for _config in CONFIGS.values():
     for _name in _config.model_fields:
-        OWNERS.setdefault(_name, []).append(_objective)
+        OWNERS.setdefault(_name, []).append(_config.objective)
 
 
 def fit_config(

@@ -27,7 +27,6 @@ CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
 # -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
 NORMALISED = "normalised"
-SERVO_TURN = 4096  # counts in a revolution of the servos that LeRobot calibrates
 ONLY = {  # units that a joint of this type cannot have
     "revolute": ("m", "mm", "m/s", "mm/s", "N"),
     "prismatic": (
@@ -265,12 +264,16 @@ class LogMapping(Group):
     def column(self, quantity: str, joint: str) -> str:
         """Return the column of "q", "qd", "tau" or "u" of a joint."""
         name: str | None = getattr(self.joint(joint).columns, quantity)
-        pattern: str = getattr(self.columns, quantity)
-        return name or pattern.replace("{joint}", self.log_name(joint))
+        return name or self.pattern(quantity).replace("{joint}", self.log_name(joint))
+
+    def pattern(self, quantity: str) -> str:
+        """Return the name of the columns of a quantity, with `{joint}`."""
+        name: str = getattr(self.columns, quantity)
+        return name
 
     def of_trajectory(self, text: str) -> LogMapping:
         """Return the mapping for one recording of a file: `{trajectory}` in the columns' names is its text."""
-        named = {key: name.replace("{trajectory}", text) for key, name in self.columns.model_dump().items()}
+        named = {key: name.replace("{trajectory}", text) for key, name in self.columns}
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
@@ -318,7 +321,8 @@ class LogMapping(Group):
         elif unit == NORMALISED:
             motor = self.calibration[self.log_name(joint)]
             counts = (motor.range_max - motor.range_min) / 200
-            factor = (1 - 2 * motor.drive_mode) * counts * 2 * pi / (logged.counts_per_turn or SERVO_TURN)
+            # counts in a revolution of the servos that LeRobot calibrates
+            factor = (1 - 2 * motor.drive_mode) * counts * 2 * pi / (logged.counts_per_turn or 4096)
         elif unit in COUNTS:
             turn = logged.counts_per_turn
             factor = 2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0)
@@ -334,14 +338,14 @@ class LogMapping(Group):
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
         """Return the errors of the mapping for these joints: missing keys, and units of the wrong joint type."""
         errors = []
-        kinds: Sequence[str | None] = joint_types or [None] * len(joints)
-        for joint, kind in zip(joints, kinds, strict=True):
-            for quantity in self.quantities:
-                unit = self.unit(quantity, joint)
-                expected = self._missing(unit, self.log_name(joint), self.joint(joint), kind)
-                if expected:
-                    where = f"logs: joint {joint!r}, {quantity}"
-                    errors.append(SettingsError(f"the unit {unit}", element=where, expected=expected))
+        kinds: dict[str, str | None] = dict.fromkeys(joints)
+        kinds.update(zip(joints, joint_types or (), strict=joint_types is not None))
+        for joint, quantity in product(joints, self.quantities):
+            unit = self.unit(quantity, joint)
+            expected = self._missing(unit, self.log_name(joint), self.joint(joint), kinds[joint])
+            if expected:
+                where = f"logs: joint {joint!r}, {quantity}"
+                errors.append(SettingsError(f"the unit {unit}", element=where, expected=expected))
         return errors
 
     def _missing(self, unit: str | None, joint: str, logged: JointLog, kind: str | None) -> str | None:

@@ -55,8 +55,9 @@ class LinkShapes:
     def unread_text(self) -> str:
         """The first two links and files of the shapes that were not read, and the number of others; empty if none."""
         named = [f"{link} ({', '.join(names)})" for link, names in self.unread.items()]
-        others = [counted(len(named) - 2, "more link")] if len(named) > 2 else []
-        return ", ".join([*named[:2], *others])
+        if len(named) > 2:
+            named[2:] = [counted(len(named) - 2, "more link")]
+        return ", ".join(named)
 
 
 def link_shapes(
@@ -119,7 +120,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
         (shape,) = model.robot.links[0].collisions
         geometry = shape.geometry
         pose = np.eye(4) if shape.origin is None else np.asarray(shape.origin)
-        file_name = ""
+        kind, file_name = "mesh", ""
         if geometry.box is not None:
             kind, size = "box", geometry.box.size
         elif geometry.cylinder is not None:
@@ -127,11 +128,8 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
         elif geometry.sphere is not None:
             kind, size = "sphere", geometry.sphere.radius
         else:
-            kind, size, file_name = (
-                "mesh",
-                1.0 if geometry.mesh.scale is None else geometry.mesh.scale,
-                geometry.mesh.filename,
-            )
+            scale, file_name = geometry.mesh.scale, geometry.mesh.filename
+            size = 1.0 if scale is None else scale
         numbers = np.broadcast_to(np.asarray(size, dtype=float), COUNTS[kind])
     except Exception as error:  # of any type, from attributes that are absent or are not numbers
         raise ValueError("a shape that is not valid") from error

@@ -138,10 +138,10 @@ class Robot:
     def joints_below(self) -> dict[str, tuple[UrdfJoint, ...]]:
         """The joints whose parent is a link, by the name of the link, in the order of the file."""
         # All links have an entry, so that the tips are the links with an empty one.
-        below: dict[str, list[UrdfJoint]] = {link.name: [] for link in self.links}
+        below: dict[str, tuple[UrdfJoint, ...]] = {link.name: () for link in self.links}
         for joint in self.joints:
-            below[joint.parent].append(joint)
-        return {name: tuple(joints) for name, joints in below.items()}
+            below[joint.parent] += (joint,)
+        return below
 
     @cached_property
     def joints_from_root(self) -> tuple[UrdfJoint, ...]:

@@ -16,10 +16,9 @@ import torch
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.errors import LogError
 from spelgen.fitting.servo.tuning import ServoWindowTuning
-from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.filtering import derivative, velocities
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split_at_gaps, steps_between
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel

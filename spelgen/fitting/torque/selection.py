@@ -46,7 +46,7 @@ class SelectedTerm:
 
 
 def can_split(count: int, correlation_length: float) -> bool:
-    """Return whether the halves of `count` samples are longer than the gap between them."""
+    """Return True if the halves of `count` samples are longer than the gap between them."""
     first, last = split_halves(count, correlation_length)
     return bool(last.start - first.stop <= first.stop)
 
