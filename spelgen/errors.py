@@ -41,6 +41,7 @@ class SpelgenError(Exception):
         statement = _in_short(self.got)
         if self.expected is not None:
             statement = f"got {statement}, expected {_in_short(self.expected)}"
+        # the form of compilers, from which editors jump to the line
         location = ":".join(str(x) for x in (self.file, self.line) if x is not None)
         message = ": ".join(x for x in (_in_short(location), _in_short(self.element or ""), statement) if x)
         if self.do is not None:
@@ -88,6 +89,7 @@ class SpelgenErrors(SpelgenError):
         self.errors = tuple(errors)
 
     def __str__(self) -> str:
+        # a folder of logs from one logger has the same error in every file
         groups: dict[tuple[object, ...], list[SpelgenError]] = {}
         for error in self.errors:
             key = (error.line, error.element, error.got, error.expected, error.do)
@@ -102,17 +104,15 @@ def _once(errors: Sequence[SpelgenError]) -> str:
     """Return the text of the first of several errors that differ only in their files, followed by the other files."""
     first = errors[0]
     files = dict.fromkeys(error.file for error in errors if error.file and error.file != first.file)
-    if not files:
-        return str(first)
-    return f"{first}\n  the same: {shortened(list(files), 5)}"
+    return f"{first}\n  the same: {shortened(list(files), 5)}" if files else str(first)
 
 
 def _in_short(text: str) -> str:
     """Return a text, shortened to its start and end if it is long: a name in a file may have a million characters."""
     if len(text) <= MAX_TEXT:
         return text
-    half = MAX_TEXT // 3
-    return f"{text[:half]}... ({len(text)} characters) ...{text[-half:]}"
+    third = MAX_TEXT // 3
+    return f"{text[:third]}... ({len(text)} characters) ...{text[-third:]}"
 
 
 def in_one_line(error: BaseException) -> str:
@@ -131,18 +131,18 @@ def collect(errors: Sequence[SpelgenError]) -> None:
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a hint for an unknown ``name``: the closest of the known ``names``, or the first ten."""
     names = list(names)
+    # one name: a list of similar names would have to be read
     nearest = get_close_matches(name, names, n=1)
     if nearest:
         return f"did you mean {nearest[0]!r}?"
-    hint = f"known are {', '.join(map(repr, names[:10]))}"
-    if len(names) > 10:
-        hint += f" and {len(names) - 10} more"
-    return hint
+    more = f" and {len(names) - 10} more" if len(names) > 10 else ""
+    return f"known are {', '.join(map(repr, names[:10]))}{more}"
 
 
 def shortened(names: Sequence[str], limit: int) -> str:
     """Return the names, or the first ``limit`` of them and the number of the others."""
     omitted = len(names) - limit
+    # `and 1 more` is longer than most names
     if omitted <= 1:
         return ", ".join(names)
     return ", ".join([*names[:limit], f"and {omitted} more"])

@@ -9,7 +9,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, note, progress_bar, say
-from spelgen.cli.options import Address, Data, MappingFile
+from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
 
 if TYPE_CHECKING:
@@ -17,44 +17,38 @@ if TYPE_CHECKING:
 
 Jobs = Annotated[
     int | None,
-    typer.Option(
-        min=1, help="Number of parallel runs, one core each, by Ray; default: all cores if Ray is installed."
+    option(
+        "", "Number of parallel runs, one core each, by Ray; default: all cores if Ray is installed.", min=1
     ),
 ]
 
 
 def compare(
     target: Annotated[
-        Path,
-        typer.Argument(metavar="TARGET", help="URDF of an arm, or YAML file that lists arms and their logs."),
+        Path, argument("TARGET", "URDF of an arm, or YAML file that lists arms and their logs.")
     ],
-    data: Data = None,
-    mapping: MappingFile = None,
+    data: options.Data = None,
+    mapping: options.MappingFile = None,
     output: Annotated[
-        Path | None, options.output_option("FOLDER", "Output folder; default: comparisons/TARGET.")
+        Path | None, output_option("FOLDER", "Output folder; default: comparisons/TARGET.")
     ] = None,
     presets: Annotated[
         str | None,
-        typer.Option(
-            metavar="A,B,C",
-            help="Presets or YAML files of designs; default: closed-form,hybrid on logs, else all presets.",
+        option(
+            "A,B,C",
+            "Presets or YAML files of designs; default: closed-form,hybrid on logs, else all presets.",
         ),
     ] = None,
-    seeds: Annotated[int | None, typer.Option(min=1, help="Number of runs of each preset.")] = None,
+    seeds: Annotated[int | None, option("", "Number of runs of each preset.", min=1)] = None,
     splits: Annotated[
-        int | None, typer.Option(min=1, help="Folds of a cross-validation over trajectories; default: 1.")
+        int | None, option("", "Folds of a cross-validation over trajectories; default: 1.", min=1)
     ] = None,
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Training steps of each run on a simulated arm.")
-    ] = None,
+    steps: Annotated[int | None, option("", "Training steps of each run on a simulated arm.", min=1)] = None,
     ablation: Annotated[
-        bool,
-        typer.Option(
-            "--ablation", help="Compare designs from phnode to hybrid that differ by one change each."
-        ),
+        bool, flag("--ablation", "Compare designs from phnode to hybrid that differ by one change each.")
     ] = False,
     jobs: Jobs = None,
-    address: Address = None,
+    address: options.Address = None,
 ) -> None:
     """Train presets on the same logs and rank them.
 
@@ -75,11 +69,13 @@ def compare(
         "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
         "seeds": seeds, "splits": splits, "steps": steps,
     }  # fmt: skip
+    # options of the command line take precedence over the file
     changes = {name: value for name, value in values.items() if value is not None}
     comparison = _comparison(target, data, mapping).model_copy(update=changes)
     name = target.stem + ("-logs" if data else "") + ("-ablation" if ablation else "")
     # the working folders of workers differ, so paths must be absolute
     folder = (output or Path("comparisons") / name).absolute()
+    # all cores: a comparison takes hours on one
     parallel = jobs or default_jobs()
     # two simultaneous comparisons in one folder would overwrite each other's runs
     with locked(folder), termination_as_interrupt():
@@ -90,6 +86,7 @@ def compare(
         with workers(parallel, address) as run_tasks:
             study = run_study(study, run_tasks, note)
         sections = arm_sections(study)
+        # the tables are printed as well, since a page cannot be read in a terminal
         for section in sections:
             say(f"{section.name}: {section.sentence}\n")
             for table in section.tables:

@@ -12,17 +12,16 @@ from pydantic import ValidationError
 
 from spelgen.errors import RunError, suggestion
 from spelgen.settings.fits import OWNERS, Adaptation
-from spelgen.settings.messages import explain
 from spelgen.settings.training import PREPROCESSING, TrainingSettings
 from spelgen.settings.values import Count
+from spelgen.settings.yaml_document import explain
 
 if TYPE_CHECKING:
-    from spelgen.fitting.objectives import FitOptions
+    from spelgen.fitting.fit import FitOptions
     from spelgen.settings.log_mapping import LogMapping
 
 TIME_LIMIT = "max_minutes"
 OF_LOGS = PREPROCESSING | {"validation_fraction", "seed"}
-FIELD_SEPARATOR = "."
 
 
 class UsageError(typer.BadParameter):
@@ -84,7 +83,8 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
-        name, _, field = key.strip().replace("-", "_").partition(FIELD_SEPARATOR)
+        name, _, field = key.strip().replace("-", "_").partition(".")
+        # checked before the keys: the user may have written a blank in place of `=`
         if not equals:
             raise UsageError(f"--set: got {assignment!r}, expected KEY=VALUE")
         if name not in keys:
@@ -106,7 +106,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
 
 def new_run(urdf: Path | None, request: Request) -> Start:
     """Return the start of a new run: the command line takes precedence over the robot's settings."""
-    from spelgen.fitting.objectives import FitOptions
+    from spelgen.fitting.fit import FitOptions
     from spelgen.settings.settings import load_settings
 
     # without a URDF there is no settings file with defaults
@@ -123,7 +123,7 @@ def new_run(urdf: Path | None, request: Request) -> Start:
 
 def resumed_run(folder: Path, request: Request) -> Start:
     """Return the start of a resumed run: the command line takes precedence over the run's record."""
-    from spelgen.fitting.objectives import FitOptions
+    from spelgen.fitting.fit import FitOptions
     from spelgen.fitting.run_folder import RunFolder
 
     run = RunFolder(folder)

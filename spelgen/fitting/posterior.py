@@ -18,12 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.base_combinations import base_combinations, constants_regressor
-from spelgen.dynamics.parameters import friction_factor
+from spelgen.dynamics.body_regressor import base_combinations, constants_regressor
+from spelgen.dynamics.parameters import evaluate_with, friction_factor
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
-from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import ParameterVector
@@ -32,7 +31,7 @@ from spelgen.identification.intervals import Interval, base_unit, interval_listi
 from spelgen.labels import UNITS, parameter_name
 from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import DynamicsSamples
-from spelgen.runtime.inputs import MotorInputs
+from spelgen.runtime.motors import MotorInputs
 
 QUANTITIES = {
     "armature": "{0.inertia}",

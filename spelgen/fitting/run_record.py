@@ -22,8 +22,8 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.windows import LAST_PART
 from spelgen.settings.fits import CONFIGS, FitConfig, Objective, Substeps
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.messages import validated
 from spelgen.settings.values import Count, NonNegative, Positive, Whole
+from spelgen.settings.yaml_document import validated
 
 Content = dict[str, Any]
 """The content of a file of a run folder, by key: JSON, or a checkpoint of torch."""
@@ -170,6 +170,7 @@ def require(schema: type[Schema], content: object, file: Path, line: int | None 
     try:
         return schema.model_validate(content)
     except ValidationError as error:
+        # one error suffices: a file that was written by a fit has none
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"]))
         message = f"{key}: {first['msg']}".removeprefix(": ")

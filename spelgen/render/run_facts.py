@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.baselines.names import MODEL
 from spelgen.dynamics.parameters import used_parameter_count
 from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
@@ -17,11 +16,11 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.report import terms_in_use
-from spelgen.labels import counted, share
+from spelgen.labels import MODEL, counted, share
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.render.tuning import TUNING
-from spelgen.runtime.residual_dynamics import ResidualDynamics
+from spelgen.render.charts import TUNING
+from spelgen.runtime.residual_terms import ResidualDynamics
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
 from spelgen.spec import ModelSpec, Options
@@ -47,6 +46,7 @@ def head_numbers(
     summary = None if record is None else servo_summary(record.servo)
     if summary is not None:
         numbers.append(summary.headline)
+    # parameters that the fit switched off are not counted: the number states the size of the model in use
     elif model is not None:
         numbers.append((f"{used_parameter_count(model):,}", "trained parameters"))
     if metrics:
@@ -64,10 +64,8 @@ def outlier_note(results: Results) -> str:
     rms = last.errors[MODEL].mean_relative_rms
     if rms is None or not rms > TUNING.dominated * median:
         return ""
-    return (
-        f"After {last.name} the median error is {share(median, 'the motion')}, and the root mean square "
-        f"{share(rms, 'the motion')}: few starts dominate it."
-    )
+    text = f"After {last.name} the median error is {share(median, 'the motion')}, and the root mean square "
+    return f"{text}{share(rms, 'the motion')}: few starts dominate it."
 
 
 def best_epoch(metrics: Sequence[Content]) -> int:
@@ -89,6 +87,7 @@ def training_facts(
         "windows": f"{record.training_windows:,} for training, {record.validation_windows:,} for validation",
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
+    # least squares needs accelerations, and so fewer samples than the model
     if "samples" in baselines:
         count = f"{baselines['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
@@ -97,17 +96,14 @@ def training_facts(
     # fits to torques have no epochs
     if metrics:
         last, best = metrics[-1], best_epoch(metrics)
-        origin = f"epoch {best}"
-        if not best:
-            origin = "the start: no epoch was better"
+        origin = f"epoch {best}" if best else "the start: no epoch was better"
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         if record.options.get("solver", "rk4") == "rk4":
             facts["integrator"] = f"rk4, {counted(last['substeps'], 'step')} between samples"
-    if record.warnings:
-        facts["warnings"] = "; ".join(record.warnings)
-    if record.notes:
-        facts["notes"] = "; ".join(record.notes)
+    for label, remarks in (("warnings", record.warnings), ("notes", record.notes)):
+        if remarks:
+            facts[label] = "; ".join(remarks)
     if record.options.get("momentum_steps"):
         facts["start"] = f"{record.options['momentum_steps']:,} steps on the momentum along the logs"
     return facts
@@ -120,12 +116,12 @@ def settings(record: Record) -> dict[str, str]:
 
 
 def _names(trajectories: Sequence[str]) -> str:
-    if not trajectories:
-        return "none"
-    return f"{counted(len(trajectories), 'trajectory')}: {shortened(trajectories, 5)}"
+    count = counted(len(trajectories), "trajectory")
+    return f"{count}: {shortened(trajectories, 5)}" if trajectories else "none"
 
 
 def _duration(seconds: float) -> str:
+    # three digits at most: times of training vary by more
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = seconds / 60
@@ -134,14 +130,14 @@ def _duration(seconds: float) -> str:
 
 def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str]:
     """Return the commands that reproduce a run, with LOGS in place of the logs, whose paths are not recorded."""
+    # only options that differ from their defaults: the command remains short enough to be read
     options = asdict(spec.options)
     if spec.options.design is not None:  # the run folder has no copy of the YAML file
         options["preset"] += ".yaml"
     # without its folder, which may be one of another machine
     robot, option = shlex.quote(Path(spec.urdf).name), ""
     if run.urdf.exists():
-        robot = f"RUN/{run.urdf.name}"
-        option = f" --robot {robot}"
+        robot, option = f"RUN/{run.urdf.name}", f" --robot RUN/{run.urdf.name}"
     build = f"spelgen build {robot}"
     for key, value in _changed(options, asdict(Options())).items():
         words = ",".join(value) if isinstance(value, (list, tuple)) else str(value)
@@ -156,6 +152,7 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
         options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
+        # the mapping on the command line replaces the settings of the robot
         if run.mapping.exists():
             train += f" --mapping RUN/{run.mapping.name}"
         lines.append(train)

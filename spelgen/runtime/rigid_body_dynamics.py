@@ -8,12 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.body_chain import ChainConfiguration, chain_of_links
+from spelgen.runtime.body_chain import ChainConfiguration, InertialParameters, chain_of_links
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws, turning
+from spelgen.runtime.motors import PositionServo
 from spelgen.runtime.parts import Configuration, Inputs, Parameters, Row, Rows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
-from spelgen.runtime.position_servo import PositionServo
-from spelgen.runtime.rigid_body import InertialParameters
 from spelgen.runtime.rows import Joint, Link, vector
 
 

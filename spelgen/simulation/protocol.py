@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import DriveFriction, joint_friction
 from spelgen.errors import SettingsError, SpelgenError, collect
-from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, MotionBounds
+from spelgen.excitation.bounds import SPEEDS, MotionBounds
+from spelgen.excitation.trajectory import ExcitationTrajectory, Motion
 from spelgen.excitation.tuning import TUNING as EXCITATION
 from spelgen.logs.trajectory import Trajectory, trajectory_listing
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import SimulationSettings
 from spelgen.simulation.tuning import TUNING as SIMULATION
+
+Progress = Callable[[int, int], None]
+"""Is called with (trajectories done, all) after each trajectory."""
+
+
+def silent(done: int, total: int) -> None:
+    """Show no progress."""
 
 
 class SimulatedLogs(list[Trajectory]):
@@ -87,16 +95,15 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
         t: Times (T,) [s].
     """
     count = settings.simulation.trajectories
-    seeds = np.random.SeedSequence(settings.simulation.seed).spawn(count)
     # Independent generators: the first trajectories are the same for any number of them.
-    randoms = list(map(np.random.default_rng, seeds))
+    randoms = np.random.default_rng(settings.simulation.seed).spawn(count)
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
         # moderate: the middle of the ranges at moderate speeds, as for the first motion of an unknown arm
         middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
-        speeds = []
-        for joint in arm.coordinates:
-            speeds.append(min(SIMULATION.used_range * (joint.velocity or np.inf), SPEEDS[joint.joint_type]))
+        speeds = [
+            min(SIMULATION.used_range * (x.velocity or np.inf), SPEEDS[x.joint_type]) for x in arm.coordinates
+        ]
         bounds = MotionBounds(middle - half, middle + half, np.array(speeds))
         motions = ExcitationTrajectory(float(t[-1]), EXCITATION.min_harmonics, bounds)
         return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]

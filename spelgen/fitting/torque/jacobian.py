@@ -10,10 +10,9 @@ import torch
 from torch.autograd import grad as gradient
 
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.dynamics.parameters import friction_factor, residual_torque
+from spelgen.dynamics.parameters import NamedTensors, evaluate_with, friction_factor, residual_torque
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.functional_model import NamedTensors, evaluate_with
 from spelgen.fitting.torque import linearization
 from spelgen.fitting.torque.linearization import (
     NO_TERMS,
@@ -25,7 +24,7 @@ from spelgen.fitting.torque.linearization import (
 from spelgen.fitting.torque.parameters import ParameterVector, joint_torque, step_in_inertial_parameters
 from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
-from spelgen.runtime.inputs import MotorInputs
+from spelgen.runtime.motors import MotorInputs
 
 LOGARITHMIC_GROUPS = ("armature", "sizes", "effects", "load_dependence")
 

@@ -65,7 +65,7 @@ class TorqueTuning:
     validation_windows: int = 2**8
     # [1] Samples for the selection of residual terms.
     residual_samples: int = 2**14
-    # [1] Smallest noise, as a fraction of a torque's range: noise-free samples are fitted to four digits.
+    # [1] Smallest noise, as a fraction of a torque's standard deviation: noise-free samples are fitted to four digits.
     min_noise: float = 1e-4
     # [1] Standard deviations by which the coefficient of friction compensation must differ from zero.
     min_significance: float = 4.0
