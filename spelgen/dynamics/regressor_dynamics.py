@@ -43,7 +43,7 @@ def urdf_parameters(arm: Chain) -> np.ndarray:
     return np.array([body.inertia or (0,) * 10 for body in arm.bodies], dtype=float).ravel()
 
 
-def _row(values: tuple[object, object, object]) -> Row:
+def _row(values: tuple[object, ...]) -> Row:
     return tuple(map(float, values))  # type: ignore[arg-type]
 
 

@@ -18,7 +18,6 @@ from spelgen.exporting.model_expressions import drive_friction, joint_mass, name
 from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics
 from spelgen.live.noise import TAIL, BlockNoise, NoiseLevels
-from spelgen.live.payload import EVIDENCE, ITERATIONS, LOAD_PRIOR, WEIGHTS
 from spelgen.live.tuning import TUNING
 from spelgen.templates import render
 
@@ -80,7 +79,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     # C has no empty arrays
     breakaway = model.breakaway.ravel() if model.memory else [0.0]
     tables: dict[str, Iterable[float]] = {
-        "load_prior": LOAD_PRIOR,
+        "load_prior": TUNING.load_prior,
         "scales": TUNING.scales,
         "breakaway": breakaway,
     }
@@ -97,9 +96,9 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "tuning": TUNING,
         "supported": f"{levels.supported_alarms:.2g} per minute",
         "windows": repr(60 / TUNING.window * TAIL * model.n),
-        "evidence": repr(EVIDENCE),
-        "iterations": ITERATIONS,
-        "weights": WEIGHTS,
+        "evidence": repr(TUNING.evidence),
+        "iterations": TUNING.iterations,
+        "weights": TUNING.weights,
         "tables": {name: _numbers(row) for name, row in tables.items()},
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, model.input_inverse)),
