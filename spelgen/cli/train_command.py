@@ -124,7 +124,7 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
 
     A new fit gets its own noise levels, an adapted run has the noise levels of its source.
     """
-    from spelgen.live.cross_validation import keep_levels, stored_levels
+    from spelgen.live.levels import keep_levels, stored_levels
     from spelgen.live.replay import carried_payload
 
     if source is None:
