@@ -135,8 +135,8 @@ def suggestion(name: str, names: Iterable[str]) -> str:
     nearest = get_close_matches(name, names, n=1)
     if nearest:
         return f"did you mean {nearest[0]!r}?"
-    more = f" and {len(names) - 10} more" if len(names) > 10 else ""
-    return f"known are {', '.join(map(repr, names[:10]))}{more}"
+    remainder = f" and {len(names) - 10} more" if len(names) > 10 else ""
+    return f"known are {', '.join(map(repr, names[:10]))}{remainder}"
 
 
 def shortened(names: Sequence[str], limit: int) -> str:

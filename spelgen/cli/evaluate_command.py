@@ -1,4 +1,4 @@
-"""Commands about trained runs: `evaluate` and `estimate` along logs, `report`, and `compare`, which trains many runs."""
+"""Commands about trained runs: `evaluate` and `estimate` along logs, `report`, and `compare` of many runs."""
 
 from __future__ import annotations
 
