@@ -148,8 +148,8 @@ def _evaluate_torques(
     model = without_idle_residuals(tested.model)
     # chosen per predictor: stiff friction needs more steps, and its error must not count as an error of the dynamics
     solver = accurate_solver(model, probe)
-    known = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
-    predictors = [Predictor(MODEL, solver, model), *torque_predictors(known)]
+    arm = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
+    predictors = [Predictor(MODEL, solver, model), *torque_predictors(arm)]
     predictors += [of_dynamics(name, dynamics, probe) for name, dynamics in baselines.items()]
     tip = _tip(tested, notes)
     horizons: list[Horizon] = []
