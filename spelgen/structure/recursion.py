@@ -17,6 +17,9 @@ from spelgen.arm.arm import Body, Chain
 Element = Any
 """An element of the ring: an object with +, - and *, with other elements and with integers."""
 
+Number = Callable[[Fraction], Element]
+"""Conversion of the exact constants of an arm to elements of the ring."""
+
 Vector = tuple[Element, ...]
 Terms = tuple[tuple[int, Element], ...]
 
@@ -65,10 +68,7 @@ def triangle(n: int) -> list[tuple[int, int]]:
 
 
 def energies(
-    arm: Chain,
-    positions: Sequence[Position],
-    inertias: Sequence[Sequence[Element]],
-    number: Callable[[Fraction], Element],
+    arm: Chain, positions: Sequence[Position], inertias: Sequence[Sequence[Element]], number: Number
 ) -> Energies:
     """Return the mass matrix and the potential energy of ``arm``.
 
@@ -112,7 +112,7 @@ def energies(
 
 
 def coefficients(
-    arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Callable[[Fraction], Element]
+    arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Number
 ) -> list[Element]:
     """Return the coefficients of the inertial parameters in the entries of M, row after row, and then in V.
 
@@ -123,7 +123,7 @@ def coefficients(
     return [*result.mass.values(), result.potential]
 
 
-def _motions(arm: Chain, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[_Pose]:
+def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
     """Return the motion of the joint of each body, about or along z, at these positions of the coordinates."""
     bases = base_denominators(arm)
     motions = []
@@ -267,7 +267,7 @@ def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
     return _Inertia(inertia.mass, tuple(moment), tuple(tensor.values()))
 
 
-def _terms(row: Sequence[Fraction], number: Callable[[Fraction], Element]) -> Terms:
+def _terms(row: Sequence[Fraction], number: Number) -> Terms:
     # Products with the integers 1 and -1 cost nothing, unlike those with elements of the ring.
     return tuple((i, int(x) if abs(x) == 1 else number(x)) for i, x in enumerate(row) if x)
 
