@@ -59,7 +59,6 @@ class _Pose(NamedTuple):
 
 _Wrench = tuple[Vector, Vector]
 """A force, and its moment about the origin of the frame."""
-_UNROTATED = (((0, 1),), ((1, 1),), ((2, 1),))
 
 
 def triangle(n: int) -> list[tuple[int, int]]:
@@ -135,7 +134,7 @@ def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[
                 slide = number(body.multiplier) * slide
             if body.offset:
                 slide = slide + number(Fraction(str(body.offset)))
-            motions.append(_Pose(_UNROTATED, ((2, slide),)))
+            motions.append(_Pose((((0, 1),), ((1, 1),), ((2, 1),)), ((2, slide),)))
         else:
             factor = int(body.multiplier * bases[body.coordinate])
             c, s = _multiple_angle(position.cos, position.sin, factor)
