@@ -84,6 +84,25 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     return np.asarray(outliers & is_beyond)
 
 
+def is_stale(values: np.ndarray, changes: np.ndarray, least: float) -> np.ndarray:
+    """Return a mask (T,) of samples that repeat an old value for long, in a signal that otherwise changes.
+
+    The step to the value after them is large: quantised signals, and drives with a dead zone, go on with a typical one.
+    changes: (T,), a signal that cannot change by more than `least` while the values are constant.
+    """
+    stale = np.zeros(len(values), bool)
+    starts = np.flatnonzero(np.diff(values, prepend=np.nan))
+    lengths = np.diff(np.append(starts, len(values)))
+    steps = np.append(np.abs(np.diff(values[starts])), np.inf)
+    is_long = lengths > 20.0 * max(1.0, float(np.median(lengths)))
+    is_long &= (steps > 4.0 * _usual(steps[:-1])) & (len(starts) > 1)
+    for start, length in zip(starts[is_long], lengths[is_long], strict=True):
+        rows = slice(start + 1, start + length)
+        if np.ptp(changes[rows]) > least:
+            stale[rows] = True
+    return stale
+
+
 def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return the rows after which a position (T,) jumps: faster than any arm, and than typical steps.
 

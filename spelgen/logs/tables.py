@@ -34,6 +34,7 @@ class Layout:
     file: for errors and trajectories. columns: of t, then of q, qd and tau per joint; without qd if velocities are
     differentiated. labels: the column with the names of recordings; None if there is none. accepted: see `Trajectory`.
     recording: name of the recording if the format separates recordings. remarks: facts about the file.
+    header: lines of a CSV before its values.
     """
 
     file: Path
@@ -44,10 +45,11 @@ class Layout:
     accepted: tuple[str, ...]
     recording: str | None = None
     remarks: tuple[str, ...] = ()
+    header: int = 1
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about a column in a data row, counted from 0, with the line of a CSV file."""
-        line = int(row) + 2 if self.file.suffix == ".csv" else None
+        """Return an error about a column in a 0-based data row, with the line of a CSV."""
+        line = int(row) + 1 + self.header if self.file.suffix == ".csv" else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
 
@@ -101,8 +103,6 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
-    elif all(mapping.unit("q", joint) for joint in joints):
-        accepted += ("degrees",)
     return Layout(file, tuple(columns), labels, tuple(joints), mapping, accepted)
 
 

@@ -19,31 +19,45 @@ from spelgen.settings.values import Group, Number, Positive
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
 # factors to SI units; SI units themselves are not listed
-LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mm": _MILLI}
+LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mrad": _MILLI, "mm": _MILLI}
 SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
-CURRENTS = ("A", "mA")
+# of a torque that only a gain converts: currents, and parts of a torque that the log does not state
+CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
 # -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
 NORMALISED = "normalised"
 ONLY = {  # units that a joint of this type cannot have
     "revolute": ("m", "mm", "m/s", "mm/s", "N"),
-    "prismatic": ("normalised", "rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
+    "prismatic": (
+        "normalised",
+        "rad",
+        "deg",
+        "turns",
+        "mrad",
+        "rad/s",
+        "deg/s",
+        "turns/s",
+        "mrad/s",
+        "rpm",
+        "Nm",
+        "mNm",
+    ),
 }
 
 LONGEST_DELAY = 1.0  # s
 
 Accepted = Literal[
     "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",
-    "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "joint-sense", "joint-order", "joint-zero",
-    "gravity", "gravity-compensated", "torque-clipped",
+    "velocity-is-no-derivative", "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "motion-order",
+    "joint-sense", "joint-order", "joint-unit", "joint-zero", "gravity", "gravity-compensated", "torque-clipped",
 ]  # fmt: skip
 """Codes of errors of `spelgen logs` that a user can accept."""
 
 Time = Literal["s", "ms", "us", "ns"]
-Position = Literal["rad", "deg", "turns", "counts", "normalised", "m", "mm"]
-Velocity = Literal["rad/s", "deg/s", "turns/s", "rpm", "counts/s", "m/s", "mm/s"]
-Effort = Literal["Nm", "mNm", "N", "A", "mA"]
+Position = Literal["rad", "deg", "turns", "mrad", "counts", "normalised", "m", "mm"]
+Velocity = Literal["rad/s", "deg/s", "turns/s", "mrad/s", "rpm", "counts/s", "m/s", "mm/s"]
+Effort = Literal["Nm", "mNm", "N", "A", "mA", "percent", "permille"]
 
 
 class LogColumns(Group):
