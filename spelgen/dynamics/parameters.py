@@ -75,6 +75,7 @@ def idle_residuals(model: object) -> list[str]:
     terms = residual_terms(model)
     if terms is None:
         return []
+    # of single joints; hidden layers of networks are never zero
     idle = [name for name, weights in terms.named_parameters(recurse=False) if not weights.any()]
     for prefix, network in (("mass", terms.mass), ("potential", terms.potential)):
         if _is_idle(network):
@@ -104,6 +105,7 @@ def without_idle_residuals(model: Model) -> Model:
         terms = reduced.residuals
         terms.mass = None if _is_idle(terms.mass) else terms.mass
         terms.potential = None if _is_idle(terms.potential) else terms.potential
+        # without any term, the factor on friction is one and needs no evaluation either
         if not any(bool(weights.any()) for weights in terms.parameters()):
             reduced.residuals = None
     return reduced

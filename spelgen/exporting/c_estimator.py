@@ -49,16 +49,20 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     gradient = kinetic_gradient + residuals["kinetic"] - gravity - residuals["gravity"] - residuals["torque"]
     applied = constant(model.inputs) @ (tau - model.torque_offset)
     torque = applied + constant(model.friction_compensation) * qd + gradient
+    # the friction state is known up to an interval: its middle is the friction, half its width the uncertainty
     first, second = (drive_friction(model, residuals, qd, gravity, z) for z in (high, low))
+    # of the last body's frame, in root axes: linear, then angular rows
+    pose, jacobian = frame_kinematics(bodies, len(bodies) - 1, np.eye(4), q)
+    rotation, weight = pose[:3, :3], load[0] * constant(model.arm.gravity)
     load_momentum, load_gradient = payload.momentum(qd)
-    load_gradient -= payload.torque(still, still)
-    pose = np.eye(4)
-    pose[:3, 3] = levels.point
-    _, jacobian = frame_kinematics(bodies, len(bodies) - 1, pose, q)
+    moment = ca.cross(rotation @ load[1:4], constant(model.arm.gravity))
+    # not by Newton-Euler: with its rounding errors, log odds differ 40 times as much from Python's
+    load_gradient += jacobian.T @ ca.vertcat(weight, moment)
+    at_point = jacobian[:3, :] - ca.skew(rotation @ levels.point) @ jacobian[3:, :]
     outputs = {
         "momentum_balance": (
             momentum, torque, (first + second) / 2, ca.fabs(first - second) / 2,
-            ca.jacobian(load_momentum, load), ca.jacobian(load_gradient, load), jacobian[:3, :],
+            ca.jacobian(load_momentum, load), ca.jacobian(load_gradient, load), at_point,
         ),
         "payload_torque": (payload.torque(qd, qdd),),
     }  # fmt: skip
