@@ -179,7 +179,7 @@ def _require_finite(weights: Content, path: Path) -> None:
 
 def write_state(path: Path, state: Content) -> None:
     """Write a state with torch.save, all or nothing."""
-    # in memory first: an interruption leaves the former file
+    # in memory first: after an interruption the former file is still there
     buffer = io.BytesIO()
     torch.save(state, buffer)
     write_bytes(path, buffer.getvalue())
