@@ -115,7 +115,7 @@ def short_name(name: str) -> str:
     """Return a name from a file for a line of a table: shortened, without control characters."""
     # line ends and tabs of a name would break the table
     line = " ".join(printable(name).split())
-    # a table of 80 columns has room for 36 characters beside its numbers
+    # a table of 80 columns has room for 36 characters and its numbers
     return f"{line[:33]}..." if len(line) > 36 else line or '""'
 
 

@@ -33,7 +33,7 @@ class Axes:
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
         generator = random.Random(0)  # reproducible reports
         # per configuration: directions (n, 3) and twists (n, 6) of the axes
-        # two are enough: each alone fails to refute with a probability of about the degree divided by 1e6
+        # two are enough: each one fails to refute with a probability of about the degree divided by 1e6
         self._configurations = [_configuration(arm, generator) for _ in range(2)]
 
     def parallel(self, a: int, b: int) -> bool:

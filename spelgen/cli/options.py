@@ -137,7 +137,7 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
 
 def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
     """Return the paths of all options --data. Raises a usage error if there are none."""
-    # an option and not an argument, so that a forgotten --data is not taken for the name of a module
+    # an option and not an argument, so that a log after a forgotten --data is not read as the name of a module
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
     return [*data, *(extra_logs or [])]

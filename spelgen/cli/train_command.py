@@ -81,7 +81,7 @@ def train(
     # with --resume, the argument may be the run folder
     folder = output or _default_folder(module, source, resume=resume)
     spec = _specification(module, source, folder if resume else None)
-    # a resumed run keeps the settings of its record, not those of a file that may have changed since
+    # a resumed run keeps the settings of its record, not the settings of a file that may have changed since
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
     start = resumed_run(folder, request) if resume else new_run(urdf, request)
     from spelgen.emission.specify import arm_of_spec

@@ -124,7 +124,7 @@ class Objective(ABC):
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """Run the fit until a stopping criterion holds, and return it; call ``save`` to write a `checkpoint`.
 
-        By default nothing is left to do after `begin`. KeyboardInterrupt may be raised at any time.
+        By default `begin` does the whole fit. KeyboardInterrupt may be raised at any time.
         """
         return "finished"
 
