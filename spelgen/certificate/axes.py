@@ -122,7 +122,7 @@ def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarra
     axes, twists = [], []
     numbers = range(
         1, 10**6
-    )  # numerators and denominators: the more, the rarer is a relation that holds by chance
+    )  # of numerators and denominators: with a larger bound fewer relations hold by chance
     rotation, origin = IDENTITY, ZERO
     for body in arm.bodies:
         origin = origin + rotation @ np.array(body.translation)

@@ -113,7 +113,7 @@ class Objective(ABC):
         """Do the steps of a new fit before its first checkpoint; return diagnostics."""
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Continue from the files of a run folder, by default with a fitted model.
+        """Continue from the files of a run folder. By default the fit is complete, and its best weights are loaded.
 
         Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError for files of another model.
         """

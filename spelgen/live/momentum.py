@@ -114,7 +114,7 @@ def _weight(at: LoadAxes) -> Tensor:
 
 
 def load_terms(at: LoadAxes) -> tuple[Tensor, Tensor]:
-    """Return P and N, (T, n, 10)."""
+    """Return P and N of the momentum balance of a payload (see the module), (T, n, 10)."""
     momentum = at.ratios.mT @ _projected(at.axes, at.twist)
     return momentum, at.ratios.mT @ (_projected(at.turning, at.twist) + _weight(at))
 
