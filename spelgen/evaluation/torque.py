@@ -14,8 +14,7 @@ from spelgen.dynamics.protocol import known_past
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.plain import finite
 from spelgen.identification.tuning import TUNING as LEAST_SQUARES
-from spelgen.log_checks.statistics import quantisation_step
-from spelgen.log_checks.tuning import TUNING as LOG_CHECKS
+from spelgen.log_checks.statistics import has_few_levels, quantisation_step
 from spelgen.logs.dynamics_samples import DynamicsSamples, is_moving
 from spelgen.logs.trajectory import Trajectory, joined_column
 
@@ -110,7 +109,7 @@ def coarse_torques(
         # infinite for a log that is not quantised; the median: most of the logs are quantised
         step = float(np.median(np.nan_to_num([quantisation_step(log.tau[:, k]) for log in logs], nan=np.inf)))
         torque = joined_column(logs, "tau")[:, k]
-        if np.isfinite(step) and np.ptp(torque) < LOG_CHECKS.levels * step:
+        if np.isfinite(step) and has_few_levels(step, float(np.ptp(torque))):
             steps[joint] = step
             message = (
                 f"the torque of {joint} is logged in steps of {step:.3g}, as large as the torque itself: "

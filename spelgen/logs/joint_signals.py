@@ -6,32 +6,62 @@ the acceleration is H(f) = J_m + J_l / (1 - (f / f_0)^2), with the resonance f_0
 joint has H = J + c / f^2, with a constant c due to gravity.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.labels import counted
-from spelgen.logs.jumps import held_samples, is_lost, is_outlier, jumps, read_as_words
-from spelgen.logs.recording import listed_times, outlier_rows
+from spelgen.logs.jumps import is_lost, is_outlier, jumps, read_as_words
+from spelgen.logs.recording import listed_times, outlier_rows, stale_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SIGNALS, shows_accelerations
 
 
 class Advice(NamedTuple):
-    """Finding of a check with a remedy that the check has tested."""
+    """Finding of a check, and the keys of the joint and of the group `logs` that remedy it, which are tested."""
 
     message: str
-    do: str
+    joint: Mapping[str, Any] = {}
+    keys: Mapping[str, Any] = {}
+
+    @property
+    def is_line(self) -> bool:
+        """Whether there is a remedy."""
+        return bool(self.joint or self.keys)
+
+
+def settings_line(keys: Mapping[str, object]) -> str:
+    """Return keys of the settings as YAML in one line, without the outer braces."""
+    text: str = yaml.safe_dump(dict(keys), default_flow_style=True, sort_keys=False, width=float("inf"))
+    return text.strip()[1:-1]
+
+
+def mapping_line(keys: Mapping[str, object]) -> str:
+    """Return the advice to write keys of the group `logs`."""
+    return f"write '{settings_line(keys)}' under 'logs' in the robot's YAML"
+
+
+def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str]) -> dict[str, object]:
+    """Return the keys of single joints for the group `logs`; units that all joints of an arm share are its units."""
+    first = next(iter(entries.values()))
+    if first.keys() == {"units"} and all(entries.get(joint) == first for joint in joints):
+        return dict(first)
+    return {"joints": dict(entries)}
+
+
+def plain_number(value: float, digits: int = 5) -> float:
+    """Return a number rounded to some digits; an integer if it is one."""
+    rounded = float(f"{value:.{digits}g}")
+    return int(rounded) if rounded.is_integer() else rounded
 
 
 class JointSignals(NamedTuple):
     """Signals of one joint in one trajectory: the subject of the checks without the robot.
 
-    q, qd: (T,). factor: ratio of dq/dt to qd; NaN for a joint at rest. correlations: of qd with dq/dt of each joint;
+    q, qd: (T,). factor: ratio of dq/dt to qd; NaN for a joint at rest. correlations: of dq/dt with qd of each joint;
     NaN for a joint at rest.
     """
 
@@ -88,6 +118,27 @@ def is_factor(value: float, unit: float) -> bool:
     return 0.8 < value / unit < 1.25
 
 
+def find_frozen(signals: JointSignals) -> str | Advice | None:
+    """Find a position or a velocity that never changes while the other one does, and values that are old for long."""
+    from scipy.integrate import cumulative_trapezoid
+
+    # [rad, m] above this integral of qd a constant q is frozen, and the reverse
+    t, q, qd, motion = signals.trajectory.t, signals.q, signals.qd, 0.05
+    if np.ptp(qd) == 0 and np.ptp(q) > motion:
+        return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
+    # by the trapezoidal rule, so that noise of qd about zero has a small integral
+    drift = np.abs(cumulative_trapezoid(qd, t)).max(initial=0.0)
+    if np.ptp(q) == 0 and drift > motion:
+        return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
+    for name in signals.measured if "qd" in signals.measured else ():
+        rows = np.flatnonzero(stale_rows(name, signals.signal(name), t, q, qd))
+        if rows.size:
+            value, count = signals.signal(name)[rows[0]], counted(len(rows), "sample")
+            message = f"{name} that stays at {value:.4g} while the joint moves, in {count} from t = {t[rows[0]]:.4g} s"
+            return Advice(message, keys={"dropouts": "dropped"})
+    return None
+
+
 def find_dropouts(signals: JointSignals) -> str | None:
     """Find lost samples and outliers."""
     for name in signals.measured:
@@ -120,62 +171,34 @@ def find_jumps(signals: JointSignals) -> str | Advice | None:
 
 def _find_words(signals: JointSignals, name: str) -> Advice | None:
     """Find undecoded register words, or wrapped angles, in "q", "qd", "tau" or "u" of the joint."""
-    mapping, values, joint = signals.trajectory.mapping, signals.signal(name), signals.joint
-    scale, offset = mapping.scale(name, joint), mapping.offset(name, joint)
-    turn = None if signals.kind == "prismatic" or name not in ("q", "u") else 2 * np.pi / abs(scale)
+    mapping, values = signals.trajectory.mapping, signals.signal(name)
+    scale, offset = mapping.scale(name, signals.joint), mapping.offset(name, signals.joint)
+    unit = mapping.unit(name, signals.joint)
+    turns: list[float | None] = [None]
+    if signals.kind != "prismatic" and name in ("q", "u"):
+        # angles without a stated unit may be in degrees
+        turns = [2 * np.pi / abs(scale), *([360.0] if unit is None else [])]
     # a lost sample or an outlier has two jumps, unlike a register
     values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
-    word = read_as_words((values - offset) / scale, turn)
-    if word is None:
-        return None
-    # commands may jump: they count as words only if decoded commands are close to the positions
-    if name == "u":
-        q = signals.q[~is_lost(signals.signal("u"))]
-        if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
-            return None
-    unit = mapping.unit(name, joint) or ("as logged" if turn is None else "rad")
-    size, count = float(f"{word.value:.9g}"), counted(word.jumps, "time")
-    what = "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
-    line = f"joints: {{{joint}: {{{word.key}: {{{name}: {size:.9g}}}}}}}"
-    message = f"{name} that jumps by {size:.6g} ({unit}), {count}: {what}"
-    return Advice(message, f"write '{line}' under 'logs' in the robot's YAML")
-
-
-def find_held(signals: JointSignals) -> str | None:
-    """Find signals whose values are held over several rows."""
-    rate = signals.trajectory.sample_rate
-    for name in signals.measured:
-        often = held_samples(signals.signal(name))
-        if often > 1:
-            rates = f"{rate / often:.3g} times a second in rows at {rate:.3g} Hz"
-            return f"{name} that changes {rates}: each value lasts {often} samples"
+    for turn in turns:
+        word = read_as_words((values - offset) / scale, turn)
+        if word is None:
+            continue
+        # commands may jump: they count as words only if decoded commands are close to the positions
+        if name == "u":
+            q = signals.q[~is_lost(signals.signal("u"))]
+            if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
+                return None
+        keys: dict[str, object] = {word.key: {name: plain_number(word.value, 9)}}
+        if turn == 360.0 and unit is None:
+            unit, keys = "deg", {"units": {name: "deg"}} | keys
+        unit = unit or ("as logged" if turn is None else "rad")
+        what = (
+            "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
+        )
+        message = f"{name} that jumps by {word.value:.6g} ({unit}), {counted(word.jumps, 'time')}: {what}"
+        return Advice(message, keys)
     return None
-
-
-def find_too_rare(signals: JointSignals) -> str | None:
-    """Find held signals from which no acceleration can be computed; arms under servos need none."""
-    rate = signals.trajectory.sample_rate
-    if signals.trajectory.u is not None or not shows_accelerations(rate):
-        return None
-    held = max(held_samples(signals.signal(name)) for name in signals.measured)
-    return None if shows_accelerations(rate / held) else find_held(signals)
-
-
-def find_unsigned_velocity(signals: JointSignals) -> str | None:
-    """Find velocities that are the magnitude of dq/dt."""
-    # largest velocity of the rarer sign, relative to the largest velocity, of a signal without sign
-    trajectory, qd, share = signals.trajectory, signals.qd, 0.05
-    lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
-    # the velocity noise of a joint at rest has both signs
-    if trajectory.mapping.velocity == "differentiated" or lowest > share * highest or len(qd) < 3:
-        return None
-    speed = np.gradient(signals.q, trajectory.t)
-    backward, forward = sorted((-np.quantile(speed, 0.02), np.quantile(speed, 0.98)))
-    if backward < share * forward or abs(qd).std() == 0:
-        return None
-    if not np.corrcoef(np.abs(speed), np.abs(qd))[0, 1] > 0.9:
-        return None
-    return f"qd that is the magnitude of dq/dt: from {qd.min():.3g} to {qd.max():.3g} while q goes both ways"
 
 
 def find_elastic(signals: JointSignals) -> str | None:

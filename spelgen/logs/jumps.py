@@ -4,8 +4,6 @@ Every function takes one signal (T,) or the columns of a log (T, C), of any form
 difference between neighbouring samples, the typical step the median of the steps that are not 0.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -86,6 +84,25 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     return np.asarray(outliers & is_beyond)
 
 
+def is_stale(values: np.ndarray, changes: np.ndarray, least: float) -> np.ndarray:
+    """Return a mask (T,) of samples that repeat an old value for long, in a signal that otherwise changes.
+
+    The step to the value after them is large: quantised signals, and drives with a dead zone, go on with a typical one.
+    changes: (T,), a signal that cannot change by more than `least` while the values are constant.
+    """
+    stale = np.zeros(len(values), bool)
+    starts = np.flatnonzero(np.diff(values, prepend=np.nan))
+    lengths = np.diff(np.append(starts, len(values)))
+    steps = np.append(np.abs(np.diff(values[starts])), np.inf)
+    is_long = lengths > 20.0 * max(1.0, float(np.median(lengths)))
+    is_long &= (steps > 4.0 * _usual(steps[:-1])) & (len(starts) > 1)
+    for start, length in zip(starts[is_long], lengths[is_long], strict=True):
+        rows = slice(start + 1, start + length)
+        if np.ptp(changes[rows]) > least:
+            stale[rows] = True
+    return stale
+
+
 def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return the rows after which a position (T,) jumps: faster than any arm, and than typical steps.
 
@@ -114,9 +131,8 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     index = np.arange(len(columns)) - np.repeat(starts, lengths)
     if len(starts) < 4 or not index.any():
         return np.repeat(is_held, lengths), 1
-    steps = np.abs(
-        np.diff(columns[starts, :positions], axis=0)
-    )  # after each block of equal rows except the last
+    # after each block of equal rows except the last
+    steps = np.abs(np.diff(columns[starts, :positions], axis=0))
     speeds = steps[1:] / lengths[1:-1, None]
     quantum = np.min(np.where(steps > 0, steps, np.inf), axis=0)
     makes_up = (steps[:-1] > 2.5 * quantum) & (steps[:-1] > 0.6 * lengths[:-2, None] * speeds)

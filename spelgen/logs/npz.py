@@ -1,7 +1,5 @@
 """Reader of NPZ archives, with an array per column, or matrices with a column per joint."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -140,6 +138,8 @@ def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str]) -> li
     if JOINT_NAMES not in arrays.names:
         if width != len(joints):
             expected, do = f"{len(joints)}, one for each joint", f"name them by an array {JOINT_NAMES!r}"
+            if len(arrays[matrix]) == len(joints):
+                do = "transpose it: rows are times"
             raise arrays.error(matrix, f"{width} columns", expected, do)
         return list(range(width))
     names = list(map(str, arrays[JOINT_NAMES].ravel()))

@@ -1,7 +1,5 @@
 """Conversion of rows in SI units to trajectories: order, wraps, repeats, outliers, velocities, delay of torques."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from math import pi
@@ -10,7 +8,7 @@ import numpy as np
 
 from spelgen.errors import LogError
 from spelgen.labels import counted
-from spelgen.logs.jumps import centred, is_outlier, jump_count, repeated_rows, unwrapped
+from spelgen.logs.jumps import centred, is_outlier, is_stale, jump_count, repeated_rows, unwrapped
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import TUNING
@@ -102,8 +100,11 @@ def _without_outliers(
     """Return rows (T, C) without lost samples and outliers, and messages that list them."""
     outliers = np.zeros(len(data), bool)
     found = []
-    for (quantity, joint), values in zip(signals, data[:, 1:].T, strict=True):
+    columns = dict(zip(signals, data[:, 1:].T, strict=True))
+    for (quantity, joint), values in columns.items():
         rows = outlier_rows(quantity, values)
+        if ("qd", joint) in columns:
+            rows |= stale_rows(quantity, values, data[:, 0], columns["q", joint], columns["qd", joint])
         # commands may jump
         if quantity != "u" and rows.any():
             outliers |= rows
@@ -118,6 +119,19 @@ def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau"; zero velocities are not lost."""
     rows = is_outlier(values, smooth=quantity == "q")
     return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
+
+
+def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+    """Return a mask (T,) of samples of "q", "qd" or "tau" of a moving joint that repeat an old value for long.
+
+    A torque at its largest or smallest value is not stale, but clipped, and the last one may be of a motor at rest.
+    """
+    if quantity == "tau":
+        stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
+        return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
+    from scipy.integrate import cumulative_trapezoid  # takes long to import
+
+    return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)  # rad, m
 
 
 def listed_times(t: np.ndarray) -> str:

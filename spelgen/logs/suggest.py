@@ -3,8 +3,6 @@
 Units that neither names nor times specify remain SI: the checks of logs detect degrees, and state the lines to write.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import re
@@ -16,11 +14,12 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
-from spelgen.logs.checks import time_unit
 from spelgen.logs.formats import FORMATS, format_of
 from spelgen.logs.parquet_files import LEROBOT, dataset_motors
 from spelgen.logs.tables import names_joint, reading
 from spelgen.logs.tuning import TUNING
+from spelgen.logs.unit_checks import time_unit
+from spelgen.settings.log_mapping import CURRENTS
 
 WORDS = {
     "t": {"t", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis"},
@@ -38,9 +37,12 @@ NOT_MEASURED = COMMANDED | {"error", "std"}
 UNITS = {
     "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "ns": "ns"},
     "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad",
-          "counts": "counts", "ticks": "counts", "turns": "turns", "mm": "mm", "m": "m"},
-    "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "rpm": "rpm", "mm/s": "mm/s"},
-    "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA"},
+          "mrad": "mrad", "counts": "counts", "ticks": "counts", "turns": "turns", "rev": "turns", "mm": "mm",
+          "m": "m"},
+    "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "mrad/s": "mrad/s", "°/s": "deg/s",
+           "rev/s": "turns/s", "rpm": "rpm", "mm/s": "mm/s"},
+    "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
+            "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
 BARE = {"s", "n", "a", "m"}  # letters that count as units only in brackets
 CURRENT = {"current", "currents", "curr", "cur"}
@@ -81,8 +83,10 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         raise LogError(got, file=file, expected="one of times, called t or time")
     # a header has the time of measurement, other columns may be times of receipt; else the shortest name is used
     clock = min(found.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
+    # loggers have orders of their own, ROS often the alphabetical one
     order = _order_in_cells(table, joints)
     by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in found.items()}
+    # velocities of some joints only are worth less than those of all by differentiation
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)
@@ -97,11 +101,15 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     for joint in joints:
         entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
         lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}"]
-        if units.get("tau") in ("A", "mA"):
+        if units.get("tau") in CURRENTS:
             at_joint = "at the joint, the gear included: write its value"
             lines.append(f"    gain: 1.0 # Nm per {units['tau']} {at_joint}")
         if units.get("q") == "counts":
             lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
+    used = {column.name for named in by_joint.values() for column in named.values()}
+    others = [x.name for quantity in by_joint for x in found[quantity] if x.name not in used]
+    if others:  # of a gripper, or of another arm with the same names
+        lines.append(f"# not used: {shortened(others, TUNING.listed)}")
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     return _suggestion(lines, missing, "column")
 

@@ -1,7 +1,5 @@
 """Result of all readers of logs: a table, and its columns for the quantities of an arm."""
 
-from __future__ import annotations
-
 import difflib
 import re
 import zipfile
@@ -11,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, starmap
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
 
@@ -35,6 +34,7 @@ class Layout:
     file: for errors and trajectories. columns: of t, then of q, qd and tau per joint; without qd if velocities are
     differentiated. labels: the column with the names of recordings; None if there is none. accepted: see `Trajectory`.
     recording: name of the recording if the format separates recordings. remarks: facts about the file.
+    header: lines of a CSV before its values.
     """
 
     file: Path
@@ -45,10 +45,11 @@ class Layout:
     accepted: tuple[str, ...]
     recording: str | None = None
     remarks: tuple[str, ...] = ()
+    header: int = 1
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about a column in a data row, counted from 0, with the line of a CSV file."""
-        line = int(row) + 2 if self.file.suffix == ".csv" else None
+        """Return an error about a column in a 0-based data row, with the line of a CSV."""
+        line = int(row) + 1 + self.header if self.file.suffix == ".csv" else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
 
@@ -56,8 +57,7 @@ class Layout:
 LogTable = tuple[Layout, pa.Table]
 
 
-@dataclass(frozen=True)
-class LogFormat:
+class LogFormat(NamedTuple):
     """A format of logs: its files and its reader.
 
     read: function of a path, the joints and the mapping that returns tables, or raises LogError. suffixes: of its
@@ -103,8 +103,6 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
-    elif all(mapping.unit("q", joint) for joint in joints):
-        accepted += ("degrees",)
     return Layout(file, tuple(columns), labels, tuple(joints), mapping, accepted)
 
 
@@ -131,6 +129,7 @@ def missing_columns(
     patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]
     of_joints = dict(zip(joints, zip(*of_quantity.values(), strict=True), strict=True))
     unlogged = [joint for joint, names in of_joints.items() if set(names) <= set(missing)]
+    # a joint without any column was not logged; a wrong name affects one of its columns
     if unlogged and len(unlogged) < len(joints):
         logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (

@@ -1,7 +1,5 @@
 """Constants of reading, checking and preparing logs, and the limits of their sample rates."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 
@@ -47,6 +45,9 @@ class SignalCheckTuning:
 
     # [1] Correlation from which on two signals are proportional; 1 minus it is the tolerance of a factor of 1.
     agreement: float = 0.9
+    # [1] Samples over which q and the integral of qd are compared: between neighbours the quantisation of q may be
+    # larger than its change.
+    increments: int = 10
     # [s] Smallest and largest median time between samples: no arm is sampled above 10 kHz or below 2 Hz.
     fastest_step: float = 1e-4
     slowest_step: float = 0.5
