@@ -49,7 +49,7 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
         model.raw_armature.copy_((armature / model.nominal_armature).log())
         friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=smallest).log())
         # such logs determine only the sum of viscous friction and kd: it is fitted as kd. Friction terms are logarithms
-        # relative to a nominal value: these are negligible, and Stribeck friction is small
+        # relative to a nominal value: negligible ones, and a small Stribeck friction
         friction.raw_viscous.fill_(-6.0)
         friction.raw_saturation.fill_(-6.0)
         friction.raw_stribeck.fill_(-2.0)
