@@ -45,7 +45,7 @@ def mapping_line(keys: Mapping[str, object]) -> str:
 
 
 def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str]) -> dict[str, object]:
-    """Return the keys of single joints for the group `logs`; units that all joints of an arm share are its units."""
+    """Return the keys of joints for the group `logs`; a unit that is equal at all joints becomes a unit of the log."""
     first = next(iter(entries.values()))
     if first.keys() == {"units"} and all(entries.get(joint) == first for joint in joints):
         return dict(first)
