@@ -302,7 +302,7 @@ def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], joint: UrdfJoin
     for body in (moving.body for moving in moved):
         # a body rotates about the z axis of its frame
         beside = np.array(body.rotation, dtype=float)[:, 2]
-        is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2  # [rad] rounding included
+        is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2  # [rad] parallel within rounding errors
         if body.parent == frame.body >= 0 and body.joint_type != "prismatic" and is_parallel:
             parallel.append(body.name)
     return parallel

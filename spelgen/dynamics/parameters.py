@@ -23,10 +23,9 @@ class ParameterInfo:
 
     kind: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of friction), effects (friction that
     varies with velocity), velocities, load_dependence, fractions (of bristles), torque_splines, torque_ripple,
-    friction_splines, mass_constants, mass_residuals, stiffness, damping,
-    dead_zone, delay, or network. unit: of the quantity that the parameter represents, of revolute and of prismatic
-    joints;
-    most parameters are logarithms of it, relative to a nominal value.
+    friction_splines, mass_constants, mass_residuals, stiffness, damping, dead_zone, delay, or network. unit: of the
+    quantity that the parameter represents, of revolute and of prismatic joints; most parameters are logarithms of it,
+    relative to a nominal value.
     """
 
     kind: str

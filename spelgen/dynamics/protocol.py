@@ -117,7 +117,7 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        # the state of friction is passed through: rollouts ask these dynamics for it
+        # the friction state is passed through: rollouts read it from these dynamics
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements

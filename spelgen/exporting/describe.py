@@ -248,7 +248,7 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
     cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
-        # number of leading frequencies 1, 2, ...; those of the motor are multiples of its gear ratio
+        # number of leading frequencies 1, 2, ...; frequencies of the motor are multiples of its gear ratio
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]

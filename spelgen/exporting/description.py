@@ -137,7 +137,7 @@ class EntryPoint:
 
 
 def read_entries(text: str) -> dict[str, EntryPoint]:
-    """Return entry points by name: of each, a line ``name(inputs) -> output [unit], ...``, then what it returns."""
+    """Return entry points by name: of each, a line ``name(inputs) -> output [unit], ...``, then its description."""
     entries = {}
     lines = text.strip().splitlines()
     for signature, about in zip(lines[::2], lines[1::2], strict=True):

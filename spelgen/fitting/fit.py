@@ -105,7 +105,7 @@ def fit(
     if run is not None and not options.resume:
         # Before the logs are filtered and cut, which may take minutes.
         run.require_free(force=options.force)
-    # locked after the request was checked: there is no folder after a wrong option
+    # locked after the request was checked: a wrong option creates no folder
     with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
         return _Fitting(request, objective, run).fitted()

@@ -47,7 +47,7 @@ class Objective(ABC):
         """Do the steps of a new fit before its first checkpoint; return diagnostics."""
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Continue from the files of a run folder, by default with a fitted model.
+        """Continue from the files of a run folder. By default the fit is complete, and its best weights are loaded.
 
         Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError for files of another model.
         """
@@ -58,7 +58,7 @@ class Objective(ABC):
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """Run the fit until a stopping criterion holds, and return it; call ``save`` to write a `checkpoint`.
 
-        By default `begin` has done everything. KeyboardInterrupt may be raised at any time.
+        By default `begin` does the whole fit. KeyboardInterrupt may be raised at any time.
         """
         return "finished"
 

@@ -96,7 +96,7 @@ def robot_of(
         raise ModuleError("another URDF than the module was built from", file=path, do=do)
     if urdf is not None:
         raise RunError("no such file", file=path, expected="the URDF the module was built from")
-    # the user has not named this file: the fit needs none
+    # a file next to the module was not requested: the fit continues without it
     if exists:
         code = "changed-urdf"
         message = (

@@ -35,7 +35,7 @@ class CsvText(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the one table of a file; a last line that is cut off is left out, with a remark."""
+    """Return the one table of a file; a last line that is cut off is omitted, with a remark."""
     table, text, cut = _csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
     layout = table_layout(table.schema, joints, mapping, file)
