@@ -289,7 +289,7 @@ def test_the_payload_is_the_map_estimate(offset):
     covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + np.diag(TUNING.load_prior**-2.0))
     mean = PAYLOAD.copy()
     mean[[4, 7, 9]] -= offset
-    payload = find_payload(mean, covariance, 1.0)
+    payload = find_payload(mean, covariance, 1.0, 2.0)
     assert payload.status == "payload"
     precision = np.linalg.inv(covariance)
     linear, precision = precision @ mean, precision - np.diag(TUNING.load_prior**-2.0)
@@ -321,7 +321,7 @@ def test_the_payload_is_the_map_estimate(offset):
 def test_an_indefinite_covariance_is_no_payload_and_no_error():
     covariance = np.diag(TUNING.load_prior**2.0)
     covariance[0, 0] = -1e-9
-    assert find_payload(PAYLOAD, covariance, 1.5).status == "not yet"
+    assert find_payload(PAYLOAD, covariance, 1.5, 2.0).status == "not yet"
 
 
 def test_noise_levels_are_those_of_the_residuals():

@@ -36,41 +36,58 @@ class ContactObserver:
         """Begin with the next sample."""
         self.t: float | None = None
         self.inputs = self.low = np.zeros((15, len(self.factor)))
+        self.baseline = np.zeros_like(self.factor)
+        self.touched = self.factor < 0
 
     def step(
-        self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
+        self, t: float, qd: np.ndarray, at: Balance, payload: Payload, drift: np.ndarray
     ) -> ContactState:
-        """Use the terms of a sample; scale: friction scale minus one, (n,)."""
-        signal, variance = self.residual(t, qd, at, payload, scale)
+        """Use the terms of a sample; drift: friction scale minus one, and disturbance, (n, 2)."""
+        signal, variance = self.residual(t, at, payload, drift)
+        variance = variance + self.levels.observer_variance(qd)
         threshold = self.factor * np.sqrt(variance)
-        touched = np.abs(signal) > threshold
-        force = tip_force(at.jacobian, -signal, variance) if touched.any() else np.zeros(3)
-        return ContactState(-signal, threshold, touched, force)
+        self.touched = np.abs(signal) > threshold
+        force = tip_force(at.jacobian, -signal, variance) if self.touched.any() else np.zeros(3)
+        return ContactState(-signal, threshold, self.touched, force)
 
     def residual(
-        self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
+        self, t: float, at: Balance, payload: Payload, drift: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low-passed torque that model, payload and drift do not explain, and its variance, (n,)."""
+        """Return the low-passed torque that model, payload and drift do not explain, and its variance, (n,).
+
+        The variance is that of changing accelerations, an unknown friction state and the payload; the noise is added.
+        """
         rate = TUNING.bandwidth
+        scale, disturbance = drift.T
         load = at.load_torque + rate * at.load_momentum
         free = at.torque - at.friction + rate * at.momentum
         inputs = np.stack([free, at.friction, at.uncertainty, at.momentum, at.momentum, *load.T])
+        # a contact may be as slow as a disturbance, and is none only as far as the training logs have disturbances
+        largest = TUNING.outlier * self.levels.drift.disturbance
+        disturbance = np.clip(disturbance, -largest, largest)
         if self.t is None:
-            # as after constant inputs
-            self.low = inputs
+            # no external torque: the arm may be in motion
+            self.low = inputs.copy()
+            self.low[0], self.low[1], self.low[5:] = rate * at.momentum, 0.0, rate * at.load_momentum.T
+            self.baseline = disturbance
         else:
-            gains = np.full((len(inputs), 1), 1 - np.exp(-rate * (t - self.t)))
+            step = t - self.t
+            gains = np.full((len(inputs), 1), 1 - np.exp(-rate * step))
             # the second momentum, at twice the bandwidth: the difference of both tells the change of acceleration
-            gains[4] = 1 - np.exp(-2 * rate * (t - self.t))
+            gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
+            # the disturbance of a joint in contact contains the contact
+            gain = np.where(self.touched, 0.0, 1 - np.exp(-step / TUNING.baseline))
+            self.baseline = self.baseline + gain * (disturbance - self.baseline)
         self.t, self.inputs = t, inputs
         torque, friction, uncertainty, slow, fast = self.low[:5]
         # the regressor of the payload, Phi, (n, 10), as of a block
         regressor = rate * at.load_momentum - self.low[5:].T
-        signal = torque - rate * at.momentum - regressor @ payload.parameters - friction * scale
+        signal = (
+            torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline
+        )
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
-        resting = TUNING.resting_friction * self.levels.coulomb * np.exp(-np.abs(qd) / self.levels.rest_speed)
-        variance = self.levels.observer**2 + resting**2 + jerk**2 + TUNING.uncertainty * uncertainty**2
+        variance = jerk**2 + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)
         return signal, variance
 

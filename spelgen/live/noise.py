@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
+from scipy.special import stdtrit
 
 from spelgen.live.tuning import TUNING
 
@@ -41,9 +42,10 @@ class BlockNoise(BaseModel):
 class NoiseLevels(BaseModel):
     """All that the estimator knows of an arm besides its model; vectors are (n,).
 
-    drift, load: noise of blocks of both filters. observer: standard deviation of the momentum observer of a moving
-    joint [Nm, N]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer, beyond the
-    largest fifth. load_variance: factor on the covariance of payloads. coulomb: friction at low speed [Nm, N]. speed:
+    drift, load: noise of blocks of both filters. observer, resting: standard deviations of the momentum observer of a
+    moving joint and, in addition, of a joint at rest [Nm, N]; the latter falls with exp(-|qd| / resting_speed) [rad/s,
+    m/s]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer, beyond the largest fifth.
+    load_variance: factor on the covariance of payloads, an estimate with load_freedom degrees of freedom. speed:
     largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m]. effort: torque limit [Nm, N].
     minutes: duration of the training logs. point: tip in the frame of the last body, (3,) [m].
     """
@@ -53,10 +55,12 @@ class NoiseLevels(BaseModel):
     drift: BlockNoise
     load: BlockNoise
     observer: Vector
+    resting: Vector
+    resting_speed: Vector
     peak_start: Vector
     peak_scale: Vector
     load_variance: float
-    coulomb: Vector
+    load_freedom: float
     speed: Vector
     encoder: Vector
     effort: Vector
@@ -69,15 +73,26 @@ class NoiseLevels(BaseModel):
         return TUNING.rest * self.speed
 
     @property
+    def load_quantile(self) -> float:
+        """Half width of 95 % intervals of a payload in standard deviations: Student's t, for an estimated variance."""
+        return float(stdtrit(self.load_freedom, 0.975))
+
+    @property
     def supported_alarms(self) -> float:
         """Lowest rate of false alarms [1/min] that the training logs support: one in their whole duration."""
         return 1 / self.minutes
+
+    def observer_variance(self, qd: np.ndarray) -> np.ndarray:
+        """Return the variance of the momentum observer at velocities (..., n), (..., n) [Nm^2, N^2]."""
+        resting = self.resting * np.exp(-np.abs(qd) / self.resting_speed)
+        variance: np.ndarray = np.square(self.observer) + np.square(resting)
+        return variance
 
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the thresholds of the normalised observer, (n,), for a rate of false alarms of all joints."""
         windows = 60 / TUNING.window * TAIL * len(self.observer)
         tail = self.peak_start + self.peak_scale * math.log(windows / alarms_per_minute)
-        return math.sqrt(TUNING.variance) * np.maximum(tail, 1.0)
+        return TUNING.other_days * np.maximum(tail, 1.0)
 
 
 TAIL = 0.2
