@@ -166,11 +166,13 @@ def find_levels(
     levels = NoiseLevels(
         drift=noise,
         load=noise,
-        observer=0 * unknown,
+        observer=unknown,
+        resting=unknown,
+        resting_speed=unknown,
         peak_start=unknown,
         peak_scale=unknown,
-        load_variance=TUNING.variance,
-        coulomb=np.mean([model.coulomb.numpy() for model, _ in folds], axis=0),
+        load_variance=1.0,
+        load_freedom=1.0,
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
         # torques of the logs are within the limits in any case

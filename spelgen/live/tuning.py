@@ -29,10 +29,11 @@ class LiveTuning:
 
     # Filters (`live.filters`).
 
-    # [kg, kg m, kg m^2] Prior standard deviations of mass, first moments and inertia of a payload: of 20 kg.
-    load_mass: float = 20.0
-    load_moment: float = 4.0
-    load_inertia: float = 0.8
+    # [kg, kg m, kg m^2] Prior standard deviations of mass, first moments and inertia of a payload of 10 kg. The report
+    # removes this prior: larger ones only add rounding errors.
+    load_mass: float = 10.0
+    load_moment: float = 2.0
+    load_inertia: float = 0.4
     # [1] Prior standard deviation of the friction scale.
     friction: float = 0.02
     # [1/s] Variance per second of its random walk.
