@@ -84,9 +84,9 @@ def _read(path: Path) -> Design:
 
 
 def validate(values: Mapping[str, object], document: YamlDocument | None = None) -> None:
-    """Raise SettingsError, or SpelgenErrors of several, unless ``values`` are a design.
+    """Raise SettingsError, or SpelgenErrors for several errors, unless ``values`` are a valid design.
 
-    ``document``: the file of the values, which errors name with lines.
+    ``document``: the parsed file of the values; errors state the file and the line.
     """
     file = None if document is None else document.path
 

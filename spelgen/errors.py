@@ -99,7 +99,7 @@ class SpelgenErrors(SpelgenError):
 
 
 def _once(errors: Sequence[SpelgenError]) -> str:
-    """Return the first of errors that differ only in their files, and the files of the others."""
+    """Return the text of the first of several errors that differ only in their files, followed by the other files."""
     first = errors[0]
     files = dict.fromkeys(error.file for error in errors if error.file and error.file != first.file)
     if not files:
@@ -108,7 +108,7 @@ def _once(errors: Sequence[SpelgenError]) -> str:
 
 
 def _in_short(text: str) -> str:
-    """Return a text, or start and end of a long one: a name in a file may have a million characters."""
+    """Return a text, shortened to its start and end if it is long: a name in a file may have a million characters."""
     if len(text) <= MAX_TEXT:
         return text
     half = MAX_TEXT // 3

@@ -10,7 +10,7 @@ MAX_NAME = 36
 
 @dataclass(frozen=True)
 class Units:
-    """Units of the quantities of a joint; torque: or force; inertia: of the diagonal entry of M."""
+    """Units of the quantities of a joint. torque: of its torque or force. inertia: of the diagonal entry of M."""
 
     position: str
     velocity: str

@@ -115,7 +115,7 @@ class ServoSpec:
 
 @dataclass(frozen=True)
 class OutputSpec:
-    """A learned function f(q) = mean + scale x network of ``joints``, whose part of M is f times ``basis``."""
+    """A learned function f(q) = mean + scale x network of ``joints``; its contribution to M is f times ``basis``."""
 
     joints: tuple[int, ...]
     basis: Entries
@@ -125,7 +125,7 @@ class OutputSpec:
 
 @dataclass(frozen=True)
 class ConstantSpec:
-    """A trained constant in units of ``scale``, whose part of M is the constant times ``basis``."""
+    """A trained constant in units of ``scale``; its contribution to M is the constant times ``basis``."""
 
     basis: Entries
     start: float

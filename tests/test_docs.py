@@ -100,13 +100,12 @@ def test_tutorials_are_notebooks(page, request):
     assert path.read_text(encoding="utf-8") == notebook(page)
 
 
-def test_the_tables_of_settings_are_up_to_date(request):
-    """docs/settings.md has every key of the settings with its values, default, unit and meaning."""
-    path = settings_page.PAGE
+@pytest.mark.parametrize("path", settings_page.PAGES, ids=lambda path: path.name)
+def test_the_tables_of_settings_are_up_to_date(path, request):
+    """The pages of settings have every key with its values, default, unit and meaning."""
     if request.config.getoption("--update"):
-        path.write_text(settings_page.page(path.read_text(encoding="utf-8")), encoding="utf-8")
-    text = path.read_text(encoding="utf-8")
-    assert text == settings_page.page(text)
+        path.write_text(settings_page.page(path), encoding="utf-8")
+    assert path.read_text(encoding="utf-8") == settings_page.page(path)
 
 
 def run_commands(block: str, folder: Path) -> str:
@@ -130,8 +129,7 @@ def test_links_lead_somewhere(page):
 def test_a_page_is_short_and_has_no_history(page):
     """A page has at most 2,500 words; former versions and trials are described in docs/decisions.md only."""
     text = page.read_text(encoding="utf-8")
-    if page.name != "settings.md":  # a generated table of all keys
-        assert len(text.split()) <= 2500
+    assert len(text.split()) <= 2500
     if page.name != "decisions.md":
         assert HISTORY.findall(text) == []
 

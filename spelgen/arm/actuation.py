@@ -212,7 +212,7 @@ def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]
 def _block(
     joints: Sequence[str], names: Sequence[str], matrix: Sequence[Sequence[float]]
 ) -> Iterator[InputEntry]:
-    """Yield the nonzero entries of G of the joints ``names``, whose block of G is ``matrix``."""
+    """Yield the nonzero entries of ``matrix``, the block of G of the joints ``names``."""
     for row, values in zip(names, matrix, strict=True):
         for column, value in zip(names, values, strict=True):
             if value:

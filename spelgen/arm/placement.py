@@ -124,7 +124,8 @@ class Placement:
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
     def _seen_from_both(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return the position (3,) of a joint without noise in the frame of its parent and, if possible, in its own.
+        """Return the position (3,) of a joint, rounded in the frame of its parent and, if both agree, in its own
+        frame.
 
         An offset of (0.1, 0.1, 0) is parallel to an axis at 45 degrees, but not to its rational approximation.
         """

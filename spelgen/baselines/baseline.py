@@ -24,10 +24,10 @@ LinearServoRecord = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class EvaluatedArm:
-    """An arm under torques, as far as baselines may know it.
+    """The information about an arm under torques that baselines may use.
 
     joints: names, in the order of q. urdf: None if unknown. fitted: the baselines fitted to the training logs.
-    fitted_arm: the arm that these were fitted for; None if there are none. probe: windows by which the integrator's
+    fitted_arm: the arm for which these were fitted; None if there are none. probe: windows for which the integrator's
     step is chosen. notes: a baseline appends, for example, why it is absent.
     """
 

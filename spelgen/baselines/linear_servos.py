@@ -25,7 +25,7 @@ class DelayedCommand:
 
 @dataclass(frozen=True)
 class LinearServos:
-    """Each joint by itself: qdd = w^2 (u(t - delay) + offset - q) - 2 damping w qd.
+    """Independent servos of the joints: qdd = w^2 (u(t - delay) + offset - q) - 2 damping w qd.
 
     frequency: w [rad/s], damping: ratio [1], delay [s], offset [rad, m] of the n joints. late: the delay [s] of
     `DelayedCommand`, one for all joints.

@@ -68,7 +68,7 @@ def _stepper(
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return M qdd, (W, n)."""
+        """Return the generalized forces M qdd, (W, n) [Nm, N]; pose: the equations of motion at q."""
         added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
         return pose.force(qd, tau, z) + added
 
@@ -131,7 +131,7 @@ class PredictorTuning:
     most_substeps: int = 16
     # [s] Shortest step: only dynamics that diverge would need shorter ones.
     shortest_step: float = 1e-3
-    # [1] Change by twice as many steps that is allowed, relative to the error of the dynamics: reported figures
+    # [1] Allowed change of a result if the steps are doubled, relative to the error of the dynamics: reported figures
     # change by a thousandth.
     tolerance: float = 5e-2
     # [1] Smallest expected error of dynamics, relative to the motion.
@@ -166,7 +166,7 @@ class Solver:
 
 
 def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
-    """Return the solver with the fewest steps per sample interval whose result twice as many steps confirm."""
+    """Return the solver with the fewest steps per sample interval for which doubling the steps changes nothing."""
     windows = thinned(probe, TUNING.probed_windows)
     motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
     solver = Solver(dynamics, 1)
@@ -200,7 +200,7 @@ class Predictor:
 
 
 def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
-    """Return the predictor of some dynamics, with the steps that these need on the probe."""
+    """Return the predictor of `dynamics`, with the number of integration steps chosen on the probe windows."""
     return Predictor(name, accurate_solver(dynamics, probe), dynamics)
 
 

@@ -103,7 +103,8 @@ class Axes:
         body = self.arm.bodies[-1]
         if body.inertia is not None and body.joint_type == "revolute":
             return body.inertia
-        # For a prismatic joint no test of balance applies: ones are neither centred nor balanced.
+        # Balance is a property of rotations. For a prismatic joint, inertial parameters of one fail every test of
+        # balance.
         return (Fraction(1),) * 10
 
     def is_weightless(self, joint: int) -> bool:

@@ -53,7 +53,7 @@ class Inspection:
         return formulas(self.arm, self.structure, entry=entry, longest=longest)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON contract; names are the URDF's, rows and columns count from 1."""
+        """Return the documented JSON object; names are the names in the URDF, rows and columns are counted from 1."""
         structure = self.structure
         potential = "zero"
         if structure.potential:

@@ -35,7 +35,7 @@ class NumericSamples:
 
     @property
     def changes(self) -> np.ndarray:
-        """Changes of M with each coordinate, (n, S, n(n+1)/2)."""
+        """Differences of M between block k and block 0, (n, S, n(n+1)/2)."""
         result: np.ndarray = self.mass[1:] - self.mass[0]
         return result
 

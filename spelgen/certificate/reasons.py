@@ -62,7 +62,7 @@ def _diagonal_reason(axes: Axes, structure: Structure, joint: int) -> str | None
 
 
 def balance_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
-    """Return the reason for an entry of a balanced last body: the entry is Izz times the cosine of the axes."""
+    """Return the reason for an entry of a balanced last body: Izz times the cosine of the angle between the axes."""
     last, earlier = len(structure.joints) - 1, entry.column
     if structure.assume != "inertials" or not axes.balanced or entry.row != last:
         return None

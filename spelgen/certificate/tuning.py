@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CertificateTuning:
-    """How much of the closed forms is written, and which numbers of a verification count as rounding."""
+    """Limits of the length of closed forms, and bounds of rounding errors in a verification."""
 
-    # [1] Terms of an entry that is printed among others: three lines of a terminal.
+    # [1] Largest number of terms of an entry that is printed together with others: three lines of a terminal.
     readable_terms: int = 40
     # [1] Digits of decimals in formulas that are read.
     digits: int = 12
-    # [1] Terms of a sum in Python that are added by operators; longer sums are one call, as parsers nest operators.
+    # [1] Largest number of terms of a Python sum with operators; longer sums are one call, as parsers nest operators.
     nested_terms: int = 20
-    # [1] Terms of an entry that a program reads, or that is requested by itself.
+    # [1] Largest number of terms of an entry in a file for programs, or of a single requested entry.
     writable_terms: int = 3000
-    # [1] Multiplications of terms for all entries of an arm, about 2 s.
+    # [1] Largest number of multiplications of terms for all entries of an arm, about 2 s.
     budget: int = 2_000_000
     # [1] Random configurations at which relations between axes are tested exactly.
     configurations: int = 2
@@ -27,9 +27,9 @@ class CertificateTuning:
     spare_samples: int = 6
     # [1] A number of a check below this fraction of its scale is rounding; measured differences are reported.
     rounding: float = 1e-12
-    # [1] The same bound for the smallest form, whose long fractions are evaluated in double precision.
+    # [1] Bound of rounding errors of the smallest form, whose long fractions are evaluated in double precision.
     form_rounding: float = 1e-6
-    # [1] An arm with smaller nonzero numbers may have products that vanish in rounding.
+    # [1] Relative size of a nonzero number below which its products may vanish in rounding errors.
     fine: float = 1e-3
     # [rad, m] Allowed difference of frames per joint: dropped offsets, and composed rotations of 1e-11 each.
     frame_rounding: float = 1e-9

@@ -43,7 +43,10 @@ class _DerivedFact:
     rounding: float = TUNING.rounding
 
     def check(self, is_fine: bool) -> FactCheck:
-        """Return the result of the check. is_fine: products of small dimensions may be below rounding errors."""
+        """Return the result of the check.
+
+        is_fine: whether products of small dimensions may be below rounding errors.
+        """
         unexpected, unseen = [], []
         for number in self.magnitudes:
             if number.is_nonzero and number.value <= self.rounding:
@@ -108,7 +111,7 @@ def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_Derived
 
 
 def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFact:
-    """Return that M = sum c A + sum f B, and that each f depends only on its joints, and each c on none."""
+    """Return the fact that M = sum c A + sum f B, where each f depends only on its joints, and each c on none."""
     n = len(structure.joints)
     remainder = samples.mass
     magnitudes = []
@@ -159,7 +162,7 @@ def _potential(structure: Structure, samples: NumericSamples) -> _DerivedFact:
 
 
 def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
-    """Return that rows (m, k) have this rank: the number of singular values above rounding, relative to the largest."""
+    """Return the fact that rows (m, k) have this rank: the number of singular values above rounding errors."""
     if len(rows) > rows.shape[1]:
         # The triangular factor has the same singular values and fewer rows.
         rows = np.asarray(np.linalg.qr(rows, mode="r"))

@@ -17,7 +17,7 @@ from spelgen.settings.training import PREPROCESSING, TrainingSettings
 from spelgen.settings.values import Count
 
 if TYPE_CHECKING:
-    from spelgen.fitting.objectives import FitOptions
+    from spelgen.fitting.fit import FitOptions
     from spelgen.settings.log_mapping import LogMapping
 
 TIME_LIMIT = "max_minutes"
@@ -47,7 +47,10 @@ class Assignments(TrainingSettings):
 
 @dataclass(frozen=True)
 class Request:
-    """The options of the command line. values: of `--set`, by key. warm_start: whether the model was fitted before."""
+    """The options of the command `train`.
+
+    values: the values of `--set` by key. warm_start: whether the model was fitted before.
+    """
 
     objective: str | None
     values: Mapping[str, Any]
@@ -103,7 +106,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
 
 def new_run(urdf: Path | None, request: Request) -> Start:
     """Return the start of a new run: the command line takes precedence over the robot's settings."""
-    from spelgen.fitting.objectives import FitOptions
+    from spelgen.fitting.fit import FitOptions
     from spelgen.settings.settings import load_settings
 
     # without a URDF there is no settings file with defaults
@@ -120,7 +123,7 @@ def new_run(urdf: Path | None, request: Request) -> Start:
 
 def resumed_run(folder: Path, request: Request) -> Start:
     """Return the start of a resumed run: the command line takes precedence over the run's record."""
-    from spelgen.fitting.objectives import FitOptions
+    from spelgen.fitting.fit import FitOptions
     from spelgen.fitting.run_folder import RunFolder
 
     run = RunFolder(folder)

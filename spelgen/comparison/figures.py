@@ -86,7 +86,7 @@ def simulated_figures(
     config = fit.config if isinstance(fit.config, Rollout) else Rollout()
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
-    # smallest eigenvalue of M: where the arm can be; error of M: where the arm has been
+    # M must be positive definite at all positions within the limits; its error is measured at logged positions
     joints = fit.record.joints
     ranges = list(map(working_range, load_arm(truth, joints).chain.coordinates))
     low, high = torch.tensor(ranges, dtype=torch.float64).T

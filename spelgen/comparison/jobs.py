@@ -21,8 +21,7 @@ from spelgen.errors import RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.plain import record
 from spelgen.files import read_json, write_json
-from spelgen.fitting.fit import RunOptions, fit
-from spelgen.fitting.objectives import FitOptions
+from spelgen.fitting.fit import FitOptions, RunOptions, fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.tuning import TUNING as WINDOWS
 from spelgen.labels import thousandths
@@ -109,7 +108,7 @@ class Job(Group):
 
     @property
     def named_design(self) -> str | Design:
-        """Return the design as `build` takes it."""
+        """Return the design in the form that `build` accepts."""
         return ablation_designs().get(self.design, self.design)
 
     def build(self) -> ArmModel:

@@ -171,7 +171,7 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
 
 
 def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
-    """Return the expected time of a run [s]: of finished runs of this arm and preset, else of its training steps."""
+    """Return the expected time of a run [s], from finished runs of this arm and preset, else from its steps."""
     finished = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
     if finished:
         return statistics.median(finished) + TUNING.measuring

@@ -13,7 +13,8 @@ from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, parameter_name
 from spelgen.runtime.body_chain import BodyChain
 
-# Length of a column of the regressor, relative to the column, below which it depends on the columns before it.
+# Norm of the part of a regressor column that is orthogonal to all columns before it, relative to the norm of the
+# column, below which the column is linearly dependent.
 DEPENDENT = 1e-8
 # Smallest coefficient of a combination.
 ROUNDING = 1e-9

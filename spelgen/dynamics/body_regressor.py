@@ -12,7 +12,7 @@ from spelgen.runtime.port_hamiltonian import applied
 
 
 def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass, centre of mass and the tensor about it, (3, 3), of ten parameters about the joint, in its frame."""
+    """Return mass, centre of mass and inertia about it, (3, 3), from the ten parameters in the joint's frame."""
     mass = inertia[0]
     center = inertia[1:4] / mass
     xx, xy, xz, yy, yz, zz = inertia[4:]

@@ -35,14 +35,14 @@ EquationsAt = Callable[[Tensor], MotionEquations]
 
 @runtime_checkable
 class OwnEquations(Protocol):
-    """Dynamics that give their own equations, in fewer operations."""
+    """Dynamics with their own equations of motion, which take fewer operations than the general ones."""
 
     def equations_at(self, q: Tensor) -> MotionEquations:
         """Return the equations at q, (W, n)."""
 
 
 def equations_of(dynamics: object) -> EquationsAt:
-    """Return the equations of motion as a function of q, (W, n); the parameters must not change meanwhile."""
+    """Return the equations of motion as a function of q, (W, n), valid until the parameters change."""
     if isinstance(dynamics, PortHamiltonian):
         return partial(_of_model, dynamics, dynamics.prepare())
     return dynamics.equations_at if isinstance(dynamics, OwnEquations) else partial(_of_any, dynamics)

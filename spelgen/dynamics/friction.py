@@ -97,7 +97,8 @@ class FrictionModel:
 
     coulomb_smoothing_velocity [rad/s, m/s]: width of the tanh in place of the sign of the velocity. stribeck: dry
     friction at low velocity (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3. memory: dry friction as
-    a function of the deflection of bristles (see ``runtime.friction_laws``), a column each, in place of the tanh.
+    a function of the deflection of bristles (see ``runtime.friction_laws``), one column per bristle, in place of the
+    tanh.
     """
 
     coulomb_smoothing_velocity: float = 0.01

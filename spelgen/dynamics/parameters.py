@@ -1,13 +1,15 @@
-"""Group, unit and number of a model's trained parameters; removal of its residual terms."""
+"""Group, unit and number of a model's trained parameters; other parameters than its own; removal of residual terms."""
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.runtime.masked_mlp import MaskedMLP
@@ -22,7 +24,8 @@ class ParameterInfo:
     kind: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of friction), effects (friction that
     varies with velocity), velocities, load_dependence, fractions (of bristles), torque_splines, torque_ripple,
     friction_splines, mass_constants, mass_residuals, stiffness, damping,
-    dead_zone, delay, or network. unit: of the quantity that the parameter makes, of revolute and of prismatic joints;
+    dead_zone, delay, or network. unit: of the quantity that the parameter represents, of revolute and of prismatic
+    joints;
     most parameters are logarithms of it, relative to a nominal value.
     """
 
@@ -61,7 +64,10 @@ def parameters_of_kind(model: nn.Module, *kinds: str) -> tuple[str, ...]:
     return tuple(name for name, info in parameter_table(model).items() if info.kind in kinds)
 
 
-Model = TypeVar("Model")
+Model = TypeVar("Model", bound=nn.Module)
+Result = TypeVar("Result")
+NamedTensors = Mapping[str, Tensor]
+"""Tensors by the names of a model's parameters and buffers."""
 
 
 def idle_residuals(model: object) -> list[str]:
@@ -91,7 +97,7 @@ def without_residuals(model: Model) -> Model:
 
 
 def without_idle_residuals(model: Model) -> Model:
-    """Return a copy of the model without residual terms that are zero, for constant parameters."""
+    """Return a copy of the model without residual terms that are zero; the copy must not be trained."""
     # The caller's model may be trained further.
     reduced = copy.deepcopy(model)
     if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:
@@ -104,7 +110,7 @@ def without_idle_residuals(model: Model) -> Model:
 
 
 def _is_idle(network: Network | None) -> bool:
-    """Return whether a network is zero for all inputs; a network that does not exist is."""
+    """Return True if a network is zero for all inputs; a network that does not exist is."""
     if not isinstance(network, MaskedMLP):
         return network is None
     # Only the last layer counts: hidden layers start at random weights.
@@ -127,3 +133,24 @@ def friction_factor(model: object, q: Tensor) -> Tensor:
         return torch.ones_like(q)
     factor: Tensor = model.residuals.at(q, model.prepare().residual).friction
     return factor
+
+
+class _Caller(nn.Module):
+    """Module whose `forward` applies any function to a model, since `functional_call` calls only `forward`."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, function: Callable[..., Result]) -> Result:
+        return function(self.model)
+
+
+def evaluate_with(model: Model, parameters: NamedTensors, function: Callable[[Model], Result]) -> Result:
+    """Return function(model) with other parameters than its own, as a differentiable function of these parameters.
+
+    All other parameters of the model keep their values.
+    """
+    named = {f"model.{name}": tensor for name, tensor in parameters.items()}
+    result: Result = functional_call(_Caller(model), named, (function,))
+    return result

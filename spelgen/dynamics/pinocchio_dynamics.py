@@ -103,7 +103,7 @@ class PinocchioDynamics:
 
     @_takes_tensors
     def inverse_dynamics(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """Return the inputs, (..., n), that give qdd; of a passive joint, the torque that it lacks."""
+        """Return the inputs, (..., n), for the accelerations qdd; at a passive joint, the torque required there."""
         speeds, rates = qd @ self.jacobian.T, qdd @ self.jacobian.T
         torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
         torque = torque + self.friction(qd)
@@ -126,7 +126,7 @@ class PinocchioDynamics:
         return configuration
 
     def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
-        """Return the results of an algorithm for a batch of states (..., nq), (..., nv), ...; it accepts one state."""
+        """Return the results of an algorithm for a batch of states (..., nq), (..., nv), ..., state by state."""
         batch = states[0].shape[:-1]
         if not batch:
             return algorithm(self.model, self.data, *states)
@@ -165,6 +165,6 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
 
 
 def drives_known(urdf: Path, joints: Sequence[str]) -> bool:
-    """Return whether the settings of a URDF specify rotors or friction of these joints."""
+    """Return True if the settings of a URDF specify rotors or friction of these joints."""
     drives = load_settings(urdf).joints
     return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in drives.items() if k in joints)

@@ -41,7 +41,7 @@ class RigidDynamics(Protocol):
         """Return qdd, (..., n), under the inputs tau."""
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Return the inputs, (..., n), that give qdd; of a passive joint, the torque that it lacks."""
+        """Return the inputs, (..., n), for the accelerations qdd; at a passive joint, the torque required there."""
 
 
 @runtime_checkable
@@ -60,12 +60,12 @@ class FrictionState(Protocol):
 
 
 def residual_terms(model: object) -> ResidualTerms | None:
-    """Return the residual terms of a model; None of a model without any, or of one that they were removed from."""
+    """Return the residual terms of a model; None for a model without residual terms."""
     return model.residuals if isinstance(model, ResidualDynamics) else None
 
 
 def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
-    """Return whether friction depends on the state z of bristles, the last argument of all calls."""
+    """Return True if friction depends on the state z of bristles, the last argument of all calls."""
     return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 
 
@@ -105,9 +105,10 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the last arguments of calls of these dynamics: z, if friction has a state, and the direction.
+    """Return the arguments of the history of friction, the last of each call: z, if friction has a state, and the
+    direction.
 
-    direction: of dry friction without bristles, (..., n); it is given for a filtered tau, as it must be filtered, too.
+    direction: of dry friction without bristles, (..., n); required for a filtered tau, and filtered as tau is.
     """
     if z is None or not is_stateful(dynamics):
         return ()

@@ -51,7 +51,7 @@ class RegressorDynamics:
     """An arm of n coordinates with these parameters (see ``RigidDynamics``).
 
     parameters: (10 B,), in the order of ``regressor``. armature: of the drives, (n,) [kg m^2, kg]. friction: function
-    of velocities (T, n) and of the state z (T, n, K), or None, that returns torques (T, n). bristle_reach: break-away
+    of velocities (T, n) and of the state z (T, n, K), or None, which returns torques (T, n). bristle_reach: break-away
     displacements, (n, K) [rad, m]; None: no state. drives: None: each input is the torque of its joint.
     """
 
@@ -116,10 +116,10 @@ class RegressorDynamics:
         return qdd.squeeze(-1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the inputs, (..., n), that give qdd; of a passive joint, the torque that it lacks."""
+        """Return the inputs, (..., n), for the accelerations qdd; at a passive joint, the torque required there."""
         passive = (self.inputs == 0).all(dim=1).double()
-        # A passive joint has a zero row in G: a one on the diagonal makes G invertible, and its result is
-        # the torque that is missing.
+        # A passive joint has a zero row in G: a one on the diagonal makes G invertible, and the result at this
+        # joint is the torque required there.
         inverse: Tensor = torch.linalg.inv(self.inputs + torch.diag(passive))
         return self.joint_torque(q, qd, qdd, z) @ inverse.mT
 

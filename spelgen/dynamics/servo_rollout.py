@@ -98,7 +98,7 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     stiffness = (strength * (qd.sign() * z < drives.reach)).sum(dim=0)
     decay = h * (damping + h * (servo_stiffness / 2 + stiffness)) / inertia
     theta = (3 + decay) / (6 + decay)
-    # at theta of the step; bristles, which are the stiffest, at its end
+    # evaluated at the fraction theta of the step; bristles, which are the stiffest, at its end
     impulse, bristle_stiffness = theta * h * force, theta * h * h * strength
     damping = theta * h * (damping + h * theta * servo_stiffness)
     # displacements are divided by h: the unknown is the mean velocity of the step

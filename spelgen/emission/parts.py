@@ -78,7 +78,7 @@ def _inputs(spec: ModelSpec) -> Call:
 
 
 def base_class(spec: ModelSpec) -> str:
-    """Return the name of the runtime's class that the model is."""
+    """Return the name of the runtime class of the model."""
     if spec.links:
         return "RigidBodyDynamics" if spec.design.net == "none" else "ResidualDynamics"
     return "DenseInputDynamics" if spec.design.input == "dense-3n" else "NetworkDynamics"

@@ -13,7 +13,7 @@ SKIP = "  # fmt: skip"  # for ruff: numbers are read row by row
 
 @dataclass(frozen=True)
 class Code:
-    """A name."""
+    """A name in source code."""
 
     text: str
 

@@ -85,7 +85,7 @@ def find_urdf(module: Path, name: str) -> Path:
 
 
 def _path_of_urdf(module: Path, urdf: Path) -> str:
-    """Return the name of a URDF that ``find_urdf`` finds by it, else the path relative to the module."""
+    """Return the name of a URDF if ``find_urdf`` finds the file by this name, else its path relative to the module."""
     try:
         if find_urdf(module, urdf.name).samefile(urdf):
             return urdf.name

@@ -46,7 +46,7 @@ class ModelTuning:
     friction_units: int = 8
     # [1] Smallest number of hidden units of the outputs that depend on the same joints.
     min_units: int = 4
-    # [1] The same number for Kolmogorov-Arnold networks.
+    # [1] Smallest number of hidden units of these outputs in Kolmogorov-Arnold networks.
     min_kan_units: int = 2
     # [1] Units of Kolmogorov-Arnold networks as a fraction of the width: each edge has a grid of weights.
     kan_fraction: float = 0.25

@@ -119,7 +119,7 @@ class Horizon:
 class EvaluatedLogs:
     """Test logs, cut at gaps and filtered.
 
-    pieces: without gaps; windows are cut from them. samples: torques and accelerations of logs that are dense enough,
+    pieces: segments without gaps, from which windows are cut. samples: torques and accelerations of dense logs,
     see `dynamics_samples`. used: the preprocessing. reach: break-away displacement of the bristles of friction.
     """
 

@@ -34,7 +34,8 @@ class Measurements:
     horizon. cutoff: of the filter of the test logs [Hz], None without one. substeps: integrator steps of the model per
     sample interval. torque: errors by predictor, empty if the logs are too sparse for accelerations. torque_steps: see
     `coarse_torques`. replays: of the commands of an arm under position servos. mass_errors: relative errors of M by
-    predictor, if the truth is known. assessment: of the model, with the coverage of its training logs; None before it.
+    predictor, if the truth is known. assessment: of the model, with the coverage of its training logs; None before
+    the assessment.
     """
 
     robot: str

@@ -109,7 +109,10 @@ def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = 
 def read_test_logs(
     folder: Path | str, paths: Iterable[Path | str], mapping: GivenMapping = None
 ) -> list[Trajectory]:
-    """Return the test logs of a run's arm (of a folder test.*, if there are any); mapping: None: as in training."""
+    """Return the test logs of a run's arm: the files test.* of a folder, or all files if none has this name.
+
+    mapping: None: the mapping of the training logs.
+    """
     run = RunFolder(folder)
     record, spec = run.read_record(), run.read_spec()
     if mapping is None:

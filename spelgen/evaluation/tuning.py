@@ -20,13 +20,14 @@ class EvaluationTuning:
     most_predicted_steps: int = 10_000
     # [1] Smallest number of windows of a long horizon, as far as the logs have as many.
     fewest_windows: int = 100
-    # [1] Test windows from which the probe of the integration is taken.
+    # [1] Number of test windows on which the number of integration steps is chosen.
     probed_model_windows: int = 64
     # [1] Explained fraction of the torque variance that contact detection requires; a convention of this package.
     explained_for_contacts: float = 0.99
-    # [1] The same for feed-forward control.
+    # [1] Explained fraction of the torque variance that feed-forward control requires.
     explained_for_feed_forward: float = 0.95
-    # [1] The same for gravity compensation: gravity and friction explain about as much on most logs.
+    # [1] Explained fraction that gravity compensation requires: gravity and friction explain about as much on most
+    # logs.
     explained_for_gravity: float = 0.8
     # [1] Error relative to the motion up to which a prediction is called a simulation.
     close_prediction: float = 0.1
@@ -42,13 +43,13 @@ class EvaluationTuning:
     mass_positions: int = 500
     # [1] Random positions at which M must be positive definite.
     sampled_positions: int = 100_000
-    # [1] Steps of 1 ms without input.
+    # [1] Number of steps of 1 ms of the motion without input.
     free_steps: int = 10_000
     # [1] Initial states of the motion without input.
     started_states: int = 8
     # [1] Largest number of words of the first sentence of a verdict.
     headline: int = 20
-    # [1] Samples of the windows that probe the integration of a model that was not fitted to windows.
+    # [1] Length of the windows on which the number of integration steps is chosen, for a model not fitted to windows.
     model_window: int = 5
     # [s] Length of replays that are restarted from the measured state.
     replay_window: float = 1.0

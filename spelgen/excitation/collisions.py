@@ -200,7 +200,8 @@ class Collisions:
                     yield index, k
 
     def _largest_displacements(self, chain: Chain, bounds: MotionBounds) -> np.ndarray:
-        """Return the largest displacement of a point of the arm per displacement of each coordinate, (n,) [m/rad, 1].
+        """Return an upper bound of the displacement of any point of the arm per displacement of each coordinate, (n,)
+        [m/rad, 1].
 
         The distance from a joint to any point that it carries is at most the length of the chain from there on.
         """

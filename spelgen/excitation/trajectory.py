@@ -122,7 +122,7 @@ class ExcitationTrajectory:
         return parameters.reshape(self.joints, -1)[:, -1].square() / 4
 
     def _coefficients(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the coefficients (2, H, n) of sines and cosines, and the offsets (n,), of parameters (size,)."""
+        """Return the coefficients (2, H, n) of sines and cosines, and of offsets (n,), from parameters (size,)."""
         rows = parameters.reshape(self.joints, 2 * self.harmonics + 2)
         sines_cosines = rows[:, :-2].reshape(self.joints, 2, self.harmonics).permute(1, 2, 0)
         k = self._numbers()

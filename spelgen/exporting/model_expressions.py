@@ -190,7 +190,7 @@ def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:
 
 
 def _inputs(model: TrainedModel, force: ca.SX) -> ca.SX:
-    """Return the inputs for generalised forces (n, columns); of a passive joint, the torque that it would need."""
+    """Return the inputs for generalised forces (n, columns); at a passive joint, the torque required there."""
     return constant(np.linalg.inv(model.inputs + np.diag(1 - model.actuated))) @ force
 
 

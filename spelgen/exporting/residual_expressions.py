@@ -86,7 +86,7 @@ def _in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
 
 def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
     """Return the symbols that depend on q, (k, 1) each, with their derivatives with respect to q, (k, n)."""
-    # the factor of a joint depends on the position of this joint only
+    # the friction factor of a joint depends on the position of this joint only
     joints = np.eye(model.n)[list(model.residuals.friction)]
     by_joint = ca.horzsplit(symbols["second"], model.n)
     jacobians = [

@@ -14,11 +14,11 @@ class ExportTuning:
     # [1] Largest difference of C, CasADi and torch programs, relative to the largest value; `benchmarks/deploy.py`
     # measures 4e-14.
     tolerance: float = 1e-12
-    # [1] The same for ONNX; larger because M may be ill-conditioned.
+    # [1] Largest relative difference of ONNX programs; larger because M may be ill-conditioned.
     onnx_tolerance: float = 1e-10
-    # [1] The same for ONNX and torch programs in float32, whose eliminations lose digits in an ill-conditioned M.
+    # [1] Largest relative difference of float32 programs, whose eliminations lose digits if M is ill-conditioned.
     float32_tolerance: float = 1e-3
-    # [1] The same for MuJoCo; `benchmarks/deploy.py` measures 9e-15.
+    # [1] Largest relative difference of MuJoCo; `benchmarks/deploy.py` measures 9e-15.
     mujoco_tolerance: float = 1e-9
     # [1] Random positions at which a model and the nearest rigid bodies are compared.
     positions: int = 512

@@ -107,7 +107,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
     coulomb = np.stack([projection.friction.forward, projection.friction.backward], axis=1)
-    # by section and name: (n,) or (n, K) each
+    # by section and name: arrays (n,) or (n, K)
     sections = {"viscous_coulomb": {"viscous": projection.friction.viscous, "coulomb": coulomb}}
     # friction networks have no constants
     if projection.exact:

@@ -18,11 +18,10 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.base_combinations import base_combinations, constants_regressor
-from spelgen.dynamics.parameters import friction_factor
+from spelgen.dynamics.parameters import evaluate_with, friction_factor
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
-from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import ParameterVector
@@ -51,7 +50,7 @@ class Uncertain(NamedTuple):
 
 
 class Propagated(NamedTuple):
-    """Value of a function of the model, (...), and its derivative times R, (..., k): the standard deviations' root."""
+    """Value of a function of the model, (...), and its derivative times R, (..., k): norms over k are deviations."""
 
     value: Tensor
     root: Tensor
@@ -138,7 +137,7 @@ class Posterior:
 
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
-        """Mass [kg] and first moments [kg m] of each body that the logs can determine on their own."""
+        """Mass [kg] and first moments [kg m] of each body that the logs determine individually."""
         _, combination = self._base
         alone = (combination.count_nonzero(dim=1) == 1).tolist()
         pairs = zip(self.base_parameters, alone, strict=True)
@@ -148,7 +147,7 @@ class Posterior:
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
-        """Names of the masses and first moments that only occur in combinations, or in none."""
+        """Names of the masses and first moments that the logs determine only in combinations, or not at all."""
         known = {x.name for x in self.bodies}
         names = map(parameter_name, range(10 * len(self.model.chain.parents)))
         return tuple(name for name in names if name[0] in "mh" and name not in known)
@@ -274,7 +273,7 @@ def posterior_of(
 
     Args:
         model: with the fitted parameters.
-        content: `Checkpoint.posterior`: covariance (K, K), torque_std (n,) and delay_std [s]; it may be any file's.
+        content: `Checkpoint.posterior`: covariance (K, K), torque_std (n,) and delay_std [s]; untrusted.
         delay: of the torques [s].
         file: checkpoint, for messages.
 

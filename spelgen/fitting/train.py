@@ -10,9 +10,8 @@ from pathlib import Path
 
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
-from spelgen.fitting.fit import AUTOMATIC, QUIET, RunOptions, fit, sample_rates
+from spelgen.fitting.fit import AUTOMATIC, QUIET, FitOptions, RunOptions, choose_config, fit, sample_rates
 from spelgen.fitting.fitted import Fit
-from spelgen.fitting.objectives import FitOptions, choose_config
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import BoundedLogs, read_bounded_logs
@@ -36,14 +35,15 @@ def train(
     require: Callable[[Sequence[Trajectory]], list[Diagnostic]] | None = None,
     options: RunOptions = QUIET,
 ) -> Fit:
-    """Fit the module to the logs and write a run folder (see `RunFolder`); see `fit`.
+    """Fit the module to the logs and write a run folder (see `RunFolder`); further arguments: see `fit`.
 
-    urdf: the robot the module was built from, for the regularizer and the baselines; by default the file
-    of that name in the module's folder. source: without a module, a run whose model is adapted. config: may
-    also be options, for an objective that depends on the logs. require: raises for logs that are wrong, before anything
-    is fitted, or returns findings. validation: 0.25 by default, seed: 0. For a resumed run all of these
-    are by default as before, and logs are read as spelgen writes them if ``options`` has no mapping.
-    Raises ModuleError, LogError, and RunError when the folder contains a run or cannot be resumed with this.
+    urdf: the robot that the module was built from, for the regularizer and the baselines; by default the file of this
+    name in the module's folder. source: without a module, a run whose model is adapted. config: a configuration, or
+    options for an objective that depends on the logs. require: function that raises an error for unusable logs before
+    the fit, or returns findings. validation, seed: by default 0.25 and 0. A resumed run uses the recorded values by
+    default, the mapping of its logs included.
+
+    Raises ModuleError, LogError, and RunError if the folder contains a run or cannot be resumed with these arguments.
     """
     run = RunFolder(folder)
     robot = None
@@ -56,6 +56,7 @@ def train(
         if preprocessing is AUTOMATIC:
             preprocessing = record.preprocessing
         options = replace(options, mapping=options.mapping or record.mapping)
+        # its weights come from the checkpoint
         model = run.untrained_model()
     else:
         model = load_module(module) if module is not None else fitted_model(RunFolder(source or folder))
@@ -87,21 +88,24 @@ def robot_of(
         path = module.parent / spec.urdf
     else:
         return None, []
-    if not path.is_file():
-        if urdf is not None:
-            raise RunError("no such file", file=path, expected="the URDF the module was built from")
+    exists = path.is_file()
+    if exists and hashlib.sha256(urdf_bytes(path)).hexdigest() == spec.urdf_sha256:
+        return path, []
+    if urdf is not None and exists:
+        do = "build the module again"
+        raise ModuleError("another URDF than the module was built from", file=path, do=do)
+    if urdf is not None:
+        raise RunError("no such file", file=path, expected="the URDF the module was built from")
+    # a file beside the module was not asked for: the fit goes on without it
+    if exists:
+        code = "changed-urdf"
+        message = (
+            f"{spec.urdf} beside the module has changed since the module was built; it is left out of the run"
+        )
+    else:
+        code = "no-urdf"
         message = (
             f"no {spec.urdf} beside the module; pass it by --robot. Without it, evaluation has no baseline with the "
             "URDF's values, and the run cannot be exported"
         )
-        return None, [Diagnostic("warning", "no-urdf", "run", None, message)]
-    if hashlib.sha256(urdf_bytes(path)).hexdigest() == spec.urdf_sha256:
-        return path, []
-    if urdf is not None:
-        raise ModuleError(
-            "another URDF than the module was built from", file=path, do="build the module again"
-        )
-    message = (
-        f"{spec.urdf} beside the module has changed since the module was built; it is left out of the run"
-    )
-    return None, [Diagnostic("warning", "changed-urdf", "run", None, message)]
+    return None, [Diagnostic("warning", code, "run", None, message)]

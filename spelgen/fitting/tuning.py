@@ -20,9 +20,10 @@ class FittingTuning:
     damping_factor: float = 10.0
     # [1] Dampings tried for one step: from the smallest to 1e6, at which steps are negligible.
     max_trials: int = 15
-    # [1] Predicted reduction of the cost, as a fraction of the cost, below which a step is rounding and is not tried.
+    # [1] Predicted reduction of the cost, as a fraction of the cost, below which a step is not tried: rounding errors.
     min_predicted_decrease: float = 1e-10
-    # [1] Gain ratio (decrease divided by predicted reduction) below which the second way of a step is tried, too.
+    # [1] Gain ratio (decrease divided by predicted reduction) below which the next candidate of a step is evaluated,
+    # too.
     min_gain_ratio: float = 0.5
 
     # Windows on which a fit is validated (`fitting.dataset`).
@@ -32,7 +33,7 @@ class FittingTuning:
     # [1] Training windows on which the integration error is monitored.
     probe_windows: int = 64
 
-    # Steps on windows (`fitting.window.momentum`).
+    # Steps on windows (`fitting.momentum_objective`).
 
     # [1] Smallest number of steps per epoch; few windows are passed several times between validations.
     epoch_steps: int = 20
@@ -45,7 +46,7 @@ class FittingTuning:
     # [1] Factor on the learning rate of momentum steps, which are cheap and noisy.
     momentum_factor: float = 10.0
 
-    # Epochs of predicted windows (`fitting.window.rollout`).
+    # Epochs of predicted windows (`fitting.rollout_objective`).
 
     # [1] Largest fraction of all steps or minutes during which residual terms of rigid bodies are constant.
     first_stage: float = 0.8

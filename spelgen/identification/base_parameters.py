@@ -23,9 +23,10 @@ from spelgen.structure.base_parameters import base_parameters as body_base_param
 class BaseParameters:
     """r base parameters of K parameters: ten per body, then friction and drives.
 
-    names: of the r base parameters. columns: (r,), the column of the regressor per base parameter. combination: (r, K),
-    base parameters = combination @ parameters, with a one in column `columns[k]` of row k. parameters: K names. bodies:
-    number of base parameters of bodies, the first ones.
+    names: of the r base parameters. columns: (r,), index of the independent column of the regressor per base
+    parameter.
+    combination: (r, K), base parameters = combination @ parameters, with a one in column `columns[k]` of row k.
+    parameters: K names. bodies: number of base parameters of bodies, the first ones.
     """
 
     names: tuple[str, ...]
@@ -93,7 +94,7 @@ def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, cou
 
 
 def _sum(row: np.ndarray, first: int, names: tuple[str, ...]) -> str:
-    """Return the sum with the coefficients of a row (K,), beginning with the parameter `first`."""
+    """Return the text of the sum of parameters with coefficients (K,), beginning with the parameter `first`."""
     text = names[first]
     for k in np.flatnonzero(row):
         if k != first:

@@ -1,7 +1,7 @@
-"""Find couplings of motors that no file states, by least squares with rate-only friction on a subset of all samples.
+"""Detection of undeclared couplings of motors, by least squares with rate-only friction on a subset of all samples.
 
-The products of the regressor's columns are formed once; a candidate has other columns of two joints. The best candidate
-counts if it explains the torques better in blocks of time that the parameters were not fitted to.
+The Gram matrices of the regressor are computed once; a candidate changes the columns of two joints only. The best
+candidate is accepted if it lowers the torque residual on held-out blocks of time.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
 
 @dataclass(frozen=True)
 class Coupling:
-    """The motor of `joint` turns with its own joint and, `ratio` times as fast, with `moved_by`.
+    """Coupling of two joints: the motor of `joint` rotates with its own joint and, `ratio` times as fast, with
+    `moved_by`.
 
-    logged_at: place of the logged torques: the joints, or the motors (in the joints' units).
+    logged_at: whether logged torques act at the joints, or at the motors (in the units of the joints).
     """
 
     joint: int
@@ -50,16 +51,16 @@ class Coupling:
 def drive_rows(
     chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, speeds: np.ndarray
 ) -> np.ndarray:
-    """Return the regressor (S, n, K) of bodies, then of friction's effects, of all drives each.
+    """Return the regressor (S, n, K): columns of the bodies, then of each friction effect for all drives.
 
-    q, qd, qdd: (S, n). speeds: C, (n, n), of the motors, by the couplings that are known.
+    q, qd, qdd: (S, n) [rad, m], per s, per s^2. speeds: C, (n, n), of the motors with the declared couplings.
     """
     bodies = chain_regressor(chain, q, qd, qdd)
     return np.concatenate([bodies, FRICTION.columns(qd, qdd, None, speeds)], axis=2)
 
 
 def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> DriveProblem:
-    """Return least squares of the joint torques."""
+    """Return the least-squares problem of the joint torques of samples."""
     regressors = drive_rows(chain, samples.q, samples.qd, samples.qdd, drives.speeds)
     rows = np.concatenate([regressors, samples.tau[..., None]], axis=2)
     products = block_products(rows, HINTS.blocks)
@@ -68,10 +69,11 @@ def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> Dr
 
 @dataclass(frozen=True, eq=False)
 class DriveProblem:
-    """Least squares of the torques of n joints by K parameters, in B blocks of time.
+    """Least-squares problem of the torques of n joints with K parameters, in B blocks of time.
 
-    speeds: C, (n, n), of the motors, by the couplings that are known. rows: (S, n, K + 1), of each joint the columns of
-    the parameters and the torque. products: (n, B, K + 1, K + 1), of these. size: (n,) of the squares of the torques.
+    speeds: C, (n, n), of the motors with the declared couplings. rows: (S, n, K + 1), regressor and torque of each
+    joint.
+    products: (n, B, K + 1, K + 1), their Gram matrices. size: (n,), sums of the squared torques.
     """
 
     samples: DriveSamples
@@ -92,7 +94,7 @@ class DriveProblem:
 
     @property
     def free(self) -> list[int]:
-        """Return the joints that no known coupling joins and whose torques vary."""
+        """Return the joints without a declared coupling whose torques vary."""
         joins = self.speeds != 0
         return np.flatnonzero(varying(self.rows[..., -1]) & ((joins | joins.T).sum(axis=0) == 1)).tolist()
 
@@ -102,16 +104,16 @@ class DriveProblem:
         return replace(self, rows=rows, products=block_products(rows, self.products.shape[1]))
 
     def in_one_block(self, stride: int) -> DriveProblem:
-        """Return the problem on every `stride`-th sample, in a single block: fitted to and tested on the same."""
+        """Return the problem on every `stride`-th sample, in one block, on which it is fitted and evaluated."""
         rows = self.rows[::stride]
         samples = self.samples.thinned(stride)
         return replace(self, samples=samples, rows=rows, products=block_products(rows, 1))
 
     @cached_property
     def errors(self) -> np.ndarray:
-        """Return the squared residual (B, n) of each torque in each block, relative to the torque's square.
+        """Return the squared residual (B, n) of each torque in each block, divided by the squared torque.
 
-        The parameters are fitted to all other blocks; for a single block, to this block.
+        The parameters are fitted to all other blocks; a single block is fitted itself.
         """
         products = self.products / np.where(self.size > 0, self.size, 1.0)[:, None, None, None]
         fitted = products.sum(axis=0)
@@ -120,16 +122,16 @@ class DriveProblem:
         solution = normal_solution(fitted, 1)
         left = np.append(solution, np.full_like(solution[:, :1], -1.0), axis=1)
         errors = left.swapaxes(1, 2) @ products @ left
-        # the residual of an exact model is rounding
+        # the residual of an exact model consists of rounding errors
         return np.asarray(np.maximum(errors[..., 0, 0].T, TUNING.negligible))
 
     def cost(self, coupling: Coupling) -> float:
-        """Return the error ratio of both joints with a coupling."""
+        """Return the squared residual of both joints with a coupling, divided by the one without it."""
         errors = self.coupled(coupling).errors[:, coupling.pair].mean()
         return float(errors / self.errors[:, coupling.pair].mean())
 
     def coupled(self, coupling: Coupling) -> DriveProblem:
-        """Return the problem where a motor turns with another joint, too."""
+        """Return the problem with an additional coupling."""
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
         motion = np.stack([self.samples.qd, self.samples.qdd])
         qd, qdd = motion[..., [joint]] + ratio * motion[..., [moved_by]]
@@ -147,11 +149,12 @@ class DriveProblem:
 
 
 def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
-    """Return the coupling between two neighbours' motors that explains torques best, and the error ratio.
+    """Return the coupling of two neighbouring joints with the smallest residual, and its error ratio; None if no
+    coupling is significant.
 
-    None: none is significant. Joints of known couplings are not searched.
+    Joints with a declared coupling are not searched.
     """
-    # all pairs on few samples: a coupling is visible with an approximate ratio
+    # all pairs on few samples: an approximate ratio suffices to detect a coupling
     coarse = problem.in_one_block(HINTS.coarse)
     candidates: list[Coupling] = []
     for joint, moved_by in permutations(problem.free, 2):
@@ -166,7 +169,7 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     best = _with_best_ratio(nearest, problem.in_one_block(1).cost)
     logged = problem.errors[:, best.pair].mean(axis=1)
     coupled = problem.coupled(best).errors[:, best.pair].mean(axis=1)
-    # torques that are hardly explained in some block may be anything
+    # torques that no model explains in some block are no evidence
     explained = coupled.max() < HINTS.coupling_gain
     if not (explained and _is_sure(logged, coupled, HINTS.coupling_gain, len(candidates))):
         return None
@@ -174,7 +177,7 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
 
 
 def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coupling:
-    """Return a coupling with the ratio of the least error, one of small numbers where that costs little."""
+    """Return a coupling with the ratio of minimum cost, or with a close ratio of small integers at about this cost."""
     bounds = sorted((start.ratio / 2, start.ratio * 2))
     best = minimize_scalar(
         lambda ratio: cost(replace(start, ratio=ratio)),
@@ -187,7 +190,7 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
 
 
 def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
-    """Whether errors per block (B,) fell below the fraction `gain`, significantly for the best of some candidates."""
+    """Return True if errors per block (B,) fell below the fraction `gain`, significantly for the best candidate."""
     if mended.mean() >= gain * logged.mean():
         return False
     # between -1 and 1, so that no single block dominates

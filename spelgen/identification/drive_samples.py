@@ -55,7 +55,7 @@ class DriveSamples(NamedTuple):
 class DriveLog:
     """Collector of samples of successive trajectories, evenly subsampled to at most twice `DriveHintTuning.samples`.
 
-    If there are many trajectories, only every second, fourth, ... is used: to filter all of a long log takes minutes.
+    Of many trajectories only every second, fourth, ... is used, since filtering all of a long log takes minutes.
     """
 
     def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:

@@ -1,4 +1,5 @@
-"""Search for the reading of a log that explains its torques: single changes, orders of joints, combinations."""
+"""Search for the hypothesis about the columns of a log with the best fit to its torques: single changes, orders of
+joints, combinations."""
 
 from __future__ import annotations
 
@@ -19,21 +20,21 @@ STEP = 1e-4  # [rad, m] of finite differences
 
 @dataclass(frozen=True, eq=False)
 class HypothesisComparison:
-    """Readings of a log that are better than the unchanged log, the best first; they explain it equally well."""
+    """Hypotheses that fit a log about equally well, and significantly better than the unchanged log; best first."""
 
     unchanged: HypothesisFit
     better: tuple[HypothesisFit, ...]
 
     @property
     def codes(self) -> tuple[str, ...]:
-        """Codes of the changes of the best reading."""
+        """Codes of the changes that the best hypothesis makes to the log."""
         return self.better[0].hypothesis.codes
 
 
 def compare_readings(problem: GeometryProblem, factors: Sequence[np.ndarray] = ()) -> HypothesisComparison:
-    """Return the readings of a log that are significantly better than the unchanged log.
+    """Return the hypotheses that fit a log significantly better than the unchanged log.
 
-    factors: (n,) each, of the torques, as another unit or motor constant has them.
+    factors: candidates of factors on the torques, (n,) each, for another unit or motor constant.
     """
     coarse = problem.thinned(GEOMETRY.samples)
     unchanged = coarse.fit(problem.unchanged)
@@ -66,9 +67,9 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
 def _rescaled(
     problem: GeometryProblem, unchanged: HypothesisFit, factors: Sequence[np.ndarray]
 ) -> tuple[HypothesisFit, ...]:
-    """Return the fit with the best factor of the torques, if it is better at all.
+    """Return the fit with the best factor on the torques, if its cost is lower.
 
-    Gravity has shown already that a factor is needed: light bodies, whose cost is small, explain small torques.
+    A low cost is no evidence for a factor, since light bodies can explain small torques; the evidence is from gravity.
     """
     fits = [problem.fit(hypothesis) for hypothesis in _scaled(problem.unchanged, factors)]
     best = min(fits, key=_rank, default=unchanged)
@@ -76,14 +77,14 @@ def _rescaled(
 
 
 def _rank(fit: HypothesisFit) -> float:
-    """Return the cost, plus a penalty by which changes that are rarer come after others that explain as much."""
+    """Return the cost plus a penalty for rare changes, so that common ones of about the same cost come first."""
     return fit.cost + GEOMETRY.rare * sum(RARE.get(code, 0) for code in fit.hypothesis.codes)
 
 
 def single_changes(
     problem: GeometryProblem, base: HypothesisFit, factors: Sequence[np.ndarray]
 ) -> list[HypothesisFit]:
-    """Return fits with one more change than the base has."""
+    """Return the fits with one change in addition to the changes of the base."""
     reading = base.hypothesis
     changed = [*_senses(reading), *_swapped(reading), *_scaled(reading, factors)]
     fits = [problem.fit(hypothesis) for hypothesis in changed]
@@ -104,7 +105,7 @@ def _senses(base: Hypothesis) -> Iterator[Hypothesis]:
         sign: np.ndarray = 1.0 - 2.0 * (np.arange(len(base.offset)) == k)
         torque = {"torque_scale": sign * base.torque_scale}
         yield _changed(base, "torque-sense", **torque)
-        # the offset of a mapping may have been found in either sense
+        # an offset of the mapping may have been determined in either sense
         for offset in (base.offset, sign * base.offset)[: 1 + (base.offset[k] != 0)]:
             motion = {"motion_scale": sign * base.motion_scale, "offset": offset}
             yield _changed(base, "joint-sense", **motion)
@@ -133,7 +134,7 @@ def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[Hypoth
     """
     joints = problem.arm.joint_names
     starts = [np.arange(len(joints)), np.arange(len(joints))[::-1]]
-    # a message in alphabetical order has the n-th name in column n
+    # joints may be logged in the alphabetical order of their names
     starts.append(np.argsort(np.argsort(joints)))
     rng = np.random.default_rng(0)
     starts += [rng.permutation(len(joints)) for _ in range(GEOMETRY.random_orders)]
@@ -157,7 +158,7 @@ def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[Hypoth
 def _with_offset(
     problem: GeometryProblem, base: HypothesisFit, joint: int, revolute: bool
 ) -> list[HypothesisFit]:
-    """Return the fit with the best zero offset of a joint; none if it is below the errors of calibration."""
+    """Return the fit with the best zero offset of a joint; an empty list for an offset below calibration errors."""
     reading = base.hypothesis
 
     def shifted(offset: float) -> Hypothesis:
@@ -187,7 +188,7 @@ def _with_offset(
             best, offset = exact, right
     if abs(offset) < (GEOMETRY.min_angle if revolute else GEOMETRY.min_shift):
         return []
-    # if other masses can make up for an offset, the angle would be no better than the masses of the URDF
+    # if other masses have the same effect as the offset, its value is as uncertain as the masses of the URDF
     if best.misfit > base.misfit - GEOMETRY.needed / 2:
         return []
     is_right_angle = offset in (RIGHT_ANGLE, -RIGHT_ANGLE, -np.pi)
@@ -195,7 +196,7 @@ def _with_offset(
 
 
 def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[HypothesisFit]:
-    """Return the fits with the best direction of gravity, and with the part of gravity in compensated torques."""
+    """Return the fits with the best direction of gravity, and with the fraction of gravity in compensated torques."""
     present = np.array(base.hypothesis.gravity)
     size = float(np.linalg.norm(present))
     fits = []
@@ -204,7 +205,7 @@ def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[Hypothe
     axes = [
         *-np.eye(3)[::-1],
         *np.eye(3),
-    ]  # upright first: a prismatic vertical joint shows no sense of gravity
+    ]  # upright first: a vertical prismatic joint does not determine the sign of gravity
     starts = [_gravity(problem, base, (size or STANDARD_GRAVITY) * axis) for axis in axes]
     lowest = min(fit.cost for fit in starts)
     best = next(fit for fit in starts if fit.cost < lowest + GEOMETRY.rare)
@@ -253,7 +254,7 @@ def _best_direction(problem: GeometryProblem, fit: HypothesisFit) -> HypothesisF
 
 
 def _with_compensation(problem: GeometryProblem, base: HypothesisFit) -> list[HypothesisFit]:
-    """Return the fit with the part of gravity that a compensating controller has not taken out of the torques."""
+    """Return the fit with the fraction of gravity in torques that do not include a controller's compensation."""
     present = np.array(base.hypothesis.gravity)
     without = _gravity(problem, base, np.zeros(3))
     column = (_gravity_columns(problem, without) @ present)[..., None]

@@ -51,10 +51,10 @@ class Identification:
 
     parameters: (K,), zero for parameters that are no base parameters. values, deviations: (r,), the base parameters and
     their standard deviations. condition: condition number of the regressor (columns of length one, joints weighted).
-    unseen: number of directions of the base parameters that these logs do not excite. residual: (n,) root mean square
-    [Nm, N]. nmse: (n,), mean squared residual divided by the variance of the torque. drives: between logged torques and
-    joints.
-    torque_delay: by which logged torques were moved.
+    unseen: number of directions in the space of base parameters that these logs do not excite. residual: (n,) root
+    mean square [Nm, N]. nmse: (n,), mean squared residual divided by the variance of the torque. drives: map of logged
+    torques to joint torques.
+    torque_delay: by which logged torques were shifted [s].
     """
 
     arm: Chain

@@ -105,7 +105,8 @@ def least_squares(
     return _Equations(arm, samples, drives or Drives(identity, identity)).solved(method or LeastSquares())
 
 
-# Samples of a block of the jackknife, 2 s: without a prior, a shorter block determines some parameters on its own.
+# Smallest number of samples of a jackknife block, 2 s: without a prior, some parameters may be excited in one short
+# block only.
 MIN_BLOCK = 200
 
 
@@ -182,14 +183,14 @@ class _Equations:
         weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
         # weights "noise": iteratively reweighted by the residual of each joint
         for _ in range(1 + TUNING.rounds * (method.weights == "noise")):
-            # the columns that are no base parameters are zero
+            # parameters that are not base parameters are zero
             solution = solve(triangles, weights, base.columns)
             noise = np.maximum(self._noise(method.friction, solution), TUNING.least_noise * torque_range)
             used, weights = weights, 1.0 / noise
         squares = triangles.squares(solution.parameters) / triangles.count
         combination = base.combination[:, base.columns]
         std = solution.deviations(triangles, used**2 * noise, combination)
-        # without parameters that the samples do not determine at all
+        # parameters that the samples do not determine at all are omitted
         if solution.rank == len(base) and triangles.count >= BLOCKS * MIN_BLOCK:
             std = np.maximum(
                 std, student_scale(BLOCKS) * self._jackknife(method.friction, solution, used, combination)

@@ -24,7 +24,7 @@ class InertialPrior:
 
 
 def inertial_prior(arm: Chain) -> InertialPrior:
-    """Return the prior of an arm; a body without an inertial has a wide one about 0."""
+    """Return the prior of an arm; a body without an inertial has a wide prior about 0."""
     masses = [float(body.inertia[0]) for body in arm.bodies if body.inertia and body.inertia[0] > 0]
     typical = float(np.median(masses)) if masses else 1.0
     size = 10 * len(arm.bodies)

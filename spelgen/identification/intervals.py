@@ -15,8 +15,8 @@ from spelgen.listing import Listing
 
 QUANTILE = 1.96
 """Half of a 95 % interval of a normal distribution, in standard deviations."""
-# Contiguous blocks of samples of a jackknife. More blocks are shorter than errors that last, and fewer do not
-# determine a covariance.
+# Number of contiguous blocks of samples of a jackknife. More blocks would be shorter than the correlation time of the
+# errors, and fewer would not determine a covariance.
 BLOCKS = 10
 # Smallest number of samples of a block: half a second.
 MIN_BLOCK = 25
@@ -25,7 +25,7 @@ DETERMINED = ("firm", "fair", "weak", "may be zero")
 
 @dataclass(frozen=True)
 class Interval:
-    """Estimate of a quantity with its standard deviation; an interval of a positive quantity has no negative end."""
+    """Estimate of a quantity with its standard deviation; the interval of a positive quantity is cut at zero."""
 
     name: str
     value: float
@@ -83,7 +83,7 @@ def interval_listing(title: str, intervals: Sequence[Interval], note: str = "") 
 
 
 def student_scale(blocks: int) -> float:
-    """Return the factor on standard deviations from a few blocks for which 95 % intervals are 1.96 of them."""
+    """Return the factor on standard deviations from a few blocks: 1.96 results are Student's 95 % interval."""
     return float(stdtrit(blocks - 1, 0.975)) / QUANTILE
 
 

@@ -1,4 +1,4 @@
-"""Linear least squares on torques, from one triangular factor per joint, which any weighting of joints can use."""
+"""Linear least squares on torques, from one triangular factor per joint, independent of the weights of joints."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Columns = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """QR factors of the equations of each joint.
+    """Triangular QR factors of the least-squares equations of each joint.
 
     factors: (n, K + 1, K + 1), upper triangular, of the rows [regressor, torque]. count: number of samples. deviation:
     (n,) standard deviation of the torque [Nm, N].
@@ -46,7 +46,7 @@ def reduce(blocks: Iterable[Columns]) -> Triangles:
 
 
 def varying(tau: np.ndarray) -> np.ndarray:
-    """Whether torques (S, n) vary by more than the rounding of a constant, (n,)."""
+    """Return True if torques (S, n) vary by more than the rounding errors of a constant, (n,)."""
     return np.asarray(tau.std(axis=0) > TUNING.negligible * np.abs(tau).max(axis=0))
 
 
@@ -121,7 +121,8 @@ def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Sol
 
 
 def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
-    """Return the standard deviations (n,) of errors, scaled as if the errors of all samples were independent.
+    """Return standard deviations (n,) of the torque errors [Nm, N], scaled as if the errors of samples were
+    independent.
 
     The residual of filtered torques is correlated: its variance is multiplied by its correlation time in samples.
 

@@ -42,9 +42,9 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A reading of the columns of n joints, and a gravity.
+    """Hypothesis: an assignment of the columns of a log to n joints, with scales and offsets, and a vector of gravity.
 
-    codes: of the changes, as findings have them; none: the unchanged log. q of joint k is motion_scale[k] times the
+    codes: of the changes, as in findings; empty for the unchanged log. q of joint k is motion_scale[k] times the
     column of joint motion_source[k], plus offset[k] [rad, m]; its torque is torque_scale[k] times the column of joint
     torque_source[k]. gravity: in the frame of the root link [m/s^2].
     """
@@ -72,12 +72,12 @@ class Hypothesis:
         return b"".join(x.tobytes() for x in arrays), self.gravity
 
     def signals(self, samples: MotionSamples) -> MotionSamples:
-        """Return the samples as this hypothesis reads them."""
+        """Return the motion and torques that the logged samples represent under this hypothesis."""
         q, qd, qdd = (x[:, self.motion_source] * self.motion_scale for x in samples[:3])
         return MotionSamples(q + self.offset, qd, qdd, samples.tau[:, self.torque_source] * self.torque_scale)
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the columns of the log that this hypothesis reads as `samples`."""
+        """Return the logged columns that represent `samples` under this hypothesis: the inverse of `signals`."""
         motion, torque = np.argsort(self.motion_source), np.argsort(self.torque_source)
         q = (samples.q - self.offset) / self.motion_scale
         qd, qdd = samples.qd / self.motion_scale, samples.qdd / self.motion_scale
@@ -137,7 +137,7 @@ class GeometryProblem:
         return fewer
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
-        """Return the problem in which only some torques count; counted: (S, n), of the unchanged log."""
+        """Return the problem with only some torques. counted: mask (S, n) for the columns of the unchanged log."""
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
         return fewer
@@ -228,10 +228,10 @@ class GeometryProblem:
         return np.asarray((inverse(matrix) @ vector)[-columns.shape[2] :])
 
     def wrong_links(self, fit: HypothesisFit) -> Iterator[tuple[int, float, float]]:
-        """Yield bodies whose first moment is far from the URDF's, its ratio to the URDF's, and standard deviations.
+        """Yield the index of each body whose first moment differs significantly from the URDF's, and two numbers.
 
-        The ratio is along the direction of the URDF's first moment. A body counts only if the difference is visible in
-        the torques: small and distant bodies compensate for each other.
+        The first is the ratio of the moments along the direction of the URDF's, the second its standard deviation. A
+        body counts only if its effect on the torques is visible: small and distant bodies compensate for each other.
         """
         visible = GEOMETRY.visible * float(self.samples.tau.std(axis=0).max())
         gravity = float(np.linalg.norm(fit.hypothesis.gravity))
@@ -250,10 +250,10 @@ class GeometryProblem:
                 yield k, ratio, deviation
 
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
-        """Return the cost of rotor inertias below 0 and of friction that drives its joint, on average of the log.
+        """Return the penalty of negative rotor inertias, and of friction whose mean power over the log is positive.
 
-        Each costs the square of its standard score / 2, at most `implausible_inertia` and `implausible_friction`: a
-        drive may compensate friction, and the errors of a friction model may resemble inertia.
+        Each adds half of its squared standard score, at most `implausible_inertia` or `implausible_friction`: drives
+        may compensate friction, and errors of the friction model may resemble inertia.
         """
         drives, n = np.arange(len(normal)), len(normal)
         first = len(self._prior.mean)
@@ -271,7 +271,7 @@ class GeometryProblem:
 
 
 def _variance(tau: np.ndarray) -> np.ndarray:
-    """Return the variance (n,) of torques (S, n); infinite of a constant, which does not depend on the dynamics."""
+    """Return the variance (n,) of torques (S, n); infinite for a constant torque, which has no information."""
     return np.asarray(np.where(varying(tau), tau.var(axis=0), np.inf))
 
 

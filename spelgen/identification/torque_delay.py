@@ -26,9 +26,10 @@ FRICTION = FrictionModel(memory=True)
 
 @dataclass(frozen=True)
 class TorqueDelay:
-    """How much later than positions torques are logged, and half of the 99 % interval [s]; zeros: nothing is sure.
+    """Delay of logged torques relative to positions, and half of its 99 % interval [s]; both zero if none is
+    significant.
 
-    coupling: of motors, see `find_coupling`; where logs show one, no delay is searched: any would be wrong.
+    coupling: of motors, see `find_coupling`. If one is found, no delay is estimated, since it would be biased.
     """
 
     delay: float = 0.0
@@ -37,7 +38,7 @@ class TorqueDelay:
 
     @property
     def notes(self) -> list[Diagnostic]:
-        """Return the message about the delay, or about a coupling that prevents the search; none without either."""
+        """Return the message about the delay, or about a coupling that prevents its estimation; [] without either."""
         if self.coupling is not None:
             joint, other = (number + 1 for number in self.coupling[0].pair)
             message = (
@@ -72,7 +73,7 @@ def find_torque_delay(
     chain: BodyChain,
     preprocessing: Preprocessing,
 ) -> TorqueDelay:
-    """Return the delay that these logs show, see `delay_of`. kinds: the joints' types. chain: of the bodies."""
+    """Return the delay of the torques in logs, see `delay_of`. kinds: types of the joints. chain: of the bodies."""
     collected = DriveLog(kinds, drives, preprocessing)
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
         collected.add(log)
@@ -85,7 +86,7 @@ def delay_of(problem: DriveProblem) -> TorqueDelay:
     late, coupling = _likely_delay(problem), find_coupling(problem)
     if coupling is None:
         return late
-    # delayed torques may be confounded with a coupling, until they are shifted
+    # a delay may be confounded with a coupling: it is removed first
     moved = problem.of_torques(problem.samples.torques @ _spline(late.delay))
     if late.delay and find_coupling(moved) is None:
         return late
@@ -93,21 +94,22 @@ def delay_of(problem: DriveProblem) -> TorqueDelay:
 
 
 def _likely_delay(problem: DriveProblem) -> TorqueDelay:
-    """Return the delay that least squares with and without friction's memory both show, where both fit.
+    """Return the delay if it is significant without a friction state and, if this model fits, with one; zero
+    otherwise.
 
-    The value is from the form of friction with the smaller residual.
+    Its value is from the friction model with the smaller residual.
     """
     samples = problem.samples
     tau = samples.torques
     if not varying(problem.rows[..., -1]).any():
         return NO_DELAY
     estimates = []
-    # dry friction with and without memory, through the filter of the torques: a delay that only one form shows is its
-    # error
+    # dry friction with and without a state, filtered like the torques: a delay that only one form shows is an error of
+    # this form
     for dry in (samples.bent, samples.direction[..., None]):
         friction = FRICTION.columns(samples.qd, samples.qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
-    # a lag of friction resembles a delay with memory, but not without: its errors are symmetric
+    # errors of a friction state resemble a delay; errors of friction without a state do not, since they are symmetric
     memory, direct = estimates
     likely = [direct]
     if memory.squares <= HINTS.unlikely_form * direct.squares:
@@ -121,7 +123,8 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
 
 
 def _estimate(rows: np.ndarray) -> _Estimate:
-    """Return the delay of least squares by rows (S, n, K + D), the last of which are torques moved by `SHIFTS`.
+    """Return the delay with the smallest residual; rows: (S, n, K + D), regressor and torques shifted by each of
+    `SHIFTS`.
 
     The standard error is from a jackknife over blocks of time: model errors are correlated over seconds.
     """
@@ -136,14 +139,15 @@ def _estimate(rows: np.ndarray) -> _Estimate:
         squares = unexplained @ products.sum(axis=1) @ unexplained
         noise = np.sqrt(np.maximum(squares / len(rows), np.square(TUNING.least_noise * least)))
     spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
-    # beyond the last shift the delay is unknown; without any residual there are too few samples
+    # at the last shift the delay is unknown; a residual of zero means too few samples
     unknown = abs(delay) > SHIFTS[-2] or spread == 0
     standard_error = np.inf if unknown else float(np.sqrt(spread))
     return _Estimate(delay, standard_error, float((squares / least**2).sum()))
 
 
 def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the delay of the least squares by products (K + D, K + D), and the residual's coefficients, (K + D,).
+    """Return the delay of the smallest residual for Gram matrices (K + D, K + D), and the residual's coefficients, (K
+    + D,).
 
     Between shifts a torque is a cubic in the shift: filtered torques are smooth over one step.
     """

@@ -12,8 +12,8 @@ class IdentificationTuning:
     # [1] Iterations of the weights of joints from their torque residual; further ones change no printed digit
     # (UR10e).
     rounds: int = 4
-    # [1] Smallest noise as a fraction of a joint's torque range: few samples may be fitted better than they are
-    # determined.
+    # [1] Smallest noise as a fraction of a joint's torque range: the residual of few samples may be far below the
+    # noise.
     least_noise: float = 0.02
     # [1] Largest lag of the autocorrelation of residuals: 500 samples, 5 s.
     largest_lag: int = 500
@@ -41,16 +41,16 @@ class IdentificationTuning:
 class DriveHintTuning:
     """Detection of delayed torques and of coupled motors."""
 
-    # [1] Blocks of time, each predicted from the others.
+    # [1] Number of blocks of time, each of which is held out once.
     blocks: int = 10
     # [1] Stride of the samples that select among candidates.
     coarse: int = 4
-    # [1] Largest residual with a coupling, relative to the squared error and, per block, to the squared torque; the
-    # TX40's wrist has 0.05 and 0.03.
+    # [1] Largest squared residual with a coupling, relative to the one without and, per block, to the squared torque;
+    # the wrist of the TX40 has 0.05 and 0.03.
     coupling_gain: float = 0.5
-    # [1] Probability that any candidate is accepted by chance, as for terms of a fit.
+    # [1] Probability that any candidate is accepted by chance, as for residual terms.
     chance: float = 1 / 400
-    # [1] Relative increase of the squared error that is accepted for a ratio of small integers.
+    # [1] Relative increase of the squared residual up to which a ratio of small integers is preferred.
     simple_ratio: float = 0.02
     # [1] Initial ratios of the search for couplings: each covers half to twice its value.
     ratios: tuple[float, ...] = (1.0, -1.0, 0.4, -0.4, 2.5, -2.5)
@@ -60,13 +60,13 @@ class DriveHintTuning:
     # [1] The form with friction state is ignored if its squared residual exceeds the other form's by this
     # factor (recorded arms: 0.3 to 0.8).
     unlikely_form: float = 2.0
-    # [1] Probability outside a delay's interval: a log without delay must not get one.
+    # [1] Error probability of the interval of a delay; small, so that logs without delay are not shifted.
     delay_chance: float = 0.01
-    # [1] Samples that are kept: six joints have some 70 parameters.
+    # [1] Number of samples that are kept: six joints have about 70 parameters.
     samples: int = 1500
     # [1] Smallest number of samples for hints and errors.
     fewest_samples: int = 400
-    # [1] Largest number of trajectories; of more, only an even part is used.
+    # [1] Largest number of trajectories; of more, an evenly spaced subset is used.
     trajectories: int = 8
 
 
@@ -74,65 +74,68 @@ class DriveHintTuning:
 class LogGeometryTuning:
     """Numbers of the test of a log's geometry, chosen by benchmarks/log_geometry.py. Costs: negative log posteriors."""
 
-    # [s] residuals of recorded arms stay correlated for about 0.2 s: the likelihood counts one error in that time
+    # [s] Correlation time of the residuals of recorded arms: samples within it count as one independent error.
     correlation_time: float = 0.2
-    # at most this number of errors per joint: the errors of a rigid model do not average out in long logs
+    # [1] Largest number of independent errors per joint: errors of a rigid model do not average out in long logs.
     max_errors: float = 150.0
-    # [1] of the torque's variance, is always left: friction models err by 2 % of the torque
+    # [1] Smallest residual variance, relative to the torque's: errors of friction models are 2 % of the torque.
     error_floor: float = 4e-4
-    # [1] of the torque's variance, before the first iteration.
+    # [1] Initial residual variance, relative to the torque's.
     initial_error: float = 0.1
-    # Of the prior's weight, before the first iteration.
+    # [1] Initial weight of the prior.
     initial_scale: float = 0.1
-    # Of reweighting; the costs change by less than 0.1 after.
+    # [1] Number of reweighting iterations; more change the costs by less than 0.1.
     iterations: int = 6
-    # [1] standard deviations of masses, of centres of mass relative to the extent, and of tensors
+    # [1] Prior standard deviations of masses (relative), of centres of mass relative to the extent, and of tensors
+    # (relative).
     relative_error: float = 0.5
-    # [1] of the other bodies' mass or 1 kg, and [m]: standard deviation and extent of a body without an inertial
+    # Body without an inertial: standard deviation of its mass relative to the other bodies' or 1 kg [1], and extent
+    # [m].
     unknown_mass: float = 20.0
     unknown_extent: float = 0.5
-    # [m] of a body.
+    # [m] Smallest extent of a body.
     min_extent: float = 0.03
-    # [1] radius of gyration relative to the extent: point masses have none.
+    # [1] Smallest radius of gyration relative to the extent, for point masses.
     min_gyration: float = 0.3
-    # costs at most: recorded arms have friction that drives (shanghai's joint 6) or negative inertia (airbot), not both
+    # Largest penalties: recorded arms have friction of positive power (shanghai, joint 6) or negative rotor inertia
+    # (airbot), not both.
     implausible_inertia: float = 15.0
     implausible_friction: float = 10.0
-    # cost by which another hypothesis must be better: the recorded arms' best wrong one gains 16
+    # Smallest cost decrease of an accepted hypothesis: the best wrong one on recorded arms has 16.
     needed: float = 20.0
-    # Cost by which two hypotheses must differ for only one to be named.
+    # Cost difference up to which two hypotheses count as equally good, and are both reported.
     ambiguous: float = 8.0
-    # That a reading has at most, an order of joints as one.
+    # [1] Largest number of changes of a hypothesis; an order of joints counts as one.
     changes: int = 3
-    # Readings that a message names at most.
+    # [1] Largest number of hypotheses in a message.
     named: int = 3
-    # Random orders at which the search for the order of joints starts, in addition to three plausible ones.
+    # [1] Random initial orders of joints in the search, in addition to three plausible ones.
     random_orders: int = 6
-    # Cost of a change that is rarer than a wrong sense or order.
+    # Penalty of a change that is rarer than a wrong sense or order.
     rare: float = 1.0
-    # For comparing all hypotheses.
+    # [1] Samples for the comparison of all hypotheses.
     samples: int = 200
-    # Regressors in memory, of about 1 MB.
+    # [1] Number of regressors in memory, of about 1 MB each.
     kept: int = 30
-    # For the best ones.
+    # [1] Samples for the comparison of the best hypotheses.
     confirming_samples: int = 800
     # Gauss-Newton steps of an offset, or of the direction of gravity.
     refinements: int = 4
-    # [rad] smaller zero offsets and tilts of the base are errors of calibration.
+    # [rad] Zero offsets and tilts of the base below this bound are calibration errors.
     min_angle: float = 0.09
-    # [m] likewise of prismatic joints.
+    # [m] Zero offsets of prismatic joints below this bound are calibration errors.
     min_shift: float = 0.01
-    # Cost up to which a multiple of 90 degrees is preferred to the best angle.
+    # Cost increase up to which a multiple of 90 degrees is preferred to the best angle.
     right_angle: float = 3.0
-    # [rad] zero offsets and tilts of the base below are warnings.
+    # [rad] Zero offsets and tilts of the base below this bound are warnings, not errors.
     serious_angle: float = 0.17
-    # [1] Ratio of a first moment to the URDF's that errors of a CAD model do not explain.
+    # [1] Ratio of a first moment to the URDF's above which it is reported: errors of CAD models are smaller.
     wrong_moment: float = 2.5
-    # [1] Standard deviations by which such a ratio must differ from 1.
+    # [1] Number of standard deviations by which this ratio must differ from 1.
     certain: float = 4.0
-    # [1] of the largest joint torque's standard deviation: smaller gravity torques of a body are not visible.
+    # [1] Smallest visible gravity torque of a body, relative to the largest standard deviation of a joint's torque.
     visible: float = 0.5
-    # [1] of the URDF's gravity: with less in all joints it is compensated.
+    # [1] Fraction of the URDF's gravity torque at all joints, below which a controller compensates gravity.
     compensated: float = 0.5
 
 

@@ -13,7 +13,7 @@ from spelgen.live.tuning import TUNING
 
 
 class ContactState(NamedTuple):
-    """External torques and their thresholds, (n,) [Nm, N]; touched: joints above, (n,); force: at the tip, (3,) [N]."""
+    """External torques and thresholds, (n,) [Nm, N]; touched: mask (n,) of torques above; force: at the tip [N]."""
 
     external_torque: np.ndarray
     threshold: np.ndarray
@@ -22,7 +22,7 @@ class ContactState(NamedTuple):
 
 
 class ContactObserver:
-    """Low-passed momentum balance, at the rate of the samples.
+    """First-order low-pass filter of the momentum balance, updated with each sample.
 
     Each low-passed term is a state, (15, n): torque, friction, its uncertainty, the momenta of the arm at two
     bandwidths, and the regressor of the payload.
@@ -33,7 +33,7 @@ class ContactObserver:
         self.restart()
 
     def restart(self) -> None:
-        """Begin with the next sample."""
+        """Discard the filter states; the next sample initialises them."""
         self.t: float | None = None
         self.inputs = self.low = np.zeros((15, len(self.factor)))
         self.baseline = np.zeros_like(self.factor)
@@ -42,7 +42,10 @@ class ContactObserver:
     def step(
         self, t: float, qd: np.ndarray, at: Balance, payload: Payload, drift: np.ndarray
     ) -> ContactState:
-        """Use the terms of a sample; drift: friction scale minus one, and disturbance, (n, 2)."""
+        """Return the external torques after a sample.
+
+        at: its terms. drift: friction scale minus one, and disturbance, (n, 2).
+        """
         signal, variance = self.residual(t, at, payload, drift)
         variance = variance + self.levels.observer_variance(qd)
         threshold = self.factor * np.sqrt(variance)
@@ -53,9 +56,9 @@ class ContactObserver:
     def residual(
         self, t: float, at: Balance, payload: Payload, drift: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low-passed torque that model, payload and drift do not explain, and its variance, (n,).
+        """Return the low-pass filtered torque residual of model, payload and drift, and its variance, (n,) each.
 
-        The variance is that of changing accelerations, an unknown friction state and the payload; the noise is added.
+        The variance is due to changing accelerations, an unknown friction state and the payload; without the noise.
         """
         rate = TUNING.bandwidth
         scale, disturbance = drift.T
@@ -66,7 +69,7 @@ class ContactObserver:
         largest = TUNING.outlier * self.levels.drift.disturbance
         disturbance = np.clip(disturbance, -largest, largest)
         if self.t is None:
-            # no external torque: the arm may be in motion
+            # the steady state for constant inputs would be an external torque if the arm accelerates
             self.low = inputs.copy()
             self.low[0], self.low[1], self.low[5:] = rate * at.momentum, 0.0, rate * at.load_momentum.T
             self.baseline = disturbance
@@ -81,7 +84,7 @@ class ContactObserver:
             self.baseline = self.baseline + gain * (disturbance - self.baseline)
         self.t, self.inputs = t, inputs
         torque, friction, uncertainty, slow, fast = self.low[:5]
-        # the regressor of the payload, Phi, (n, 10), as of a block
+        # regressor Phi of the payload, (n, 10), as in `Block`
         regressor = rate * at.load_momentum - self.low[5:].T
         signal = (
             torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline
@@ -93,11 +96,11 @@ class ContactObserver:
 
 
 def tip_force(jacobian: np.ndarray, torque: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return the force at the tip that is nearest to external torques, (3,) [N], in root axes.
+    """Return the weighted least-squares estimate of a force at the tip, (3,) [N], in root axes, from external torques.
 
     Args:
         jacobian: of the tip, (3, n).
-        torque, variance: (n,).
+        torque, variance: external torques [Nm, N] and their variances, (n,).
     """
     weighted = jacobian / variance
     matrix = weighted @ jacobian.T

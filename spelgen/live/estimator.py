@@ -28,11 +28,11 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 @dataclass(frozen=True, eq=False)
 class EstimatorState:
-    """Result of a step; vectors are (n,).
+    """Estimates after a sample; vectors are (n,).
 
-    t [s]. refusal: "used", or why the sample was not. contact: see `ContactState`. payload: as reported last.
-    load_changed: whether the payload became another one in this step. friction_scale: friction of now relative to the
-    model [1]. disturbance: slow torque that neither model nor payload explains [Nm, N].
+    t [s]. refusal: "used", or the reason for which the sample was not used. contact: see `ContactState`. payload: of
+    the last report. load_changed: whether a change of the payload was detected at this sample. friction_scale: current
+    friction relative to the model [1]. disturbance: slow torque that neither model nor payload explains [Nm, N].
     """
 
     t: float
@@ -58,7 +58,8 @@ class Estimator:
         levels: NoiseLevels | None = None,
         alarms_per_minute: float = TUNING.alarms_per_minute,
     ) -> None:
-        """Take a fit; levels: default: of the fit. alarms_per_minute: rate of false alarms of contact.
+        """Prepare the estimator of a fit. levels: by default of the fit. alarms_per_minute: rate of false contact
+        alarms.
 
         Raises RunError for a model without rigid bodies or with position servos, and for a fit without noise levels.
         """
@@ -69,7 +70,7 @@ class Estimator:
         self.reset()
 
     def reset(self) -> None:
-        """Start again: payload, friction drift and friction state are unknown."""
+        """Reset to unknown payload, friction drift and friction state."""
         n = self.model.n
         self.intake = Intake(self.levels, self.reach)
         self.blocks = Blocks(self.levels.rest_speed)
@@ -83,7 +84,7 @@ class Estimator:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Numbers of samples by reason that were refused or only partly used."""
+        """Number of samples that were refused or only partly used, by reason."""
         return {reason: count for reason, count in self.intake.counts.items() if count and reason != "used"}
 
     def step(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> EstimatorState:
@@ -106,7 +107,7 @@ class Estimator:
             yield EstimatorState(now, refusal, self.contact, self.payload, changed, 1 + a, d)
 
     def _advance(self, t: float, qd: np.ndarray, at: Balance, refusal: Refusal) -> bool:
-        """Use the terms of a sample; return True if the load became another one."""
+        """Update all filters with the terms of a sample; return True if a change of the load was detected."""
         if refusal != "used":
             self.blocks.restart()
             self.half = None
@@ -126,14 +127,14 @@ class Estimator:
         return changed
 
     def report(self) -> Payload:
-        """Find the payload, and use it from the next step on; ``step`` does this after each second of motion."""
+        """Estimate the payload and use it from the next step on; ``step`` calls this after each second of motion."""
         main, before = self.estimate.filters[0], self.payload
         self.reported = self.estimate.moved
         self.payload = find_payload(
             main.x[:10], main.P[:10, :10], self.levels.load_variance, self.levels.load_quantile
         )
         if (before.status == "payload") != (self.payload.status == "payload"):
-            # torques of the load were confounded with drift
+            # the drift filter has attributed torques of the load to friction: it starts from the payload filter
             joints = slice(10, 10 + self.model.n)
             self.drift = JointFilters.of_drift(self.levels.drift)
             self.drift.x[:, 0] = main.x[joints]
@@ -141,11 +142,11 @@ class Estimator:
         return self.payload
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float = 0.0) -> np.ndarray:
-        """Return the torques that give qdd with the payload and the friction of now, (n,) [Nm, N].
+        """Return the torques for accelerations qdd with the estimated payload and friction drift, (n,) [Nm, N].
 
         Args:
-            q, qd, qdd: (n,).
-            ahead: time until the motion [s]; the disturbance decays, and is omitted beyond 0.3 s.
+            q, qd, qdd: (n,) [rad, m], per s, per s^2.
+            ahead: time from now until the motion [s]; the disturbance decays, and is omitted beyond 0.3 s.
         """
         at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
         z = torch.from_numpy((self.intake.low + self.intake.high) / 2)
@@ -165,7 +166,10 @@ class Estimator:
 
 
 def torque_model(fit: Fit) -> RigidBodyDynamics:
-    """Return the model of a fit in double precision. Raises RunError if it cannot be estimated with."""
+    """Return the model of a fit in double precision.
+
+    Raises RunError for a model that the estimator does not support.
+    """
     model = fit.model
     if not isinstance(model, RigidBodyDynamics):
         raise RunError(

@@ -20,11 +20,11 @@ from spelgen.live.tuning import TUNING
 
 
 class Block(NamedTuple):
-    """The momentum balance over a block.
+    """Means of the terms of the momentum balance over a block of samples.
 
-    duration [s]. y: torque that the model does not explain, (n,) [Nm, N]. load: Phi, (n, 10). friction: mean of the
-    model's friction, (n,). uncertainty: of friction whose state is unknown, (n,). moving: whether a joint moves,
-    (n,).
+    duration [s]. y: torque residual of the model, (n,) [Nm, N]. load: regressor Phi of the payload, (n, 10).
+    friction: of the model, (n,) [Nm, N]. uncertainty: of friction whose state is not known exactly, (n,) [Nm, N].
+    moving: whether each joint moved, (n,).
     """
 
     duration: float
@@ -35,7 +35,7 @@ class Block(NamedTuple):
     moving: np.ndarray
 
     def joined(self, later: Block) -> Block:
-        """Return the block of this one and the next one."""
+        """Return one block for this block and the next one."""
         duration = self.duration + later.duration
         # means over time, so that the longer block counts more
         weight = later.duration / duration
@@ -46,19 +46,19 @@ class Block(NamedTuple):
 
 
 class Blocks:
-    """The momentum balance over the samples of a block: integrate and dump, without a low-pass filter."""
+    """Accumulator of samples that returns a `Block` after each period of `TUNING.block` seconds; no low-pass filter."""
 
     def __init__(self, rest_speed: np.ndarray) -> None:
         self.rest_speed = rest_speed
         self.restart()
 
     def restart(self) -> None:
-        """Drop the block: time or motion has a hole."""
+        """Discard the samples of the current block, after a gap."""
         self.samples: list[tuple[float, np.ndarray, Balance]] = []
         self.duration = 0.0
 
     def add(self, t: float, qd: np.ndarray, at: Balance) -> Block | None:
-        """Add a sample, terms (n,) and (n, 10); return the block that it ends."""
+        """Add a sample: time [s], velocities (n,) and terms of the balance; return the block if it is complete."""
         step = t - self.samples[-1][0] if self.samples else 0.0
         self.samples.append((t, np.abs(qd), at))
         # the sum of the steps, as the C code has it: t minus the first t rounds differently
@@ -84,8 +84,8 @@ class Blocks:
 class LoadFilter:
     """Filter of theta, a, b and d, in this order.
 
-    x: (10 + 3 n,). P: its covariance. log_likelihood: of the rows since it was set to zero. surprise: sum of the
-    normalised squared residuals of the last block of moving joints. disturbance: stationary variance of d, (n,).
+    x: (10 + 3 n,). P: its covariance. log_likelihood: of the rows since its last reset. surprise: sum of the
+    normalised squared residuals of moving joints in the last block. disturbance: stationary variance of d, (n,).
     """
 
     def __init__(self, noise: BlockNoise, effort: np.ndarray) -> None:
@@ -97,7 +97,7 @@ class LoadFilter:
         self.log_likelihood = self.surprise = 0.0
 
     def forget_load(self) -> None:
-        """Make the payload unknown."""
+        """Reset the payload to its prior distribution."""
         self.x[:10] = 0.0
         self.P[:10] = self.P[:, :10] = 0.0
         self.P[:10, :10] = np.diag(TUNING.load_prior**2)
@@ -113,7 +113,7 @@ class LoadFilter:
         self.surprise = 0.0
 
     def update(self, block: Block, joint: int) -> None:
-        """Use the row of a joint; of a joint at rest for its disturbance only."""
+        """Update the state with the row of a joint; a joint at rest updates only its disturbance."""
         columns = [*range(10), *range(10 + joint, 10 + 3 * self.n, self.n)]
         row = np.array([*block.load[joint], block.friction[joint], 1.0, 1.0])
         covariance = self.P[:, columns] @ row
@@ -135,7 +135,7 @@ class LoadFilter:
 
 
 class JointFilters:
-    """Filters of the friction scale a and the disturbance d of each joint, under a known payload.
+    """Independent filters of the friction scale a and the disturbance d of each joint, for a known payload.
 
     All joints are filtered at a time, and all hypotheses about their noise (...). K states: a first, d last, and the
     offset b between them if there is one.
@@ -165,7 +165,7 @@ class JointFilters:
         return cls(deviations, noise.white, noise.time_constant, drifts=True)
 
     def update(self, block: Block, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Advance the state by a block, and use its torque that the payload does not explain, (n,) [Nm, N].
+        """Predict the state over a block, and update it with the torque of the block without the payload, (n,) [Nm, N].
 
         Returns:
             the residual of the prediction, and its variance by the model, (..., n).
@@ -193,10 +193,10 @@ class JointFilters:
 
 
 class PayloadEstimate:
-    """The payload filter, and the hypotheses of another load and of a contact.
+    """The payload filter, and two more filters for the hypotheses of a changed load and of a contact.
 
-    Rows of a block are used one per sample, more if samples are rare. moved: motion since the start or the last
-    change [s].
+    The rows of a block (one per joint and filter) are spread over the samples of the next block, to bound the time per
+    sample. moved: time in motion since the start or the last change of load [s].
     """
 
     def __init__(self, levels: NoiseLevels) -> None:
@@ -207,7 +207,7 @@ class PayloadEstimate:
         self.samples = self.per_sample = 0
 
     def start(self, block: Block) -> None:
-        """Begin to use a block; the rows of the block before are used up."""
+        """Process the remaining rows of the former block, and begin with this block."""
         for _ in self.rows:
             pass
         if block.moving.any():
@@ -218,7 +218,7 @@ class PayloadEstimate:
         self.rows = self._rows(block)
 
     def step(self) -> None:
-        """Use the rows of one sample."""
+        """Process the share of rows of one sample."""
         self.samples += 1
         for _ in range(self.per_sample):
             next(self.rows, None)
@@ -234,7 +234,7 @@ class PayloadEstimate:
             yield
 
     def _compare(self, moving: int) -> None:
-        """Begin, accept or drop the hypotheses of another load and of a contact; moving: number of joints."""
+        """Begin, accept or drop the hypotheses of a changed load and of a contact; moving: number of moving joints."""
         main = self.filters[0]
         if len(self.filters) > 1:
             _, candidate, contact = self.filters
@@ -246,7 +246,7 @@ class PayloadEstimate:
             if self.hypotheses_moved >= least:
                 self.filters = [main]
         is_surprise = moving and main.surprise > moving + TUNING.surprise * math.sqrt(2 * moving)
-        # from the first second of motion on: before, the payload is unknown
+        # not before the payload filter has used the first second of motion
         if len(self.filters) == 1 and is_surprise and self.moved >= TUNING.changed_after:
             main.log_likelihood = self.hypotheses_moved = 0.0
             candidate, contact = copy.deepcopy(main), copy.deepcopy(main)

@@ -1,4 +1,4 @@
-"""Checks of samples as they come, and the friction state along them."""
+"""Checks of each measured sample, and bounds of the friction state."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ IGNORED: tuple[Refusal, ...] = ("not finite", "repeated", "reversed", "jump")
 
 
 class Intake:
-    """The last accepted sample, counts by reason, and bounds of the friction state, low and high, (n, K) [rad, m].
+    """The last accepted sample, counts of samples by reason, and bounds low and high of the friction state, (n, K)
+    [rad, m].
 
-    The state is between its bounds, which start at the break-away displacements and are equal after some motion.
+    The bounds start at the break-away displacements. Motion of a joint makes them equal: its state is then known.
     """
 
     def __init__(self, levels: NoiseLevels, bristles: BristleReach) -> None:
@@ -34,9 +35,9 @@ class Intake:
         self.low, self.high = -self.limit, self.limit
 
     def accept(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
-        """Check a sample, q, qd, tau (n,), and update the friction state; return why it is not used."""
+        """Check a sample, q, qd, tau (n,), update the bounds of the friction state, and return "used" or the reason."""
         refusal = self._check(t, q, qd, tau)
-        # after some of them in a row, clock or positions have changed for good
+        # after several in a row, clock or positions have changed permanently
         self.ignored += refusal in ("reversed", "jump")
         restarts = self.ignored >= TUNING.restart
         if refusal == "gap" or restarts or self.t == -np.inf:
@@ -67,7 +68,7 @@ class Intake:
             return "jump"
         if t - self.t > TUNING.gap:
             return "used" if self.t == -np.inf else "gap"
-        # one step of the encoder, and the speeds of a sample that a clock has late
+        # allowance for one encoder step, and for a sample with a delayed time stamp
         furthest = speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
         if (np.abs(q - self.q) > furthest).any():
             return "jump"

@@ -1,6 +1,6 @@
-"""Noise levels of a fit: from its run folder, else by cross-validation on its logs.
+"""Noise levels of a fit: read from its run folder, or else estimated by cross-validation on its logs.
 
-The model of each fold has not seen its logs: its torque residual is the error on other days, not the one of the fit.
+The torque residual of each log is of a model that was fitted to other logs: the residual of the fit would be too small.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 
 
 def keep_levels(fit: Fit, levels: NoiseLevels | None = None) -> None:
-    """Write noise levels into the run folder of a fit; None: find them, for a fit to torques."""
+    """Write noise levels into the run folder of a fit; None: estimate them first, if the fit is to torques."""
     of_torques = isinstance(fit.config, TorqueFit) and isinstance(fit.model, RigidBodyDynamics)
     if levels is None and of_torques and fit.logs:
         levels = cross_validated_levels(fit)
@@ -95,8 +95,8 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
     """Return the model of a fit, fitted to other logs from its initial parameters. Raises LogError for too little
     motion.
 
-    A part of the samples suffices to find the error on other logs, and so does a model without residual terms if the
-    fit has none.
+    A part of the samples suffices to estimate the error on other logs. Without residual terms in the fit, none are
+    selected.
     """
     model = assemble(required_spec(fit.model)).double()
     if residual_terms(without_idle_residuals(fit.model)) is None:
@@ -136,7 +136,7 @@ class HeldOutSample(NamedTuple):
 
 
 def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> list[HeldOutSample]:
-    """Return the usable samples of a log."""
+    """Return the accepted samples of a log, with the terms of the momentum balance."""
     intake, blocks = Intake(levels, bristle_reach(model)), Blocks(levels.rest_speed)
     refusals, terms = balance_along(model, levels, intake, log.t, (log.q, log.qd, log.tau))
     samples = []
@@ -152,7 +152,7 @@ def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> 
 def find_levels(
     folds: Sequence[tuple[RigidBodyDynamics, Sequence[Trajectory]]], effort: np.ndarray, point: np.ndarray
 ) -> NoiseLevels:
-    """Return the noise levels of folds of logs.
+    """Return the noise levels of an arm from held-out logs.
 
     Args:
         folds: models, each with the logs that it was not fitted to.
@@ -175,7 +175,7 @@ def find_levels(
         load_freedom=1.0,
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
-        # torques of the logs are within the limits in any case
+        # no limit is below the largest logged torque
         effort=np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest),
         minutes=sum(log.duration for log in logs) / 60,
         point=point,
@@ -190,9 +190,9 @@ def find_levels(
 
 
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
-    """Return the factor on the covariance of payloads, and its degrees of freedom.
+    """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
 
-    No payload is carried: the estimates show the error. Windows of blocks in a row are independent trials. The squared
+    The logs are without payload: each estimate is an error. Windows of blocks in a row are independent trials. The squared
     estimates relative to their covariance, of the mass, and of mass and first moments, are averaged together with the
     prior, and the largest average counts: errors of the model average out slowly, so that longer windows may be worse.
     """
@@ -218,7 +218,7 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
 
 
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
-    """Return the levels of maximum likelihood of blocks in a row of each log, over a grid; all joints at a time.
+    """Return the noise of maximum likelihood over a grid, per joint; segments: consecutive blocks, for each log.
 
     The model is y = f a + b + d + w per joint (see `live.filters`); white noise has its own scale for each point of
     the grid.
@@ -240,7 +240,7 @@ def _likelihood(
     """Return the negative log likelihood and the mean normalised squared residual, (grid, n).
 
     Args:
-        segments: blocks in a row.
+        segments: consecutive blocks, for each log.
         grid: time constants and ratios, (grid, 2).
         scale: standard deviations of white noise, (grid, n).
     """
@@ -249,7 +249,7 @@ def _likelihood(
     # of a, b and d; the offset is within a few standard deviations of the noise
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
-        # joints at rest determine no noise of motion
+        # the noise of motion is estimated from moving joints only
         filters = JointFilters(prior, scale, constant)
         for block in blocks:
             residual, expected = filters.update(block, block.y)
@@ -261,7 +261,7 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
-    """Return levels with the noise of the momentum observer and the tails of its peaks."""
+    """Return the levels completed by the noise of the momentum observer and the exponential tail of its peaks."""
     columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     times = np.array([sample.t for samples in tested for sample in samples])
     for samples in tested:

@@ -23,7 +23,7 @@ _BLOCK = 2048  # samples that are computed at a time
 
 
 class Balance(NamedTuple):
-    """Terms at samples, (T, n) or (T, n, 10), in SI units.
+    """Terms of the momentum balance at samples, (T, n) or (T, n, 10), in SI units.
 
     momentum: p. torque: G (tau - offset) + friction compensation + dL/dq. friction: at the middle of the bounds of the
     friction state. uncertainty: half the difference of friction at both bounds. load_momentum: P. load_torque: N.
@@ -82,8 +82,8 @@ def load_terms(model: RigidBodyDynamics, q: Tensor, qd: Tensor, point: Tensor) -
 
 
 def _projected(axes: tuple[Tensor, Tensor], twist: tuple[Tensor, Tensor]) -> Tensor:
-    """Return a . angular momentum + l . linear momentum per parameter, (T, bodies, 10), of a body that moves at a
-    twist.
+    """Return a . angular momentum + l . linear momentum per inertial parameter of a body with this twist, (T, bodies,
+    10).
 
     Linear momentum is m v + w x mc, angular momentum I w + mc x v. axes: (a, l), (T, bodies, 3).
     """
@@ -98,7 +98,7 @@ def _projected(axes: tuple[Tensor, Tensor], twist: tuple[Tensor, Tensor]) -> Ten
 def balance(
     model: RigidBodyDynamics, point: np.ndarray, samples: Sequence[np.ndarray], bounds: Sequence[np.ndarray]
 ) -> Balance:
-    """Return the terms at samples.
+    """Return the terms of the momentum balance at samples.
 
     Args:
         model: in double precision.

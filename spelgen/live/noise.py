@@ -40,7 +40,7 @@ class BlockNoise(BaseModel):
 
 
 class NoiseLevels(BaseModel):
-    """All that the estimator knows of an arm besides its model; vectors are (n,).
+    """Noise levels and limits of an arm that the estimator uses in addition to its model; vectors are (n,).
 
     drift, load: noise of blocks of both filters. observer, resting: standard deviations of the momentum observer of a
     moving joint and, in addition, of a joint at rest [Nm, N]; the latter falls with exp(-|qd| / resting_speed) [rad/s,
@@ -89,7 +89,7 @@ class NoiseLevels(BaseModel):
         return variance
 
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
-        """Return the thresholds of the normalised observer, (n,), for a rate of false alarms of all joints."""
+        """Return the thresholds of the normalised observer, (n,), for a total rate of false alarms of all joints."""
         windows = 60 / TUNING.window * TAIL * len(self.observer)
         tail = self.peak_start + self.peak_scale * math.log(windows / alarms_per_minute)
         return TUNING.other_days * np.maximum(tail, 1.0)

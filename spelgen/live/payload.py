@@ -69,7 +69,7 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
 
 
 def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quantile: float) -> Payload:
-    """Return the payload, as `find_payload`. Raises LinAlgError if a matrix is not positive definite."""
+    """Return the payload; arguments: see `find_payload`. Raises LinAlgError if a matrix is not positive definite."""
     precision = _inverse(covariance)
     linear = precision @ mean / factor
     precision = (precision - np.diag(TUNING.load_prior**-2.0)) / factor

@@ -152,7 +152,7 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
     estimator, begin = Estimator(fit), 0.0
     for log in logs:
         t = log.t - log.t[0] + begin
-        # further apart than the longest gap
+        # the pause between two logs is longer than the longest gap
         begin = float(t[-1]) + 2 * TUNING.gap
         for _ in estimator.steps(t, log.q, log.qd, log.tau):
             pass
@@ -160,7 +160,7 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
 
 
 def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> list[ContactEvent]:
-    """Return the contacts of estimates in a row."""
+    """Return the contacts in consecutive estimates."""
     touching = [state for state in states if state.contact.touched.any()]
     ends = np.flatnonzero(np.diff([state.t for state in touching]) > TUNING.merged) + 1
     events = []

@@ -36,7 +36,7 @@ class LiveTuning:
     load_inertia: float = 0.4
     # [1] Prior standard deviation of the friction scale.
     friction: float = 0.01
-    # [1/s] Variance per second of its random walk.
+    # [1/s] Variance per second of the random walk of the friction scale.
     friction_walk: float = 1e-4
     # [1] Prior standard deviation of the torque offset, relative to the effort limit.
     offset: float = 0.01
@@ -48,15 +48,16 @@ class LiveTuning:
 
     # Changed loads (`live.estimator`).
 
-    # [1] Standard deviations of the squared residuals of a block from which on another load is considered.
+    # [1] Number of standard deviations above which the squared residuals of a block start the hypothesis of a changed
+    # load.
     surprise: float = 3.0
     # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
     contact_disturbance: float = 8.0
-    # [1] Log likelihood ratio, and [s] motion, from which on another load is accepted.
+    # [1] Log likelihood ratio, and [s] time in motion, from which on a changed load is accepted.
     changed: float = 15.0
     changed_after: float = 1.0
-    # [s] Motion after which the hypotheses are dropped; earlier, after `changed_after`, if the log likelihood ratio
-    # is below this.
+    # [s] Time in motion after which the hypotheses are dropped; after `changed_after` if the log likelihood ratio is
+    # below `unlikely`.
     unlikely: float = -8.0
     dropped_after: float = 4.0
 
@@ -70,7 +71,7 @@ class LiveTuning:
     # [s] Time constant at which the disturbance is removed from the external torque: longer than it takes to find a
     # contact, so that the disturbance does not absorb the contact.
     baseline: float = 0.3
-    # [1] Factor on the thresholds: models err more on other days than between training logs.
+    # [1] Factor on the thresholds: errors of models are larger on other days than between training logs.
     other_days: float = 1.22
     # [1/min] Default rate of false alarms.
     alarms_per_minute: float = 1.0
@@ -79,7 +80,7 @@ class LiveTuning:
 
     # Payload (`live.payload`).
 
-    # [s] Motion between two reports.
+    # [s] Time in motion between two reports of the payload.
     report: float = 1.0
     # [m] Radius of gyration and distance along z of the prior mean of a payload.
     radius: float = 0.2
@@ -104,10 +105,11 @@ class LiveTuning:
     folds: int = 3
     min_samples: int = 300
     max_samples: int = 2**11
-    # [s] Time constants of the disturbance that are compared, and [1] its ratios to the white noise.
+    # [s] Time constants of the disturbance that are compared, and [1] its standard deviation divided by the one of
+    # white noise.
     time_constants: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
     disturbance_ratios: tuple[float, ...] = (0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5)
-    # [1] Lengths of a trial of the payload filter: blocks of 0.2 s, 5 and 10 s.
+    # [1] Lengths of the trials of the payload filter, in blocks: 5 and 10 s.
     trial_blocks: tuple[int, ...] = (25, 50)
     # [1] Prior of the factor on the covariance of payloads, and the number of trials that it counts as: arms with few
     # logs have too few trials of their own.

@@ -1,1 +1,1 @@
-"""Logs are held against the arm that they come from, for `spelgen logs`."""
+"""Checks of logs against their arm, for `spelgen logs`."""

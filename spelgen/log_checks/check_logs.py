@@ -1,4 +1,4 @@
-"""Report the content of the logs of a robot, and findings about it."""
+"""Report of the content of the logs of a robot, with findings about them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, CURRENT, WRONG_LINK, *G
 
 
 def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None = None) -> LogReport:
-    """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
+    """Return the report about the logs of an arm, which are read once. Faults of the logs are reported, not raised.
 
     The report's `errors` prevent training. mapping: of the logs, by default from the arm's settings; units that
     it declares and errors that it accepts are not checked. The arm's input matrix converts logged torques to joint
@@ -42,7 +42,7 @@ def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None 
     log_checks = LogChecks(joints, types)
     measured: list[Statistics] = []
     examples: list[Trajectory] = []
-    # one after another: a stream of logs may be larger than memory
+    # one trajectory at a time: an iterator of logs may be larger than memory
     for trajectory in logs:
         require_joints(trajectory, joints)
         checked.add(trajectory)
@@ -71,7 +71,7 @@ def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None 
 def require_sound_logs(
     logs: Sequence[Trajectory], arm: Arm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
-    """Return the findings of `check_logs` about an arm and its logs; raise LogError where they cannot be trained on."""
+    """Return the findings of `check_logs` about an arm and its logs; raise LogError if they cannot be trained on."""
     # the same checks as the command: a fit and `spelgen logs` refuse the same logs
     report = check_logs(logs, arm, mapping)
     collect(report.errors)

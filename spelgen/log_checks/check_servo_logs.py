@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 MOVING = SAMPLES.moving
 DELAYS = np.arange(TUNING.earliest_delay, TUNING.latest_delay + 1e-9, TUNING.delay_step).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
-FILTER_SAMPLES = 12  # the shortest piece that the derivative's polynomial has room in
+FILTER_SAMPLES = 12  # shortest piece that the polynomial of the derivative fits into
 FOLLOWS = SIGNALS.agreement
 
 
 class Following(NamedTuple):
     """Tracking of the commands of n joints.
 
-    moves: (n,) whether the command moves. delay, correlation: (n, n) of the command of the row's joint with the
-    position of the column's, at the delay [s] of the largest correlation. gain: (n,) ratio of a joint's motion to its
-    own command's. joints: one per joint.
+    moves: (n,) whether the command moves. correlation: (n, n) of the command of joint i (row) with the position of
+    joint j (column), at the delay (n, n) [s] at which its magnitude is largest. gain: (n,) amplitude of a joint's
+    motion divided by the amplitude of its command. joints: measurements per joint.
     """
 
     moves: np.ndarray
@@ -46,9 +46,9 @@ class Following(NamedTuple):
 
 
 def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Following | None:
-    """Measure n joints over recordings; None where none is long enough.
+    """Return the tracking of n joints over all recordings; None if no recording is long enough.
 
-    saturation: (n,) distances from the command at which torque is at its limit; infinite where that is not known.
+    saturation: (n,) distances from the command at which the torque is at its limit; infinite if unknown.
     """
     pieces: list[Trajectory] = []
     for log in logs:
@@ -61,7 +61,7 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
     correlations, tracking_rms = [], []
     for delay in DELAYS.tolist():
         u = np.concatenate([delayed_commands(x, slice(0, len(x)), delay, 1)[:, 0] for x in pieces])
-        # means differ by the static error, which is no matter of delay
+        # without means, which differ by the static error
         covariance = (u - u.mean(axis=0)).T @ (q - q.mean(axis=0)) / len(u)
         correlations.append(covariance / np.maximum(np.outer(u.std(axis=0), q_std), 1e-6))
         tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))
@@ -72,7 +72,7 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
     joints = []
     for k, error in enumerate(_steady_state_errors(pieces)):
         delay_index = best[k, k] if moves[k] else NO_DELAY
-        lag = float(DELAYS[delay_index]) + 0.0 if moves[k] else None  # no -0
+        lag = float(DELAYS[delay_index]) + 0.0 if moves[k] else None  # + 0.0 turns -0 into 0
         fraction = float(saturated[k]) if np.isfinite(saturation[k]) else None
         joints.append(JointFollowing(lag, float(tracking_rms[delay_index][k]), error, fraction))
     gain = correlation.diagonal() * q_std / np.maximum(u_std, 1e-6)
@@ -92,13 +92,13 @@ def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
         distances.append(np.abs(u - _midpoints(piece.q)))
     errors: list[float | None] = []
     for distance, resting in zip(np.concatenate(distances).T, np.concatenate(rests).T, strict=True):
-        # not the largest: where an arm leans on something it may be anywhere
+        # not the largest one, which is arbitrary if the arm was in contact with an obstacle
         errors.append(float(np.quantile(distance[resting], 0.9)) if resting.any() else None)
     return errors
 
 
 def _midpoints(x: np.ndarray) -> np.ndarray:
-    """Return values in the middle between samples, where delayed commands are."""
+    """Return the values halfway between samples, at which delayed commands are evaluated."""
     return np.asarray((x[1:] + x[:-1]) / 2)
 
 
@@ -110,7 +110,7 @@ class ServoLogs:
         self._logs: list[Trajectory] = []
 
     def add(self, trajectory: Trajectory) -> None:
-        """Take in a trajectory. Raises LogError without commands."""
+        """Add a trajectory. Raises LogError without commands."""
         require_commands(trajectory)
         self._logs.append(trajectory)
 
@@ -162,18 +162,18 @@ def _odd_command(
     is_copy: the command is the position itself.
     """
     where = f"joint {joints[k]!r}"
-    # at the delay of the largest correlation: a slow servo is not wrong
+    # correlations are evaluated at the best delay, so that a slow servo is not a finding
     correlation, gain = following.correlation[k, k], following.gain[k]
     if is_copy:
         code, message = (
             "commands-are-positions",
             "u is q, to the last bit: are the commands those that were sent?",
         )
-    # a constant command is evidence of nothing
+    # a constant command does not determine the servo
     elif not following.moves[k]:
         width = report.high["u"] - report.low["u"]
         code, message = "idle-command", f"its command moves by {width:.3g} alone: its servo is not determined"
-    # a servo follows its command to a fifth, unless one of the two is in degrees
+    # the amplitudes of command and motion are equal within a fifth, unless one of them is in degrees
     elif correlation > FOLLOWS and (is_factor(gain, DEGREES) or is_factor(gain, 1 / DEGREES)):
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         do = "write 'units' of q and u under 'logs' in the robot's YAML"

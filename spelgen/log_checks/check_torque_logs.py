@@ -1,4 +1,4 @@
-"""Check logs of torques with the model of their arm: geometry, limits, drives."""
+"""Checks of logs of torques with the model of their arm: geometry, limits, drives."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ CURRENT = "current-without-gain"
 
 
 class TorqueLogs:
-    """Check logs of torques with the model of their arm, from samples that are kept while the logs go by."""
+    """Checks of logs of torques with the model of their arm, on a subset of the samples of all trajectories."""
 
     def __init__(self, arm: Arm, mapping: LogMapping) -> None:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
@@ -58,7 +58,7 @@ class TorqueLogs:
         self._seconds, self._is_bag = 0.0, False
 
     def add(self, trajectory: Trajectory) -> None:
-        """Take in a trajectory. Raises LogError without torques."""
+        """Add a trajectory. Raises LogError without torques."""
         require_torques([trajectory])
         self._samples.append(state_samples(trajectory, self._drives.inputs))
         self._moving.add(trajectory)
@@ -71,8 +71,8 @@ class TorqueLogs:
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports with gravity's part in the torques, and tables; add the findings to the summary."""
-        # a code that files declare holds if all of them declare it
+        """Return the reports with the fit of gravity to the torques, and tables; add the findings to the summary."""
+        # a code is accepted if all files declare it
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         motion = joined(self._samples)
         completed = []
@@ -80,14 +80,14 @@ class TorqueLogs:
         for report, gravity in zip(reports, fits, strict=True):
             completed.append(replace(report, gravity=gravity))
         evidence = list(map(JointEvidence, self._arm.chain.coordinates, completed))
-        # with wrong velocities friction is wrong too, and hints about drives would be wrong with wrong torques
+        # wrong velocities cause wrong friction, and wrong torques cause wrong hints about drives
         is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
         unscaled = list(self._current_note())
         summary.notes.extend(unscaled)
         moving = self._moving.samples()
         weightless: list[JointEvidence] = []
         if is_sound:
-            # with torques of unknown factors another reading may seem better
+            # with unknown factors on the torques another hypothesis may have a lower cost
             problem = None if unscaled else self._problem(moving, motion)
             is_right = problem is None or self._is_within_limits(problem, accepted, summary)
             if problem is not None and is_right:
@@ -101,9 +101,9 @@ class TorqueLogs:
         has_errors = bool(summary.errors)
         for joint in evidence:
             passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
-            if has_errors:  # one cause, one message
+            if has_errors:  # one message per cause
                 passed.add("torque-beyond-drive")
-            if joint not in weightless:  # other masses than the URDF's explain it
+            if joint not in weightless:  # errors of the URDF's masses explain it
                 passed.add(WITHOUT_GRAVITY)
             where = f"joint {joint.coordinate.name!r}"
             for check, message in run_checks(CHECKS, joint, passed):
@@ -134,7 +134,7 @@ class TorqueLogs:
         return self._mapping.unit("tau", joint) is not None
 
     def _problem(self, moving: DriveSamples | None, motion: np.ndarray) -> GeometryProblem | None:
-        """Return the least-squares problem of the log; None with too few samples, or without torques.
+        """Return the least-squares problem of the log; None for too few samples, or without torques.
 
         moving: filtered samples; None: the logs are too slow for accelerations, and motion (4, S, n) is used.
         """
@@ -147,7 +147,7 @@ class TorqueLogs:
         return GeometryProblem(self._arm.chain, samples, self._drives.speeds, self._seconds, reading)
 
     def _is_within_limits(self, problem: GeometryProblem, accepted: set[str], summary: Findings) -> bool:
-        """Return True without an error that torques are clipped; add it, and warnings about mechanical stops."""
+        """Return False if torques are clipped; add this error, or warnings about mechanical stops, to the summary."""
         findings = find_limits(problem, FlatTops.joined(self._flat))
         errors = [x for x in findings.errors if CLIPPED not in accepted]
         summary.errors.extend(errors)
@@ -161,7 +161,7 @@ class TorqueLogs:
         accepted: set[str],
         summary: Findings,
     ) -> bool:
-        """Return True if no other reading of the columns explains the torques better; add the finding if one does."""
+        """Return True if no other hypothesis about the columns fits the torques better; add the finding otherwise."""
         if not comparison.better:
             summary.notes.extend(_link_notes(problem, comparison.unchanged))
         if not comparison.better or set(comparison.codes) <= accepted:
@@ -184,7 +184,7 @@ class TorqueLogs:
 
 
 def _weightless(problem: GeometryProblem, joints: Sequence[JointEvidence]) -> list[JointEvidence]:
-    """Return the joints in whose torques least squares finds no gravity, with any masses near the URDF's."""
+    """Return the joints whose torques are explained better without gravity than with any masses near the URDF's."""
     suspicious = [k for k, joint in enumerate(joints) if find_no_gravity(joint)]
     if not suspicious:
         return []
@@ -199,7 +199,7 @@ def _weightless(problem: GeometryProblem, joints: Sequence[JointEvidence]) -> li
 
 
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
-    """Yield a warning for each link whose inertials in the URDF are far from the log's."""
+    """Yield a warning for each link whose inertials in the URDF differ significantly from the fit to the log."""
     for k, ratio, deviation in problem.wrong_links(fit):
         message = (
             f"its first moment (mass times centre of mass) is {ratio:.2f} +- {deviation:.2f} times the URDF's by "
@@ -209,7 +209,7 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
 
 
 def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic:
-    """Return a coupling that the logs show, in the sidecar's words."""
+    """Return the warning about a coupling in the logs, with the lines for the settings."""
     names = arm.chain.joint_names
     pair = [coupling.moved_by, coupling.joint]
     matrix = np.array([[1.0, coupling.ratio], [0.0, 1.0]]) * np.diag(arm.actuation.matrix())[pair]
@@ -232,7 +232,7 @@ def _physics_table(joints: Sequence[JointReport]) -> Listing:
     rows = []
     for joint in joints:
         fit = joint.gravity
-        # with a low correlation the factor means nothing
+        # for a low correlation the factor is undetermined
         is_seen = abs(fit.correlation or 0) > TUNING.seen
         velocity = number(joint.velocity_factor), number(joint.velocity_correlation)
         rows.append((joint.name, *velocity, percent(fit.explained), number(fit.factor if is_seen else None)))

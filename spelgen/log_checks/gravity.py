@@ -1,4 +1,4 @@
-"""Fit the gravity of the URDF to logged torques, each joint separately."""
+"""Fit of the URDF's gravity torque to logged torques, for each joint separately."""
 
 from __future__ import annotations
 
@@ -19,13 +19,12 @@ MOVING = SAMPLES.moving
 
 @dataclass(frozen=True)
 class GravityFit:
-    """Gravity in the torque of one joint.
+    """Gravity in the torque of one joint, after removal of friction and of the inertia torque of its own acceleration.
 
-    explained: part of the torque's variance, in addition to friction and the joint's own acceleration, that some
-    inertial values explain as gravity (0..1); None if gravity never loads the joint, if the torque never changes,
-    or with too few samples. factor: ratio to the URDF's gravity torque by least squares, correlation: with the URDF's
-    gravity torque, both after projection. relative_deviation: standard deviation of the URDF's gravity torque,
-    relative to the torque's.
+    explained: fraction (0 to 1) of the remaining variance that gravity explains, for the best inertial parameters;
+    None if gravity never loads the joint, if the torque is constant, or for too few samples. factor: least-squares
+    ratio of the torque to the URDF's gravity torque. correlation: of these two. relative_deviation: standard deviation
+    of the URDF's gravity torque, divided by the torque's.
     """
 
     explained: float | None = None
@@ -35,7 +34,7 @@ class GravityFit:
 
 
 def state_samples(trajectory: Trajectory, inputs: np.ndarray) -> np.ndarray:
-    """Return q, qd, qdd and joint torques of one trajectory, thinned evenly, (4, S, n).
+    """Return q, qd, qdd and joint torques at evenly spaced samples of one trajectory, (4, S, n).
 
     Accelerations are differences within gap-free pieces. inputs: G, (n, n).
     """
@@ -51,7 +50,7 @@ def state_samples(trajectory: Trajectory, inputs: np.ndarray) -> np.ndarray:
 
 
 def joined(samples: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the samples (4, S, n) of all trajectories together, thinned evenly."""
+    """Return evenly spaced samples (4, S, n) of all trajectories together."""
     motion = np.concatenate(samples, axis=1)
     return motion[:, :: -(-motion.shape[1] // TUNING.all_gravity_samples) or 1]
 
@@ -59,13 +58,13 @@ def joined(samples: Sequence[np.ndarray]) -> np.ndarray:
 def fit_gravity(arm: Chain, motion: np.ndarray) -> list[GravityFit]:
     """Return the fit of gravity per joint. motion: samples (4, S, n)."""
     q, qd, qdd, tau = motion
-    # with fewer, gravity and friction are confounded
+    # for fewer samples gravity and friction are confounded
     if len(q) < TUNING.gravity_samples / 4:
         return [GravityFit()] * q.shape[1]
     still = np.zeros_like(q)
     rows = regressor(arm, q, still, still)  # (S, n, 10 B)
     load = rows @ urdf_parameters(arm)
-    # with friction and the joint's own inertia, which move with gravity in a slow swing
+    # friction and the joint's own inertia are correlated with gravity in a slow swing: they are removed
     friction = np.stack([np.ones_like(q), qd, np.tanh(qd / MOVING), qdd], axis=2)
     fits = []
     for joint in range(q.shape[1]):
@@ -75,14 +74,14 @@ def fit_gravity(arm: Chain, motion: np.ndarray) -> list[GravityFit]:
 
 
 def _fit(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
-    """Fit a torque with columns of friction. signals: (S, 2 + K), it, the URDF's gravity torque, and its columns."""
+    """Return the fit of a torque. signals: (S, 2 + K), the torque, the URDF's gravity torque, and its K columns."""
     remainders = _without(friction, signals)
     lengths = np.linalg.norm(remainders, axis=0)
-    # the residual of a constant torque is rounding
+    # the residual of a constant torque consists of rounding errors
     is_rounding = lengths <= TUNING.dependent * np.linalg.norm(signals, axis=0)
     largest = max(1.0, float(np.abs(signals[:, 2:]).max(initial=0.0)))
     is_seen = lengths[2:] > TUNING.dependent * largest * np.sqrt(len(signals))
-    # a vertical axis, or a motor that was off
+    # gravity does not act about a vertical axis; a motor that is off has no torque
     if is_rounding[0] or not is_seen.any():
         return GravityFit()
     torque, load = remainders[:, 0], remainders[:, 1]

@@ -1,7 +1,7 @@
-"""Find signals that stop at a limit although the motion continues: clipped torques, positions at a mechanical stop.
+"""Detection of signals at a limit: clipped torques, and positions at a mechanical stop.
 
-A flat top of a signal is no proof: an arm that rests, or accelerates uniformly, has flat torques. It is a limit if the
-model that least squares finds on all other samples contradicts it.
+A constant extreme value (flat top) of a signal is no proof: torques are constant at rest and in uniform acceleration.
+It is a limit if the torque contradicts the least-squares model of all other samples.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ SIDES = np.array([-1.0, 1.0])
 
 
 class FlatTops(NamedTuple):
-    """Flat bottoms and tops of the positions and torques of n joints.
+    """Constant lowest and highest values (flat bottoms and tops) of the positions and torques of n joints.
 
-    q, tau: values (2, n) [rad, m; Nm, N] of the most extreme ones, NaN without one. shares: (2, n), fraction of the
-    samples that are at the one of tau.
+    q, tau: values (2, n) [rad, m; Nm, N], NaN without a flat one. shares: (2, n), fraction of the samples at the value
+    of tau.
     """
 
     q: np.ndarray
@@ -40,7 +40,7 @@ class FlatTops(NamedTuple):
 
     @classmethod
     def joined(cls, trajectories: Sequence[FlatTops]) -> FlatTops:
-        """Return the flat tops of several trajectories together."""
+        """Return the most extreme flat tops of several trajectories."""
         q, tau, shares = map(np.stack, zip(*trajectories, strict=True))
         sides = SIDES[:, None]
         return cls(
@@ -51,8 +51,8 @@ class FlatTops(NamedTuple):
 def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the values (2, n) of the flat bottoms and tops of signals (T, n), NaN without one, and their shares.
 
-    Many more samples are next to the extreme value than in three times as wide a band below it; the peaks of a
-    sinusoid have equal numbers in both.
+    At a flat top a narrow band at the extreme value has many more samples than a band of three times the width below
+    it; at the peak of a sinusoid both have equal numbers.
     """
     upright = SIDES[:, None, None] * values
     tops = upright.max(axis=1)
@@ -64,18 +64,18 @@ def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
-    """Return an error for each joint with clipped torques, or else a warning for each one that rests at a stop."""
+    """Return an error per joint with clipped torques; without any, a warning per joint at a mechanical stop."""
     problem, findings = problem.thinned(GEOMETRY.confirming_samples), Findings()
     samples = problem.unchanged.signals(problem.samples)
     at_torque, at_position = (_at_levels(*x) for x in ((flat.tau, samples.tau), (flat.q, samples.q)))
     free = ~(at_torque | at_position).any(axis=0)
     if free.all():
         return findings
-    # the torques at a limit do not count
+    # the model is fitted to the torques that are not at a limit
     fit = problem.on_torques(free).fit(problem.unchanged)
     residual = problem.torque(problem.unchanged, fit.parameters) - samples.tau
     deviation, friction = problem.prediction_deviation(fit), problem.coulomb_friction(fit)
-    # of few torques the residual is no noise
+    # the residual of few samples underestimates the noise: degrees of freedom are subtracted
     noise = np.sqrt(
         np.square(residual * free).sum(axis=0) / np.maximum(free.sum(axis=0) - TUNING.free_samples, 1e-9)
     )
@@ -84,7 +84,7 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
         sides = zip(SIDES, at_torque[..., k], strict=True)
         doubt = TUNING.certain * deviation[:, k]
         excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
-        # wrong friction of few free samples must not be confused with it
+        # an error of friction, estimated from few free samples, is not evidence of a limit
         sure = max(TUNING.certain * noise[k], TUNING.excess * samples.tau[:, k].std(), abs(friction[k]))
         is_clipped = excess > sure
         if is_clipped.any():
@@ -112,11 +112,11 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
 
 
 def _at_levels(levels: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the samples of filtered signals (S, n) that are at a level (2, n), (2, S, n); False without a level."""
+    """Return a mask (2, S, n) of the samples of filtered signals (S, n) at a level (2, n); False without a level."""
     distance = SIDES[:, None, None] * (levels[:, None] - values)
     return np.asarray(distance < TUNING.near_limit * np.ptp(values, axis=0))
 
 
 def _median(values: Sequence[float] | np.ndarray) -> float:
-    """Return the median; minus infinity without values."""
+    """Return the median; minus infinity for no values."""
     return float(np.median(values)) if len(values) else -np.inf

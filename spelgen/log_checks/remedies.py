@@ -1,4 +1,4 @@
-"""Lines of the settings for a better reading of a log, and the finding in words."""
+"""Lines of the settings for a better hypothesis about a log, and the finding as a message."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RIGHT = "joints, zeros, units and gravity as the URDF and the settings state the
 
 
 def mapped_reading(arm: Chain, mapping: LogMapping, drives: Drives) -> Hypothesis:
-    """Return the unchanged reading of a log: scales and offsets of its mapping, and gears of single joints."""
+    """Return the hypothesis of the unchanged log: scales and offsets of its mapping, and gears of single joints."""
     joints = arm.joint_names
     gears = np.diag(drives.inputs) if np.count_nonzero(drives.inputs) == len(joints) else np.ones(len(joints))
     return replace(
@@ -38,9 +38,9 @@ def mapped_reading(arm: Chain, mapping: LogMapping, drives: Drives) -> Hypothesi
 
 @dataclass(frozen=True, eq=False)
 class Remedies:
-    """Lines of the settings, and findings, for better readings of a log.
+    """Findings about a log, and the lines of the settings that correct them.
 
-    by_name: the log consists of messages of joints by their names, as bags do, and has no columns.
+    by_name: whether the log consists of messages with names of joints, as in bags, instead of columns.
     """
 
     unchanged: Hypothesis
@@ -49,7 +49,7 @@ class Remedies:
     by_name: bool
 
     def finding(self, comparison: HypothesisComparison) -> LogError | Diagnostic:
-        """Return the finding of a better reading: an error, or a warning about small angles and moderate factors."""
+        """Return the finding of a better hypothesis: an error, or a warning for small angles and moderate factors."""
         best, codes = comparison.better[0], comparison.codes
         changes = [self._change(code, best.hypothesis) for code in codes]
         where = " and ".join(dict.fromkeys(self._place(joints) for joints, _ in changes))
@@ -63,7 +63,7 @@ class Remedies:
         return LogError(got, element=where, expected=RIGHT, do=do)
 
     def lines(self, reading: Hypothesis) -> str:
-        """Return the lines to write for a reading, and their places."""
+        """Return the lines of the settings for a hypothesis, and the files or keys in which to write them."""
         texts = []
         keys = {name: self._joint_keys(k, reading) for k, name in enumerate(self.arm.joint_names)}
         changed = {name: changes for name, changes in keys.items() if changes}
@@ -75,7 +75,7 @@ class Remedies:
         return " and ".join(texts)
 
     def _joint_keys(self, k: int, reading: Hypothesis) -> dict[str, object]:
-        """Return the keys of joint k in a mapping that differ from its present ones."""
+        """Return the keys of joint k in a mapping whose values change."""
         joints, mapping, unchanged = self.arm.joint_names, self.mapping, self.unchanged
         present = mapping.joint(joints[k])
         keys: dict[str, object] = {}
@@ -102,7 +102,7 @@ class Remedies:
         return keys
 
     def _change(self, code: str, reading: Hypothesis) -> tuple[np.ndarray, str]:
-        """Return the joints (n,) that a change of a reading affects, and the content of the log instead."""
+        """Return a mask (n,) of the joints that a change affects, and a text about the content of the log."""
         unchanged, order = self.unchanged, np.arange(len(reading.offset))
         reversed_motion = reading.motion_scale * unchanged.motion_scale < 0
         factors = reading.torque_scale / unchanged.torque_scale
@@ -130,7 +130,7 @@ class Remedies:
         return order >= 0, self._gravity_text(code, reading)
 
     def _place(self, joints: np.ndarray) -> str:
-        """Return the place of joints (n,) in a finding."""
+        """Return the text that names the joints of a mask (n,) in a finding."""
         if joints.all() and len(joints) > 1:
             return "all joints"
         return f"joint {', '.join(map(repr, np.array(self.arm.joint_names)[joints].tolist()))}"
@@ -145,7 +145,7 @@ class Remedies:
         return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
     def _is_minor(self, best: Hypothesis) -> bool:
-        """Whether errors of a URDF or a mounting, and no error of a log, may be the reason."""
+        """Return True if the difference may be an error of the URDF or of the mounting, not of the log."""
         if best.codes == ("torque-unit",):
             factor = np.abs(np.log(best.torque_scale / self.unchanged.torque_scale)).max()
             return bool(factor < np.log(TUNING.impossible_factor))
@@ -169,7 +169,7 @@ def _number(value: float) -> float:
 
 
 def _evidence(best: HypothesisFit, unchanged: HypothesisFit) -> str:
-    """Return the error reduction of a reading: mean over joints of the squared error."""
+    """Return a sentence with the squared torque residual, mean over joints, before and after."""
     if best.hypothesis.codes == ("torque-unit",):
         return "by the URDF's gravity"
     before, after = unchanged.errors.mean(), best.errors.mean()

@@ -27,9 +27,9 @@ MEASURES = {"q": "position", "qd": "velocity", "tau": "torque", "u": "position"}
 class JointFollowing:
     """Tracking of a joint's command; None if it is unknown.
 
-    lag: by which positions come after commands [s]. tracking_rms: root mean square of u, delayed by the lag, less q
-    [rad, m]. steady_state_error: nine tenths of the distances u - q are smaller while both rest. saturated: fraction of
-    the time that kp (u - q) is beyond the effort limit.
+    lag: delay of positions after commands [s]. tracking_rms: root mean square of u, delayed by the lag, minus q [rad,
+    m]. steady_state_error: 90th percentile of |u - q| at rest [rad, m]. saturated: fraction of the time in which kp (u
+    - q) exceeds the effort limit.
     """
 
     lag: float | None
@@ -40,11 +40,12 @@ class JointFollowing:
 
 @dataclass(frozen=True)
 class JointReport:
-    """One joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None if it is unknown.
+    """Measurements of one joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None if unknown.
 
     low, high, noise, steps: of q, qd and tau, or of q, qd and commands u. range_fraction: of the joint's range that was
     visited. noise: standard deviation of white noise; None for sparse logs. steps: of signals
-    that are quantised in most trajectories. velocity_factor, velocity_correlation: both 1 where qd is dq/dt.
+    that are quantised in most trajectories. velocity_factor, velocity_correlation: of qd and dq/dt, both 1 if these
+    are equal.
     following: of a joint under a position servo.
     """
 
@@ -82,22 +83,22 @@ class LogReport:
 
     @property
     def files(self) -> int:
-        """How many files the trajectories were read from."""
+        """Number of files that the trajectories were read from."""
         return len({clock.file for clock in self.trajectories} - {None})
 
     @property
     def samples(self) -> int:
-        """Of all trajectories."""
+        """Number of samples of all trajectories."""
         return sum(clock.samples for clock in self.trajectories)
 
     @property
     def duration(self) -> float:
-        """Of all trajectories [s]."""
+        """Duration of all trajectories [s]."""
         return sum(clock.duration for clock in self.trajectories)
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """The findings that are more than remarks."""
+        """The warnings among the findings."""
         return tuple(x for x in self.findings if x.severity == "warning")
 
     def to_dict(self) -> dict[str, object]:
@@ -115,7 +116,7 @@ class LogReport:
         }
 
     def heading(self) -> str:
-        """Return one line: how much there is."""
+        """Return one line with the numbers of files, trajectories and samples, and the duration."""
         files = ""
         if self.files:
             files = f" in {counted(self.files, 'file')}"
@@ -125,11 +126,11 @@ class LogReport:
         )
 
     def listings(self, limit: int | None = None) -> list[Listing]:
-        """Return all tables; of trajectories at most `limit`."""
+        """Return all tables, with at most `limit` trajectories."""
         return [_clock_table(self.trajectories, limit), *self.tables]
 
     def text(self) -> str:
-        """Return the report for a terminal, in 80 columns; the errors are not in it."""
+        """Return the report for a terminal, in 80 columns, without the errors."""
         paragraphs = [self.heading(), *map(Listing.text, self.listings(TUNING.shown))]
         wrapped = partial(textwrap.fill, width=WIDTH, initial_indent="  ", subsequent_indent="    ")
         findings = list(map(wrapped, map(str, self.findings)))
@@ -161,7 +162,7 @@ def joint_report(
     for name in measured[0].signals:
         lows, highs, noises, quanta = np.array([x.signals[name][:, index] for x in measured]).T
         low[name], high[name] = float(lows.min()), float(highs.max())
-        # medians, since one trajectory with contacts would set the noise of all
+        # medians, so that one trajectory with contacts does not determine the noise
         noise[name], steps[name] = _median(noises, 0.0), _median(quanta, 0.5)
     factors, correlations = velocity_agreement(products)
     factor, correlation = factors[index], correlations[index, index]
@@ -183,13 +184,13 @@ def joint_report(
 
 
 def _median(values: np.ndarray, share: float) -> float | None:
-    """Return the median of the finite values; None if their fraction is at most `share`."""
+    """Return the median of the finite values; None if the fraction of finite values is at most `share`."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) > share * len(values) else None
 
 
 def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
-    """Return when samples were taken; of trajectories at most `limit`."""
+    """Return the table of durations, sample rates and gaps, with at most `limit` trajectories."""
     head = ("trajectory", "samples", "duration", "sample rate", "jitter", "gaps", "longest")
     rows = []
     # a data set of a thousand episodes would fill the terminal

@@ -1,4 +1,4 @@
-"""Check logs against the robot: limits of its joints, and the size of torques relative to the URDF's gravity."""
+"""Checks of logs against the robot: limits of its joints, and the size of torques relative to gravity."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ class JointEvidence(NamedTuple):
     report: JointReport
 
     def limits(self) -> tuple[float, float]:
-        """Return the lowest and the highest position, infinite where there is no limit."""
+        """Return the lower and the upper position limit, infinite without a limit."""
         lower, upper = self.coordinate.lower, self.coordinate.upper
         if self.coordinate.continuous:
             lower = upper = None
         return -inf if lower is None else lower, inf if upper is None else upper
 
     def gravity_in_torque(self) -> tuple[float, float]:
-        """Return factor and correlation of the URDF's gravity in the torque; NaN where it is too small to be seen."""
+        """Return factor and correlation of the URDF's gravity in the torque; NaN if gravity is too small."""
         fit = self.report.gravity
-        # of a joint that gravity hardly loads the factor is chance
+        # the factor of a joint that gravity hardly loads is undetermined
         if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < TUNING.loaded:
             return nan, nan  # every comparison with NaN is false
         return fit.factor, fit.correlation
@@ -50,7 +50,7 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
     (lower, upper), unit = joint.limits(), UNITS[joint.coordinate.joint_type].position
     for name in ("q", "u"):
         low, high = joint.report.low.get(name, inf), joint.report.high.get(name, -inf)
-        # a limit overrun by less is the rounding of a logger
+        # a smaller excess is a rounding error of the logger
         if low < lower - TUNING.limit_rounding:
             findings.append(f"{name} down to {low:.4g} {unit}, the limit is {lower:.4g}")
         if high > upper + TUNING.limit_rounding:
@@ -69,7 +69,8 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
 
 
 def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) -> list[np.ndarray]:
-    """Return factors (n,) that give the torques the size of the URDF's gravity: candidates for another unit.
+    """Return candidates of factors (n,) on the torques, for another unit: they match the magnitude of the URDF's
+    gravity.
 
     One for each joint with torques at least `TUNING.unusual_factor` times too large or too small, and one for all
     joints together. undeclared: joints whose unit no mapping states.
@@ -78,7 +79,7 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
     factors = []
     for k, joint in enumerate(joints):
         factor, correlation = joint.report.gravity.factor, joint.report.gravity.correlation or 0.0
-        # the factor of a joint that gravity hardly loads is chance, unless its torque is only gravity
+        # the factor of a joint that gravity hardly loads is undetermined, unless its torque consists of gravity only
         is_known = joint.gravity_in_torque()[1] > TUNING.seen or correlation > SIGNALS.agreement
         if factor is None or not (is_known and undeclared[k]):
             continue
@@ -93,14 +94,14 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
 
 
 def _rounded(factor: float) -> float:
-    """Return one significant digit if this changes the factor by less than a tenth, else two digits."""
+    """Return the factor with one significant digit if this changes it by less than a tenth, else with two."""
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * factor else float(f"{factor:.2g}")
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
-    """Find torques that no drive of the joint's effort limit gives."""
-    # URDFs without knowledge of the drive write an effort of 0
+    """Find torques that exceed the joint's effort limit by a factor that no drive and no unit explains."""
+    # in URDFs of unknown drives the effort is 0
     limit, largest = joint.coordinate.effort or 0.0, joint.report.largest("tau")
     if not 0 < TUNING.beyond_drives * limit < largest:
         return None
@@ -108,9 +109,9 @@ def find_beyond_drive(joint: JointEvidence) -> str | None:
 
 
 def find_coarse(joint: JointEvidence) -> str | None:
-    """Find signals that are quantised to steps of their own size."""
+    """Find signals whose quantisation step is a large fraction of their range."""
     for name in QUANTITIES:
-        # a step has to be compared with the range: 0.01 Nm is fine for a shoulder and all there is for a wrist
+        # relative to the range: a step of 0.01 Nm is negligible at a shoulder, and may be the whole torque of a wrist
         step, width = joint.report.steps[name], joint.report.high[name] - joint.report.low[name]
         if step is not None and width < TUNING.levels * step:
             return (
@@ -121,7 +122,7 @@ def find_coarse(joint: JointEvidence) -> str | None:
 
 
 def find_stop(joint: JointEvidence) -> str | None:
-    """Find joints that reach a limit: the torque of a stop is none of the drive's."""
+    """Find joints that reach a position limit, at which a stop adds torques to the drive's."""
     for limit, extreme in zip(joint.limits(), (joint.report.low["q"], joint.report.high["q"]), strict=True):
         if abs(extreme - limit) <= TUNING.limit_rounding:
             return f"q reaches its limit {limit:.4g}: contact with the stop changes the torque; remove such motion"
@@ -129,9 +130,9 @@ def find_stop(joint: JointEvidence) -> str | None:
 
 
 def find_one_way(joint: JointEvidence) -> str | None:
-    """Find joints that move one way only: dry friction is then one number with the load of the joint."""
+    """Find joints that move in one direction only: dry friction is then confounded with the load of the joint."""
     slower, faster = sorted((-joint.report.low["qd"], joint.report.high["qd"]))
-    # of a velocity that is not dq/dt nothing follows for the motion
+    # a velocity that is not dq/dt does not determine the direction of motion
     if slower >= TUNING.one_way * faster or not (joint.report.velocity_correlation or 0.0) > TUNING.seen:
         return None
     unit = UNITS[joint.coordinate.joint_type].velocity
@@ -142,7 +143,7 @@ def find_one_way(joint: JointEvidence) -> str | None:
 
 
 def find_no_gravity(joint: JointEvidence) -> str | None:
-    """Find torques without gravity in them."""
+    """Find torques that do not contain gravity."""
     correlation = joint.gravity_in_torque()[1]
     if not abs(correlation) < 1 - TUNING.seen:  # NaN included
         return None
@@ -152,7 +153,7 @@ def find_no_gravity(joint: JointEvidence) -> str | None:
     )
 
 
-# these need no torques: of arms under position servos, too
+# checks that need no torques, also for arms under position servos
 POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
 CHECKS: list[Check[JointEvidence]] = [
     Check(

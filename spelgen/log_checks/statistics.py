@@ -1,4 +1,4 @@
-"""Measure one trajectory: its clock, its ranges and its noise."""
+"""Statistics of one trajectory: its clock, the ranges and the noise of its signals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spelgen.logs.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Clock:
-    """When the samples of one trajectory were taken.
+    """Sample times of one trajectory.
 
     duration, longest_gap: [s], the latter 0 without gaps. sample_rate: [Hz], outside gaps. jitter: standard
     deviation of the steps outside gaps, relative to their mean.
@@ -34,8 +34,8 @@ class Clock:
 class Statistics(NamedTuple):
     """One trajectory of n joints.
 
-    signals: of its quantities (see `Trajectory`), (4, n): the lowest and the highest value; the standard deviation of
-    white noise, NaN for sparse logs; the step of a quantised signal, NaN for others.
+    signals: per quantity (see `Trajectory`) an array (4, n): lowest value, highest value, standard deviation of white
+    noise (NaN for sparse logs), and quantisation step (NaN for signals that are not quantised).
     """
 
     clock: Clock
@@ -43,8 +43,8 @@ class Statistics(NamedTuple):
 
 
 def statistics(trajectory: Trajectory) -> Statistics:
-    """Return the numbers of one trajectory."""
-    # third differences of sparse motion are motion
+    """Return the statistics of one trajectory."""
+    # third differences of sparse samples contain the motion
     dense = is_dense(trajectory.sample_rate) and len(trajectory) > 8
     signals = {}
     for name in trajectory.quantities:
@@ -70,8 +70,8 @@ def statistics(trajectory: Trajectory) -> Statistics:
 def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the standard deviation (n,) of white noise on smooth signals (T, n) at jittered times (T,).
 
-    From third divided differences, scaled so that white noise keeps its standard deviation: they are small for smooth
-    motion, and the median ignores short exceptions.
+    It is computed from third divided differences, which are small for smooth motion, scaled to the standard deviation
+    of white noise. The median of their magnitudes is robust against outliers.
     """
     times = sliding_window_view(t, 4)  # (T - 3, 4)
     distances = times[:, :, None] - times[:, None, :] + np.eye(4)
@@ -83,18 +83,18 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def quantisation_step(values: np.ndarray) -> float:
-    """Return the step of a quantised signal (T,); NaN where it is not quantised, or never changes."""
+    """Return the step of a quantised signal (T,); NaN if the signal is not quantised, or constant."""
     differences = np.diff(np.unique(values))
-    # two or three levels are no grid
+    # two or three levels do not determine a grid
     if len(differences) < 3:
         return float("nan")
     smallest = np.quantile(differences, TUNING.step_tolerance)
     step = float(np.median(differences[differences <= 1.5 * smallest]))
-    # over a hundred steps the error of the step adds up to a fraction of a step
+    # over a hundred levels the error of the step accumulates to a fraction of a step
     near = differences[differences < 100 * step] / step
     is_whole = np.abs(near - np.round(near)) < TUNING.step_tolerance
     is_grid = len(near) > 2 and is_whole.mean() > 1 - TUNING.step_tolerance
-    # a smooth signal passes wide levels one after the other, commands on round numbers jump between them
+    # a smooth quantised signal passes neighbouring levels one after the other; commands with round values jump
     changes = np.abs(np.diff(values))
     is_command = np.ptp(values) < TUNING.levels * step and changes[changes > 0].mean() > 1.5 * step
     return step if is_grid and not is_command else float("nan")

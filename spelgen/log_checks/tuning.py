@@ -26,33 +26,37 @@ class LogCheckTuning:
     impossible_factor: float = 10.0
     # [1] Multiple of a drive's effort limit that no drive produces in any unit.
     beyond_drives: float = 20.0
-    # [1] Samples per trajectory for gravity; gravity and friction change slowly.
+    # [1] Largest number of samples per trajectory for the fit of gravity; gravity and friction change slowly.
     gravity_samples: int = 400
     # [1] A quantised signal with fewer levels gives no reliable magnitude.
     levels: float = 10.0
-    # [1] Fraction of a step, and of the levels of a signal, that may be off a quantisation grid.
+    # [1] Largest distance of a level from a quantisation grid, as a fraction of its step, and largest fraction of
+    # levels beyond it.
     step_tolerance: float = 0.05
-    # [1] Samples of all trajectories together for gravity.
+    # [1] Largest number of samples of all trajectories for the fit of gravity.
     all_gravity_samples: int = 6000
     # [1] A column is dependent if the part that other columns do not span is below this fraction of its length.
     dependent: float = 1e-8
     # [1] Squared torque error of a joint, relative to the variance, from which on least squares does not explain it.
     unexplained: float = 0.1
-    # [1] Width of a flat top, of the signal's range; its smallest fraction of the samples, and ratio to the samples in
-    # three times that width below it: at most 1 for the peaks of a sinusoid.
+    # [1] Flat top: its width as a fraction of the signal's range; its smallest fraction of the samples; its smallest
+    # ratio to the number of samples in three times this width below it, which is at most 1 for the peaks of a
+    # sinusoid.
     flat_top: float = 0.005
     flat_share: float = 0.01
     flat_ratio: float = 2.0
-    # [1] Distance of a filtered signal from its limit, of its range, up to which it is at the limit.
+    # [1] Distance of a filtered signal from its limit, as a fraction of its range, up to which it counts as at the
+    # limit.
     near_limit: float = 0.02
-    # [1] Samples that determine the parameters of a joint in the model that contradicts a limit.
+    # [1] Degrees of freedom of a joint's parameters, subtracted from the number of samples for the noise.
     free_samples: int = 30
-    # [1] Contradiction: median difference at the limit in standard deviations of the residual, and of the torque.
+    # [1] Smallest median difference from the model at a limit, in standard deviations of the residual and of the
+    # torque.
     certain: float = 3.0
     excess: float = 0.08
-    # [1] Trajectories that a page draws.
+    # [1] Largest number of trajectories in the charts of a page.
     examples: int = 2
-    # [1] Trajectories that a terminal and a notebook list.
+    # [1] Largest number of trajectories in a list.
     shown: int = 20
 
 

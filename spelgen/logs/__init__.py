@@ -1,1 +1,1 @@
-"""Measured or simulated motions: read, mapped, checked, filtered, cut into windows, and reported on."""
+"""Logs of measured or simulated motion: reading, mapping, checks, filters and windows."""

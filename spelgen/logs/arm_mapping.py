@@ -1,4 +1,4 @@
-"""Find out whose logs are read, and how they are named: from an arm, a model or names of joints."""
+"""The joints of logs and the mapping of their columns, from an arm, a model, or names of joints."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
 
 @runtime_checkable
 class JointNames(Protocol):
-    """Joints whose logs are read: an arm or a module. joint_types: "revolute" or "prismatic"."""
+    """Object with the joints of logs: an arm or a module. joint_types: "revolute" or "prismatic"."""
 
     @property
     def joint_names(self) -> Sequence[str]: ...
@@ -28,7 +28,7 @@ class JointNames(Protocol):
 
 @runtime_checkable
 class DescribedArm(Protocol):
-    """Loaded arm with the settings that describe its logs. turning_joints: revolute, without position limits."""
+    """Loaded arm with the settings of its logs. turning_joints: names of revolute joints without position limits."""
 
     @property
     def chain(self) -> JointNames: ...
@@ -42,7 +42,7 @@ class DescribedArm(Protocol):
 
 @runtime_checkable
 class DrivenModel(Protocol):
-    """A model, which states the quantity of its inputs: "torque" or "position"."""
+    """Model with the quantity of its inputs: "torque" or "position"."""
 
     @property
     def input_quantity(self) -> str: ...
@@ -85,7 +85,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
 
 
 def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
-    """Return a mapping as an object; keys that a file or a dict lacks come from the settings, `stated`."""
+    """Return a mapping as an object; keys that a file or a dict does not have are from the settings, `stated`."""
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):
@@ -100,7 +100,7 @@ def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | 
 
 
 def _merged(stated: object, given: object) -> object:
-    """Return the keys of two groups, and of the groups in them; a key of both has the value of the second."""
+    """Return the union of two groups of keys, recursively; a key of both has the value of the second."""
     if isinstance(stated, Mapping) and isinstance(given, Mapping):
         return {**stated, **{key: _merged(stated.get(key), value) for key, value in given.items()}}
     return given

@@ -36,13 +36,13 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     """Return the joint states of a bag, or of a file of its storage, as one table.
 
     t [s] counts from the first message: by the header's stamps, or by the recorder's clock if no message has a stamp.
-    A message without any of the joints is another device's and left out. Raises LogError, also if
-    `rosbags` is not installed.
+    Messages without any of the joints belong to another device and are omitted. Raises LogError, also if `rosbags` is
+    not installed.
     """
     remarks: list[str] = []
     messages = _stamped(list(_messages(path, mapping.topic, remarks)), remarks)
     table = _joint_states(path, messages, list(map(mapping.log_name, joints)))
-    # the messages' own fields, in SI units by definition: columns and units of the mapping do not apply
+    # fields of messages are in SI units by definition: columns and units of the mapping do not apply
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
     layout = table_layout(table.schema, joints, mapping, path)
@@ -50,7 +50,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[tuple[int, Any]]:
-    """Return times [ns] and states by one clock for all: headers and recorder may be hours apart."""
+    """Return times [ns] of one clock, and the states; the clocks of header and recorder may differ by hours."""
     without = sum(not message.stamp for message in messages)
     if messages and without == len(messages):
         remarks.append("no message has a stamp: times are those at which the recorder received them")
@@ -61,7 +61,7 @@ def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[tuple
 
 
 def _joint_states(path: Path, messages: Sequence[tuple[int, Any]], names: Sequence[str]) -> pa.Table:
-    """Return the columns `t`, `q_<name>`, `qd_<name>`, `tau_<name>`; none of a field that no message fills."""
+    """Return the columns `t`, `q_<name>`, `qd_<name>`, `tau_<name>`; fields that are always empty are omitted."""
     times: list[int] = []
     rows: list[np.ndarray] = []
     other_names: dict[str, None] = {}
@@ -104,8 +104,7 @@ def _joint_states(path: Path, messages: Sequence[tuple[int, Any]], names: Sequen
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:
     """Yield the joint states of one topic.
 
-    Messages are decoded by the published definition of the standard type only: definitions that come with a
-    bag are not looked at.
+    Messages are decoded only by the published definition of the standard type; definitions in the bag are ignored.
     """
     try:
         from rosbags.rosbag1 import Reader as Ros1Reader
@@ -124,7 +123,7 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     try:
-        # rosbags unpacks a chunk whole, however large it gets; messages as arrays take ten times their bytes
+        # rosbags unpacks a whole chunk of any size; messages as arrays take ten times their bytes
         with limited_memory(MEMORY + 20 * size):
             unfinished = [] if is_ros1 else _unfinished(path)
             if unfinished:
@@ -137,7 +136,7 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
                 yield StampedState(clock.sec * 1_000_000_000 + clock.nanosec, recorded, state)
     except (LogError, GeneratorExit):
         raise
-    except Exception as error:  # rosbags, its storages and their decompressors raise many kinds
+    except Exception as error:  # rosbags, its storages and their decompressors raise many types
         reason = in_one_line(error).rstrip(".")
         do = "a recording that was not closed may be repaired by `ros2 bag reindex` or `rosbag reindex`"
         raise LogError(
@@ -157,7 +156,7 @@ def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> 
 
 
 def _unfinished(path: Path) -> list[Path]:
-    """Return the MCAP files of a bag if one of them has no end, else none."""
+    """Return the MCAP files of a bag if one of them is incomplete, else none."""
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     for file in files:
         with file.open("rb") as source:
@@ -171,7 +170,7 @@ def _unfinished(path: Path) -> list[Path]:
 def _without_end(
     files: Sequence[Path], topic: str | None, path: Path, remarks: list[str]
 ) -> Iterator[tuple[int, bytes]]:
-    """Yield times [ns] and contents of the joint states of one topic, in files of which one has no end."""
+    """Yield times [ns] and contents of the joint states of one topic, in files of which one is incomplete."""
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
         raise LogError(
@@ -186,7 +185,7 @@ def _without_end(
 
 
 def _chosen_topic(topics: set[str], present: set[str], topic: str | None, path: Path) -> str:
-    """Return the topic of joint states that was asked for, or the only one."""
+    """Return the requested topic of joint states, or the only one."""
     if topic in topics:
         return topic
     if topic is None and len(topics) == 1:

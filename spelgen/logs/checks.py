@@ -1,7 +1,7 @@
-"""Check logs without the robot: frozen columns, velocities that are no derivative, degrees, gaps. Nothing is repaired.
+"""Checks of logs that need no robot: frozen columns, inconsistent velocities, degrees, gaps. Nothing is repaired.
 
-A check is a code, a severity and a function of a subject, registered in CHECKS. Each trajectory is checked by itself,
-so that logs need not lie in memory together. `log_checks` has the checks that take the robot.
+A check is a code, a severity and a function of a subject, registered in CHECKS. Each trajectory is checked
+individually, so that only one need be in memory. Package `log_checks` has the checks that need the robot.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from spelgen.settings.log_mapping import TIMES
 
 DEGREES = 180.0 / np.pi
 ELASTIC = "elastic-joint"
-TURNS = 4 * np.pi  # [rad] A joint with limits turns less: larger positions are in degrees.
+TURNS = 4 * np.pi  # [rad] Joints with limits have smaller positions: larger ones are in degrees.
 
 Subject = TypeVar("Subject")
 
 
 @dataclass(frozen=True)
 class Check(Generic[Subject]):
-    """Search for one fault of logs.
+    """Check for one fault of logs.
 
-    find: from the subject to the message; None without a finding. severity: logs with an error cannot be trained on.
-    unless: codes of checks, earlier in the list, whose findings explain this one. everywhere: it is a fault only if
-    all trajectories show it. expected, do: of an error.
+    find: function that returns the message for a subject; None without a finding. severity: logs with an error cannot
+    be trained on. unless: codes of earlier checks whose findings explain this one. everywhere: whether a finding must
+    occur in all trajectories. expected, do: of an error.
     """
 
     code: str
@@ -62,7 +62,7 @@ class Findings:
     errors: list[SpelgenError] = field(default_factory=list)
 
     def add(self, check: Check[Any], message: str, where: str, file: Path | None = None) -> None:
-        """Add the message of a check; to an error, how to accept it."""
+        """Add the message of a check; the message of an error is extended by the option that accepts it."""
         if check.severity == "error":
             do = f"{check.do}; --accept {check.code} if it is right"
             error = LogError(message, file=file, element=where, expected=check.expected, do=do)
@@ -74,10 +74,10 @@ class Findings:
 def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
 ) -> list[tuple[Check[Subject], str]]:
-    """Return the checks with a finding, and their messages; accepted: codes that are not checked."""
+    """Return the checks with a finding, and their messages. accepted: codes of checks that are omitted."""
     results: dict[str, tuple[Check[Subject], str]] = {}
     for check in checks:
-        # one cause, one message: degrees are no derivatives either
+        # one message per cause: velocities in degrees would also fail the check of derivatives
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         found = check.find(subject)
@@ -89,13 +89,13 @@ def run_checks(
 
 
 def velocity_products(trajectory: Trajectory) -> np.ndarray:
-    """Return sums of products (2n, 2n) of increments over some steps: of the integrals of qd, then of q."""
-    # loaded where it is called: half a second
+    """Return sums of products (2n, 2n) of increments over several samples: of the integrals of qd, then of q."""
+    # imported here, since it takes half a second
     from scipy.integrate import cumulative_trapezoid
 
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
     for piece in split_at_gaps(trajectory, shortest=2):
-        # over several steps: from one sample to the next quantisation of q is larger than its change
+        # over several samples: between neighbouring samples the quantisation of q may be larger than its change
         span = min(SIGNALS.increments, len(piece) - 1)
         integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
         positions = np.concatenate([integral, piece.q], axis=1)
@@ -107,7 +107,7 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
 def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return factors (n,) by which qd must be multiplied to be dq/dt, and correlations (n, n).
 
-    Correlations are 1 if qd of the row's joint is proportional to dq/dt of the column's; NaN if a joint is at rest.
+    Correlation (i, j) is 1 if qd of joint i is proportional to dq/dt of joint j, and NaN if one of them is at rest.
     products: see `velocity_products`.
     """
     n = len(products) // 2
@@ -118,7 +118,7 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_degrees(signals: JointSignals) -> str | None:
-    """Find revolute joints that look recorded in degrees."""
+    """Find revolute joints that were probably recorded in degrees."""
     if signals.kind == "prismatic":
         return None
     if signals.changes_by(DEGREES):
@@ -137,7 +137,7 @@ def find_frozen(signals: JointSignals) -> str | None:
     q, qd = signals.q, signals.qd
     if np.ptp(qd) == 0 and np.ptp(q) > SIGNALS.drift:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
-    # the trapezoidal rule: a constant q with a noisy qd around zero stays where it is
+    # by the trapezoidal rule, so that noise of qd about zero has a small integral
     drift = np.abs(cumulative_trapezoid(qd, signals.trajectory.t)).max(initial=0.0)
     if np.ptp(q) == 0 and drift > SIGNALS.drift:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
@@ -145,7 +145,7 @@ def find_frozen(signals: JointSignals) -> str | None:
 
 
 def find_time_unit(signals: JointSignals) -> str | Advice | None:
-    """Find times that are not in seconds: no arm is sampled more slowly than at 2 Hz, and q changes as fast as qd."""
+    """Find times that are not in seconds: from a sample rate below 2 Hz, or from the ratio of dq/dt to qd."""
     step = signals.step
     if step > SIGNALS.slowest_step:
         # reported once, and not for each joint
@@ -165,7 +165,7 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 
 
 def time_unit(step: float) -> str | None:
-    """Return the unit in which the step between two samples is one of a robot's log; None if it is none."""
+    """Return the unit of time in which a step between samples is plausible for a robot's log; None if there is none."""
     for unit, size in TIMES.items():
         if SIGNALS.fastest_step <= step * size <= SIGNALS.slowest_step:
             return unit
@@ -173,7 +173,7 @@ def time_unit(step: float) -> str | None:
 
 
 def find_no_torques(signals: JointSignals) -> str | None:
-    """Find recordings in which every joint's torque is 0 all the time."""
+    """Find recordings in which the torques of all joints are always 0."""
     trajectory = signals.trajectory
     # reported once, and not for each joint
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
@@ -184,14 +184,14 @@ def find_no_torques(signals: JointSignals) -> str | None:
 def find_wrong_velocity(signals: JointSignals) -> str | None:
     """Find velocities that are not the derivative of the positions, and a joint or a sign that fits better."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
-    # times in another unit have been found at the first joint
+    # times in another unit are a finding of the first joint already
     if signals.step > SIGNALS.slowest_step:
         return None
     if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
         return None
     advice = ""
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
-        # the velocity is right up to its sense, so that q differentiated has no more errors than q
+        # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
         advice = "; its sense is opposite: write 'velocity: differentiated' under 'logs' in the robot's YAML"
     for joint, fit in zip(signals.joints, signals.correlations, strict=True):
         if fit > max(SIGNALS.agreement, correlation):
@@ -216,7 +216,7 @@ def find_rest(signals: JointSignals) -> str | None:
 
 
 def find_gaps(trajectory: Trajectory) -> str | None:
-    """Find holes in time."""
+    """Find gaps in the sample times."""
     gaps = len(gap_ends(trajectory.t)) - 2
     if not gaps:
         return None
@@ -224,7 +224,7 @@ def find_gaps(trajectory: Trajectory) -> str | None:
 
 
 def find_low_rate(trajectory: Trajectory) -> str | None:
-    """Find a sample rate at which accelerations are hardly seen; arms under servos do without."""
+    """Find a sample rate that is too low for accelerations, which arms under position servos do not need."""
     rate = trajectory.sample_rate
     if trajectory.u is not None or rate == 0 or is_dense(rate):
         return None
@@ -241,7 +241,7 @@ CLOCK_CHECKS = [
     Check("gap", "info", find_gaps),
     Check("low-rate", "warning", find_low_rate),
 ]
-# reported when a log is read: each repair is a message of its own
+# reported when a log is read, one message per repair
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
@@ -293,7 +293,7 @@ CHECKS: list[Check[JointSignals]] = [
 
 
 class LogChecks:
-    """Check logs by themselves, one trajectory after another: they need not lie in memory together.
+    """Checks of logs without their robot, one trajectory at a time, so that only one need be in memory.
 
     products: of all velocities and positions, see `velocity_products`.
     """
@@ -305,7 +305,7 @@ class LogChecks:
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
-        """Take in a trajectory."""
+        """Add a trajectory."""
         self._count += 1
         where = f"trajectory {trajectory.name}"
         for clock_check, message in run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted):
@@ -326,10 +326,10 @@ class LogChecks:
         self._results.setdefault((group, result), []).append((message, where, trajectory.file))
 
     def findings(self) -> Findings:
-        """Return the findings: one for each joint and check; for clocks, one for each message."""
+        """Return the findings: one per joint and check; of checks of clocks, one per message."""
         summary = Findings()
         for (_, result), occurrences in self._results.items():
-            # a joint that rests in one motion and moves in another is no oddity
+            # joints at rest are a finding only if they never move
             if result.everywhere and len(occurrences) < self._count:
                 continue
             message, where, file = occurrences[0]
@@ -344,8 +344,8 @@ def check(
 ) -> list[Diagnostic]:
     """Return the findings of the checks of logs; nothing is repaired.
 
-    Raises LogError when revolute joints look recorded in degrees, unless units are declared, and when a
-    position or a velocity never changes while the other one does.
+    Raises LogError if revolute joints were probably recorded in degrees, unless units are declared, and if a position
+    or a velocity is constant while the other one changes.
     """
     checks = LogChecks(joints, joint_types)
     for trajectory in trajectories:

@@ -1,4 +1,4 @@
-"""Read CSV logs as spreadsheets and loggers write them."""
+"""Reader of CSV logs in the dialects of spreadsheets and loggers."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
-STAMP = ("sec", "nanosec", "frame_id")  # of a message's header
+STAMP = ("sec", "nanosec", "frame_id")  # columns of the header of a message
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the one table of a file."""
+    """Return a list with the table of a file."""
     table = csv_columns(file)
     return [(table_layout(table.schema, joints, mapping, file), table)]
 
 
 def csv_columns(file: Path) -> pa.Table:
-    """Return a table of commas, semicolons or tabs, with decimal commas if separated by the latter two.
+    """Return a table separated by commas, semicolons or tabs; with semicolons or tabs, decimal commas are possible.
 
     Text may be UTF-8, UTF-16 or Latin-1. Joint states written by `ros2 topic echo --csv` have no header.
     """
@@ -83,7 +83,7 @@ def _decoded_head(file: Path) -> tuple[str, str]:
         head = source.read(TUNING.csv_head)
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16", head.decode("utf-16", "ignore")
-    # a head cut off in the middle of a character is still UTF-8
+    # the head may end in the middle of a UTF-8 character
     errors = "strict" if len(head) < TUNING.csv_head else "ignore"
     try:
         return "utf-8", head.decode("utf-8", errors)

@@ -1,4 +1,4 @@
-"""Take samples from logs on which accelerations can be had: filtered, at one rate, where the arm moves."""
+"""Samples of the dynamics from logs: filtered, with accelerations, at a common rate, of a moving arm."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from spelgen.logs.tuning import SAMPLES, TUNING
 
 FREQUENCY = SAMPLES.sample_rate
 SHORTEST = SAMPLES.shortest_piece
-HOLE = 0.25 / TUNING.automatic_cutoff  # [s] a shorter one loses nothing that the filter lets through
+HOLE = 0.25 / TUNING.automatic_cutoff  # [s] a shorter gap has no information in the pass band of the filter
 AUTOMATIC = Preprocessing()
 
 
@@ -24,8 +24,8 @@ AUTOMATIC = Preprocessing()
 class DynamicsSamples:
     """Samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged.
 
-    z: (T, n, K) [rad, m], states of friction's bristles from the motion before; None: not known.
-    direction: (T, n) of dry friction without memory, through the same filter as tau; None: not known. rate: [Hz].
+    z: (T, n, K) [rad, m], bristle states of friction, from the history of motion; None: unknown. direction: (T, n) of
+    rate-only dry friction, filtered as tau; None: unknown. rate: [Hz].
     """
 
     name: str
@@ -52,14 +52,15 @@ def dynamics_samples(
     preprocessing: Preprocessing = AUTOMATIC,
     reach: BristleReach | None = None,
 ) -> list[DynamicsSamples]:
-    """Return the moving samples of each dense enough trajectory.
+    """Return the samples of each trajectory with a sufficient sample rate, at which any joint moves (|qd| > 0.02
+    rad/s).
 
-    At 100 Hz (logs from 24 Hz on are interpolated, see `resampled`), through the zero-phase low-pass of
-    ``preprocessing``, by default of 8 Hz, on q, qd and tau (before the change of rate where the log is denser, after
-    it where not), qdd by central differences of the filtered qd, only samples with some |qd| > 0.02 rad/s; pieces
-    between gaps separately, without the filter's transient at both ends. ``pauses``: all samples from the first that
-    moves to the last, standstill between them included. ``reach``: of the bristles whose states z are wanted, through
-    the same filter; see ``bristles_along``.
+    Each gap-free piece is brought to 100 Hz (logs from 24 Hz on are interpolated, see `resampled`). The zero-phase
+    low-pass of ``preprocessing``, by default of 8 Hz, is applied to q, qd and tau at the higher of the two rates, and
+    its transients at both ends are removed. qdd is the central difference of the filtered qd.
+
+    pauses: return all samples from the first to the last motion, standstill between them included. reach: break-away
+    displacements of the bristles whose states z are computed, with the same filter; see ``bristles_along``.
     """
     samples = []
     for trajectory in preprocessing.moved(trajectories):
@@ -75,7 +76,7 @@ def dynamics_samples(
 
 
 def long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
-    """Return the pieces between holes that are longer than the transients of a filter."""
+    """Return the gap-free pieces that are longer than the transients of the filter."""
     return [piece for piece in split_at_gaps(trajectory, gap, HOLE) if piece.duration >= SHORTEST]
 
 
@@ -87,7 +88,7 @@ def _columns(
     is_denser = rate > 1.5 * FREQUENCY
 
     def sampled(signals: np.ndarray) -> np.ndarray:
-        """Return signals (T, ...) of the piece's own times at the regular times, filtered."""
+        """Return signals (T, ...) at the times of the piece, filtered and resampled to the regular times."""
         if cutoff is None:
             return resampled(times, signals, t, rate)
         # filtered at the higher of the two rates: frequencies above half the lower rate are removed by then
@@ -107,12 +108,12 @@ def _columns(
         selected[moving[0] : moving[-1]] = True
     columns = [q, qd, np.gradient(qd, t, axis=0), tau]
     if reach is not None and reach.elements:
-        # the torque steps where joints reverse, at the log's own times, and then went through filter and change of
-        # rate: so must these, else a step is wrong by up to a sample's time, and is confounded with inertia
+        # The torque has steps at reversals, which were filtered and resampled. The friction state is treated equally:
+        # otherwise its steps would be wrong by up to one sample, an error that is confounded with inertia.
         path, speed = piece.q, piece.qd
         if cutoff is not None:
             path, speed = interpolated(t, q, times), interpolated(t, qd, times)
-        z = np.moveaxis(bristles_along(path, reach), 2, 0)  # one element at a time: all are as many logs
+        z = np.moveaxis(bristles_along(path, reach), 2, 0)  # one element at a time, to limit the memory
         columns.append(np.stack(list(map(sampled, z)), axis=2))
         direction = direction_along(speed, reach)
         if direction is not None:
@@ -121,5 +122,5 @@ def _columns(
 
 
 def is_moving(qd: np.ndarray) -> np.ndarray:
-    """Return in which samples some joint moves, (T,)."""
+    """Return a mask (T,) of the samples at which any joint moves."""
     return np.asarray((np.abs(qd) > SAMPLES.moving).any(axis=1))

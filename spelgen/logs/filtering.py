@@ -1,4 +1,4 @@
-"""Filter signals with zero phase, bring them to other times, and differentiate recorded positions."""
+"""Zero-phase filters, resampling and differentiation of signals."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.tuning import TUNING
 
-# SciPy is imported where it is called: that takes the better part of a second, which most commands can do without
+# SciPy is imported in the functions that need it: its import takes most of a second, and few commands need it
 
 
 def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
-    """Return one gap-free piece with q, qd and tau through a zero-phase Butterworth low-pass.
+    """Return a gap-free piece with q, qd and tau filtered by a zero-phase Butterworth low-pass.
 
-    cutoff [Hz]. All three go through the same filter, so that a linear system's filtered input still explains its
-    filtered output. Raises LogError where the piece is too slow for this cutoff.
+    cutoff [Hz]. All signals have the same filter: filtered input and output of a linear system obey the same equation.
+    Raises LogError if the sample rate is too low for this cutoff.
     """
     t = trajectory.t
     require_cutoff(trajectory, _mean_rate(t), cutoff)
@@ -27,23 +27,23 @@ def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
 
 
 def require_cutoff(trajectory: Trajectory, rate: float, cutoff: float) -> None:
-    """Raise LogError where samples at this rate [Hz] are too few for a filter of that cutoff [Hz]."""
+    """Raise LogError if a sample rate [Hz] is too low for a filter with this cutoff [Hz]."""
     if cutoff >= rate / 2:
         got = f"a filter of {cutoff:g} Hz on samples at {rate:.3g} Hz"
         raise trajectory.error(got, f"below {rate / 2:.3g} Hz", "lower or drop the filter")
 
 
 def low_passed(t: np.ndarray, signals: np.ndarray, cutoff: float) -> np.ndarray:
-    """Return signals (T, ...) at times t through that filter.
+    """Return signals (T, ...) at times t, filtered by the zero-phase low-pass.
 
-    It needs a regular grid: they are interpolated (cubic) to the mean rate, filtered and interpolated back.
+    The filter needs a regular grid: signals are interpolated (cubic) to the mean rate, filtered and interpolated back.
     """
     grid = np.linspace(t[0], t[-1], len(t))
     return interpolated(grid, low_pass_regular(interpolated(t, signals, grid), _mean_rate(t), cutoff), t)
 
 
 def interpolated(t: np.ndarray, signals: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return signals (T, ...) at times t at other times, on a cubic; unchanged if the times are the same."""
+    """Return signals (T, ...) at times t, interpolated at other times by a cubic; unchanged if the times are equal."""
     if len(t) == len(times) and np.abs(t - times).max() < 1e-6 / _mean_rate(t):
         return signals
     from scipy.interpolate import CubicSpline
@@ -56,35 +56,35 @@ def _mean_rate(t: np.ndarray) -> float:
 
 
 def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
-    """Return signals (T, ...) at a regular rate [Hz] through that filter."""
+    """Return signals (T, ...) at a regular rate [Hz], filtered by the zero-phase low-pass."""
     from scipy.signal import sosfiltfilt
 
-    # three periods of the cutoff settle the ends
+    # signals are extended at both ends by three periods of the cutoff
     padding = min(len(signals) - 1, int(3 * rate / cutoff))
     filtered = sosfiltfilt(_sections(rate, cutoff), signals, axis=0, padlen=padding)
-    return np.ascontiguousarray(filtered)  # the filter gives a reversed view, which torch does not take
+    return np.ascontiguousarray(filtered)  # the filter returns a reversed view, which torch does not accept
 
 
 @lru_cache(maxsize=8)  # logs of a robot have few rates
 def _sections(rate: float, cutoff: float) -> np.ndarray:
-    """Return the filter's second-order sections (S, 6), whose design takes as long as filtering a minute of a joint."""
+    """Return the filter's second-order sections (S, 6); their design takes as long as filtering a minute of a joint."""
     from scipy.signal import butter
 
     return np.asarray(butter(TUNING.filter_order, cutoff, fs=rate, output="sos"))
 
 
 def regular_times(t: np.ndarray, frequency: float) -> np.ndarray:
-    """Return the times of a regular rate [Hz] within the times t (T,)."""
+    """Return regular times at a rate [Hz] within the range of times t (T,)."""
     return np.arange(t[0], t[-1], 1.0 / frequency)
 
 
 def resampled(t: np.ndarray, signals: np.ndarray, times: np.ndarray, rate: float) -> np.ndarray:
-    """Return signals (T, ...) of that rate [Hz] at other times: between dense samples on lines, else on a cubic."""
+    """Return signals (T, ...) of this rate [Hz] at other times, interpolated linearly if dense, else by a cubic."""
     from scipy.interpolate import interp1d
 
     # a line between samples that are far apart would cut off the peaks of the motion
     kind = "linear" if is_dense(rate) else "cubic"
-    # by rounding the last time may lie just behind the last sample
+    # rounding errors may move the last time beyond the last sample
     return np.asarray(interp1d(t, signals, kind, axis=0, fill_value="extrapolate")(times))
 
 
@@ -94,7 +94,7 @@ def velocities(trajectory: Trajectory) -> np.ndarray:
 
 
 def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
-    """Return the derivative of (..., T, n) at a rate [Hz], of order 0 the smoothed values themselves.
+    """Return the derivative of q (..., T, n) at a rate [Hz]; of order 0: the smoothed q.
 
     By cubic polynomials over `derivative_span` (Savitzky and Golay, Anal. Chem. 36, 1964).
     """
@@ -102,6 +102,6 @@ def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
 
     samples = q.shape[-2]
     width = 2 * round(TUNING.derivative_span * rate / 2) + 1
-    # an uneven width above the four samples of a cubic, at most the number of samples
+    # the width is uneven, at least five samples for a cubic, and at most the number of samples
     width = min(max(5, width), samples - 1 + samples % 2)
     return np.asarray(savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2))

@@ -23,7 +23,7 @@ FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
 
 
 def format_of(path: Path) -> LogFormat | None:
-    """Return the format of a file or folder; None of other files, such as a pipe that might never end."""
+    """Return the format of a file or folder; None for other files, such as a pipe, whose reading might not end."""
     for log_format in FORMATS:
         is_folder = log_format.marker and (path / log_format.marker).is_file()
         if is_folder or (path.suffix in log_format.suffixes and path.is_file()):
@@ -32,7 +32,7 @@ def format_of(path: Path) -> LogFormat | None:
 
 
 def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the tables of a log. Raises LogError, where columns are missing too."""
+    """Return the tables of a log. Raises LogError, also if columns are missing."""
     log_format = format_of(path)
     assert log_format is not None, "log_files gives logs alone"
     with reading(path):
@@ -42,9 +42,9 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[
 def log_files(
     paths: Path | str | Iterable[Path | str], role: str | None = None
 ) -> tuple[list[Path], list[SpelgenError]]:
-    """Return the logs that these paths name, each once, and errors of the others.
+    """Return the logs at these paths, each once, and the errors of all other paths.
 
-    role: "train" or "test": of a folder that holds train.* or test.* files, only those with this stem.
+    role: "train" or "test": of a folder with files train.* or test.*, only the files with this stem are used.
     """
     files: dict[Path, None] = {}
     errors: list[SpelgenError] = []
@@ -60,7 +60,7 @@ def log_files(
 
 
 def _unpacking(path: Path) -> str | None:
-    """Return the remedy for a packed file, None for other files."""
+    """Return the advice to unpack a compressed file; None for other files."""
     command = UNPACK.get(path.suffix)
     return None if command is None else f"unpack it: {command} {path.name}"
 

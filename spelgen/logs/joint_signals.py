@@ -1,4 +1,4 @@
-"""Signals of one joint in one trajectory, as the checks of logs see them."""
+"""Signals of one joint in one trajectory, which checks of logs examine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from spelgen.logs.tuning import SIGNALS
 
 
 class Advice(NamedTuple):
-    """Finding of a check with the exact remedy, which the check has tried."""
+    """Finding of a check with a remedy that the check has tested."""
 
     message: str
     do: str
@@ -21,7 +21,8 @@ class Advice(NamedTuple):
 class JointSignals(NamedTuple):
     """Signals of one joint in one trajectory: the subject of the checks without the robot.
 
-    q, qd: (T,). factor: ratio of dq/dt to qd; NaN at rest. correlations: of qd with dq/dt of every joint; NaN at rest.
+    q, qd: (T,). factor: ratio of dq/dt to qd; NaN for a joint at rest. correlations: of qd with dq/dt of each joint;
+    NaN for a joint at rest.
     """
 
     trajectory: Trajectory
@@ -35,19 +36,19 @@ class JointSignals(NamedTuple):
 
     @property
     def turns(self) -> bool:
-        """Whether the joint may turn on and on."""
+        """Whether the joint can turn without limit."""
         return self.kind == "continuous" or bool(self.trajectory.mapping.word("period", "q", self.joint))
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """The quantities that were measured: neither commands nor differences."""
+        """Names of the measured quantities: without commands, and without differentiated velocities."""
         if self.trajectory.u is not None:
             return ("q",)
         return self.trajectory.mapping.quantities if self.trajectory.tau.size else ("q",)
 
     @property
     def step(self) -> float:
-        """Median of the times between samples [s], 0 of a single sample."""
+        """Median time between samples [s]; 0 for a single sample."""
         steps = np.diff(self.trajectory.t)
         return float(np.median(steps)) if steps.size else 0.0
 
@@ -63,14 +64,14 @@ class JointSignals(NamedTuple):
 
     @property
     def correlation(self) -> float:
-        """Of qd and dq/dt."""
+        """Correlation of qd and dq/dt."""
         return self.correlations[self.number]
 
     def changes_by(self, unit: float) -> bool:
-        """Return True if dq/dt is this multiple of qd, as with a wrong unit."""
+        """Return True if dq/dt is this multiple of qd, which indicates a wrong unit."""
         return self.correlation > SIGNALS.agreement and is_factor(self.factor, unit)
 
 
 def is_factor(value: float, unit: float) -> bool:
-    """Return True if a factor is the factor of a unit, within a tolerance."""
+    """Return True if a factor equals the factor of a unit within a tolerance."""
     return 1 / SIGNALS.unit_factor < value / unit < SIGNALS.unit_factor

@@ -1,4 +1,4 @@
-"""Check signals for jumps: outliers, words of a register, held values, velocities without sign."""
+"""Checks of signals for jumps: outliers, register words, held values, velocities without sign."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def find_dropouts(signals: JointSignals) -> str | None:
 
 
 def find_jumps(signals: JointSignals) -> str | Advice | None:
-    """Find signals that jump: words of a register read as plain numbers, wrapped angles, joined recordings."""
+    """Find signals that jump: undecoded register words, wrapped angles, joined recordings."""
     for name in signals.trajectory.quantities:
         found = _find_words(signals, name)
         if found is not None:
@@ -43,16 +43,16 @@ def find_jumps(signals: JointSignals) -> str | Advice | None:
 
 
 def _find_words(signals: JointSignals, name: str) -> Advice | None:
-    """Find words of a register, or wrapped angles, in "q", "qd", "tau" or "u" of the joint."""
+    """Find undecoded register words, or wrapped angles, in "q", "qd", "tau" or "u" of the joint."""
     mapping, values = signals.trajectory.mapping, signals.signal(name)
     scale, offset = mapping.scale(name, signals.joint), mapping.offset(name, signals.joint)
     turn = None if signals.kind == "prismatic" or name not in ("q", "u") else 2 * np.pi / abs(scale)
-    # one lost sample or outlier makes two jumps, which no register explains
+    # a lost sample or an outlier has two jumps, unlike a register
     values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
     word = read_as_words((values - offset) / scale, turn)
     if word is None:
         return None
-    # commands may jump: they are words only if decoding brings them to the positions
+    # commands may jump: they count as words only if decoded commands are close to the positions
     if name == "u":
         q = signals.q[~is_lost(signals.signal("u"))]
         if np.std(word.values * scale + offset - q) > SIGNALS.near_position * np.std(values - q):
@@ -68,7 +68,7 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
 
 
 def find_held(signals: JointSignals) -> str | None:
-    """Find signals that change less often than rows are written."""
+    """Find signals whose values are held over several rows."""
     rate = signals.trajectory.sample_rate
     for name in signals.measured:
         often = held_samples(signals.signal(name))
@@ -93,7 +93,7 @@ def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Find velocities that are the magnitude of dq/dt."""
     trajectory, qd = signals.trajectory, signals.qd
     lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
-    # noise of a joint at rest has both signs
+    # the velocity noise of a joint at rest has both signs
     if trajectory.mapping.velocity == "differentiated" or lowest > SIGNALS.unsigned * highest or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)

@@ -1,8 +1,7 @@
-"""Detect jumps of logged signals: lost samples, outliers, wrapped angles, register words, repeated rows.
+"""Detection of jumps of logged signals: lost samples, outliers, wrapped angles, register words, repeated rows.
 
-Every function takes one signal (T,) or the columns of a log (T, C). Nothing here depends on the format of the log or on
-the robot. A step is the difference between neighbouring samples, the typical step the median
-of the steps that are not 0.
+Every function takes one signal (T,) or the columns of a log (T, C), of any format and any robot. A step is the
+difference between neighbouring samples, the typical step the median of the steps that are not 0.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ def centred(values: np.ndarray, period: float) -> np.ndarray:
 
 
 def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
-    """Return the numbers that sign-magnitude words (T,) represent: from `sign_bit` on, minus the excess."""
+    """Return the numbers that sign-magnitude words (T,) represent: words from `sign_bit` on are negative."""
     return np.where(words >= sign_bit, sign_bit - words, words)
 
 
@@ -43,7 +42,7 @@ def is_lost(values: np.ndarray) -> np.ndarray:
     lost = np.zeros(len(values), bool)
     logged = np.flatnonzero(values)
     if not logged.size or logged[-1] - logged[0] == len(logged) - 1:
-        return lost  # all zeros are at the ends, where the signal may be zero
+        return lost  # zeros occur only at the ends, where the signal itself may be zero
     steps = np.abs(np.diff(values[logged]))
     # a signal that passes through 0 has samples close to 0 first
     nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))
@@ -54,8 +53,8 @@ def is_lost(values: np.ndarray) -> np.ndarray:
 def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     """Return a mask (T,) of lost samples and of outliers.
 
-    smooth: True for positions, whose steps change gradually; torques and velocities may step, so that
-    their outliers must also exceed all other samples by half their range.
+    smooth: True for positions, whose steps change gradually. Torques and velocities may have steps: their outliers
+    must also exceed the range of all other samples by half of it.
     """
     outliers = is_lost(values)
     if len(values) < TUNING.jump_window:
@@ -63,7 +62,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     steps = np.diff(values)
     sizes = np.abs(steps)
     is_jump = sizes > TUNING.jump * _usual(sizes)
-    # a signal of which many steps are large has no outliers, but noise
+    # a signal with many large steps is noisy
     if not is_jump.any() or is_jump.mean() > TUNING.most_jumps:
         return outliers
     for first, second in pairwise(np.flatnonzero(is_jump)):
@@ -72,7 +71,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         if not is_excursion:
             continue
         low, high = max(0, first - TUNING.jump_window), second + 1 + TUNING.jump_window
-        # steps of the neighbours: a fast motion has large steps on both sides; the largest two may be another outlier's
+        # a fast motion has large steps on both sides; the two largest steps may belong to another outlier
         around = np.sort(np.concatenate([sizes[low:first], sizes[second + 1 : high]]))[:-2]
         if min(abs(out), abs(back)) > TUNING.local_jump * around.max(initial=0.0):
             outliers[first + 1 : second + 1] = True
@@ -87,23 +86,24 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
 def jumps(t: np.ndarray, q: np.ndarray, limit: float = TUNING.fastest) -> np.ndarray:
     """Return the rows after which a position (T,) jumps: faster than `limit` [rad/s, m/s] and typical steps.
 
-    Steps across gaps in time are no jumps: an arm may be moved meanwhile.
+    Steps across gaps in time are not jumps: the arm may have moved in the gap.
     """
     if len(q) < TUNING.jump_window:
         return np.zeros(0, int)
     sizes, dt = np.abs(np.diff(q)), np.diff(t)
     median = float(np.median(dt))
     is_jump = (sizes > TUNING.jump * _usual(sizes)) & (dt <= TUNING.gap * median)
-    # stamps may come in bursts: a step is at least as long as most
+    # time stamps may come in bursts: a step lasts at least the median time
     return np.flatnonzero(is_jump & (sizes > limit * np.maximum(dt, median)))
 
 
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
-    """Return a mask (T,) of rows of a log (T, C) that repeat the row before in a motion, and the copies of each row.
+    """Return a mask (T,) of the rows of a log (T, C) that repeat the row before during motion, and the copies of each
+    row.
 
-    positions: the number of first columns that are positions. A row is a repeat if the position then makes up for it:
-    the step that follows k equal rows is as large as k steps of the motion after it. Rows of an arm at rest are kept,
-    one of n if rows of the motion are written n times.
+    positions: number of leading columns that are positions. Equal rows count as repeats if the motion continued
+    meanwhile: the step after k equal rows is as large as k steps of the motion after it. Rows of an arm at rest are
+    kept; if rows of a motion are written n times, one of n rows at rest is kept.
     """
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
     lengths = np.diff(np.append(starts, len(columns)))
@@ -111,7 +111,9 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     index = np.arange(len(columns)) - np.repeat(starts, lengths)
     if len(starts) < 4 or not index.any():
         return np.repeat(is_held, lengths), 1
-    steps = np.abs(np.diff(columns[starts, :positions], axis=0))  # at the end of each block but the last
+    steps = np.abs(
+        np.diff(columns[starts, :positions], axis=0)
+    )  # after each block of equal rows except the last
     speeds = steps[1:] / lengths[1:-1, None]
     quantum = np.min(np.where(steps > 0, steps, np.inf), axis=0)
     makes_up = (steps[:-1] > 2.5 * quantum) & (steps[:-1] > 0.6 * lengths[:-2, None] * speeds)
@@ -122,12 +124,12 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
 
 
 def held_samples(values: np.ndarray) -> int:
-    """Return the number of samples that a value of a quickly changing signal (T,) lasts: 1 of a sound signal."""
+    """Return the number of samples for which each value of a changing signal (T,) is held: 1 for a faultless signal."""
     changes = np.flatnonzero(np.diff(values))
     if len(changes) < TUNING.jump_window:
         return 1
     sizes = np.abs(np.diff(values)[changes])
-    # steps of a quantised signal last long without being held
+    # slow quantised signals are constant for several samples without being held: only large steps count
     large = sizes[1:] > 2.5 * sizes.min()
     if large.sum() < TUNING.jump_window:
         return 1
@@ -135,9 +137,9 @@ def held_samples(values: np.ndarray) -> int:
 
 
 class Word(NamedTuple):
-    """A reading of a signal as words of a register.
+    """Decoding of a signal as register words.
 
-    mapping key, its value in logged units, the number of jumps, the decoded signal.
+    key, value: of the mapping, in logged units. jumps: number of jumps of the signal. values: the decoded signal.
     """
 
     key: str
@@ -147,13 +149,13 @@ class Word(NamedTuple):
 
 
 def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
-    """Return the reading of a signal (T,) in logged units that removes its jumps; None if there is none.
+    """Return the decoding of a signal (T,) in logged units that removes its jumps; None if there is none.
 
-    Hypotheses: sign-magnitude words and overflowing words of 2^k steps of the signal's grid; turns (`turn` in logged
-    units, None for joints that do not turn) and powers of two of them. Each one is applied, and the best has fewest
-    jumps left, then the smoothest signal.
+    Hypotheses are sign-magnitude words and overflowing words, of 2^k steps of the signal's grid or of 2^k revolutions
+    (`turn` in logged units, None for joints that do not turn). The best decoding has the fewest remaining jumps, and
+    among these the smoothest signal.
     """
-    if len(values) < 4:  # the median step, with which a jump is compared, would be a jump itself
+    if len(values) < 4:  # the median step might itself be a jump
         return None
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
@@ -161,7 +163,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     if not len(rows) or len(rows) > TUNING.most_words * len(values):
         return None
     jump, usual = float(np.median(np.abs(steps[rows]))), _usual(np.abs(steps))
-    # torques reverse, too: if values below 0 occur, only an overflow of the whole range is one
+    # torques may reverse abruptly: in a signal with negative values only jumps over the whole range are overflows
     is_signed = values.min() < -TUNING.finest_word * np.ptp(values)
     if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * usual):
         return None
@@ -169,7 +171,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        # words of a register lie within its period, words with a sign bit on both sides of the bit
+        # overflowing words are within one period; words with a sign bit are on both sides of it
         readings = []
         if np.ptp(values) < size * (1 + TUNING.word_margin):
             readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))
@@ -177,7 +179,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
             left = np.abs(np.diff(reading.values))
-            # a fast motion, or one across a gap, only becomes smaller by a period
+            # the steps of a fast motion, or of one across a gap, only become smaller by a period
             if np.median(left[rows]) > TUNING.jump * usual:
                 continue
             bends = np.abs(np.diff(reading.values, 2))
@@ -191,11 +193,11 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
 
 def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
-    """Return sizes of registers of a signal (T,) in logged units: 2^k turns, and 2^k steps if the signal has a grid."""
+    """Return candidate register sizes of a signal (T,) in logged units: 2^k turns, and 2^k steps of its grid."""
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)
     differences = np.diff(levels)
-    # values in SI units were converted back: equal ones differ by rounding
+    # values were converted back from SI units: equal ones differ by rounding errors
     differences = differences[differences > TUNING.finest_word * np.ptp(values)]
     if differences.size:
         step = float(differences.min())
@@ -206,6 +208,6 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
 
 
 def _usual(sizes: np.ndarray) -> float:
-    """Return the median of the sizes (T,) that are not 0; infinite if there is none."""
+    """Return the median of the nonzero step sizes (T,); infinite if all are zero."""
     moving = sizes[sizes > 0]
     return float(np.median(moving)) if moving.size else np.inf

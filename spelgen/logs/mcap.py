@@ -1,4 +1,4 @@
-"""Read MCAP files without an end: a recorder that was killed writes no summary and no index.
+"""Reader of incomplete MCAP files, without summary and index, of recorders that were killed.
 
 Records follow one another: an operation code (1 byte), a length (8 bytes) and a body. https://mcap.dev/spec
 """
@@ -44,7 +44,7 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _unpacked(chunk: bytes) -> bytes:
-    """Return the records of a chunk; if it is cut off, the ones before the cut."""
+    """Return the records of a chunk, or the complete records of a chunk that is cut off."""
     if len(chunk) < 40:
         return b""
     size = _number("<Q", chunk, 16)
@@ -62,10 +62,10 @@ def _unpacked(chunk: bytes) -> bytes:
 
 
 def _number(form: str, data: bytes, start: int = 0) -> int:
-    """Return a number at a place of the data."""
+    """Return the number at an offset in the data."""
     return int(struct.unpack_from(form, data, start)[0])
 
 
 def _text(data: bytes, start: int) -> str:
-    """Return a text at a place of the data, which begins with its length."""
+    """Return the text at an offset in the data; it is preceded by its length."""
     return data[start + 4 : start + 4 + _number("<I", data, start)].decode()

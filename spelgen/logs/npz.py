@@ -1,4 +1,4 @@
-"""Read NPZ archives: an array for each column, or matrices with a column for each joint."""
+"""Reader of NPZ archives, with an array per column, or matrices with a column per joint."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spelgen.logs.tables import LogFormat, LogTable, missing_columns, stored_col
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-JOINT_NAMES = "joints"  # the array of joint names, by the columns of the matrices
+JOINT_NAMES = "joints"  # array with the names of the joints in the order of the columns of matrices
 TRAJECTORY = "{trajectory}"
 
 
@@ -48,18 +48,18 @@ class NpzArrays:
         return self._arrays[name]
 
     def column(self, name: str) -> pa.Array:
-        """Return an array as a column, of a matrix a column of its rows."""
+        """Return an array as a column; a matrix becomes a column of lists."""
         array = self[name]
-        # Arrow refuses half and extended precision, and the other byte order
+        # Arrow rejects half and extended precision, and foreign byte orders
         wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
         values = pa.array(array.astype(wide).ravel())
         return pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if array.ndim == 2 else values
 
 
 def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return one recording, or one for each text that `{trajectory}` stands for in the name of the times.
+    """Return one table, or one per text in place of `{trajectory}` in the name of the times.
 
-    Arrays that are not asked for are not looked at.
+    Only the arrays of the mapping are read.
     """
     arrays, times = NpzArrays(file), mapping.columns.t
     if TRAJECTORY not in times:
@@ -75,7 +75,7 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def npz_columns(file: Path) -> pa.Table:
-    """Return all arrays with as many values, or rows, as the longest has; matrices as lists."""
+    """Return a table of all arrays that are as long as the longest one; matrices are columns of lists."""
     arrays = NpzArrays(file)
     lengths = {name: len(arrays[name]) for name in arrays.names if arrays[name].ndim in (1, 2)}
     samples = max(lengths.values(), default=0)
@@ -83,9 +83,9 @@ def npz_columns(file: Path) -> pa.Table:
 
 
 def _trajectory_text(pattern: str, name: str) -> str | None:
-    """Return the text in place of `{trajectory}` in a name, everywhere the same; None where the pattern does not fit.
+    """Return the text in place of `{trajectory}` in a name, equal at all places; None if the pattern does not match.
 
-    By lengths: a regular expression with several open ends takes exponential time on a long name.
+    It is found by lengths, since regular expressions with several wildcards take exponential time on long names.
     """
     start = pattern.index(TRAJECTORY)
     length = (len(name) - len(pattern)) // pattern.count(TRAJECTORY) + len(TRAJECTORY)
@@ -111,7 +111,7 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
                     if pattern.replace("{joint}", owner) == columns_of[joint]:
                         columns_of[joint] = f"{matrix}[{places[owner]}]"
             mapping = mapping.with_joint_columns({joint: {quantity: x} for joint, x in columns_of.items()})
-    # only names: the type of an array is known once it is read
+    # names only: the type of an array is unknown before it is read
     schema = pa.schema([(name, pa.null()) for name in arrays.names])
     layout = table_layout(schema, joints, mapping, arrays.file)
     if recording is not None:
@@ -130,7 +130,7 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
 
 
 def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str]) -> list[int]:
-    """Return the joints' columns of a matrix: by the array `joints`, else in the order of the arm's joints."""
+    """Return the columns of a matrix for the joints: by the array `joints`, else in the order of the arm's joints."""
     width = arrays[matrix].shape[1]
     if JOINT_NAMES not in arrays.names:
         if width != len(joints):

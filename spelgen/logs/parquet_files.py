@@ -1,4 +1,4 @@
-"""Read Parquet logs, the columns that are asked for and no others, and data sets of LeRobot 3, made of such files."""
+"""Reader of the columns of Parquet logs, and of LeRobot 3 data sets, which consist of Parquet files."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.messages import validated
 from spelgen.settings.yaml_document import YamlDocument
 
-INFO = "meta/info.json"  # of a data set of LeRobot
+INFO = "meta/info.json"  # file in a LeRobot data set
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
 ENDING = ".pos"
-LARGEST_NORMALISED = 100.001  # single precision
+LARGEST_NORMALISED = 100.001  # 100 in single precision
 
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the one table of a file. The mapping does not apply to files that spelgen wrote."""
+    """Return a list with the table of a file. The mapping does not apply to files that spelgen wrote."""
     schema = pa.parquet.read_schema(file)
     layout = table_layout(schema, joints, mapping, file)
     columns = stored_columns(layout, schema.names)
@@ -35,10 +35,10 @@ def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the tables of all files, with columns by the data set's names of motors.
+    """Return the tables of all files of a data set; joints have the names of its motors.
 
-    Raises LogError if there are no files, a joint is not among the motors, or positions are normalised and no
-    calibration states their scale.
+    Raises LogError without files, for a joint that is not among the motors, and for normalised positions without a
+    calibration.
     """
     info = read_json(folder / INFO, LogError)
     states, actions = _motor_names(folder, info, STATE), _motor_names(folder, info, ACTION)
@@ -61,7 +61,7 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         expected = "data/chunk-000/file-000.parquet"
         raise LogError("a data set without Parquet files", file=folder, expected=expected)
     mapping, remarks = _with_scale(folder, files, joints, mapping)
-    # LeRobot 2 had degrees, and no ending in the names
+    # LeRobot 2 has positions in degrees, and no suffixes in the names
     if ENDING not in str(info["features"][STATE]["names"]):
         remarks = ()
     fps = info.get("fps")
@@ -83,8 +83,8 @@ def _with_scale(
 ) -> tuple[LogMapping, tuple[str, ...]]:
     """Return the mapping with the unit of positions, and remarks on it.
 
-    LeRobot stores -100..100 of each motor's calibrated range by default, and degrees or radians on request; the data
-    set does not state which. Raises LogError if values are in the former range, and no calibration states their scale.
+    LeRobot stores -100..100 for each motor's calibrated range by default, and degrees or radians as an option; the
+    data set does not specify the unit. Raises LogError for values in -100..100 without a calibration.
     """
     largest = 0.0
     for file in files:
@@ -118,7 +118,7 @@ def _with_scale(
 
 
 def _calibration(folder: Path) -> dict[str, MotorCalibration]:
-    """Return the calibration of the motors that lies in a data set, empty without one."""
+    """Return the calibration of the motors in a data set; {} if there is none."""
     for file in (folder / "calibration.json", folder / "meta" / "calibration.json"):
         if file.is_file():
             document = YamlDocument(file, None)
@@ -132,7 +132,7 @@ def dataset_motors(folder: Path) -> list[str]:
 
 
 def _motor_names(folder: Path, info: Any, feature: str) -> list[str]:
-    """Return the motors' names of a feature, without LeRobot's ending."""
+    """Return the names of the motors of a feature, without LeRobot's suffix."""
     try:
         names = info["features"][feature]["names"] or []
         if isinstance(names, dict):  # LeRobot writes a list, or a group of lists

@@ -16,13 +16,13 @@ from spelgen.logs.tuning import TUNING
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """How logs are cut, filtered and thinned. Raises SettingsError for values that cannot be.
+    """Options of cutting, filtering and decimation of logs. Raises SettingsError for invalid values.
 
-    cutoff: of the zero-phase low-pass on q, qd and tau [Hz]; 0: none; None: 8 Hz, and none for windows of logs of
-    which one is sampled at 50 Hz or less.
-    decimation: samples from one sample of a window to the next; None: as filtered logs allow.
-    gap: a step longer than this multiple of the median step is a hole in the recording, at which it is cut.
-    torque_delay: how much later than positions the logs show torques [s]; None: found where torques are fitted.
+    cutoff: of the zero-phase low-pass on q, qd and tau [Hz]; 0: none; None: 8 Hz, but no filter for windows if any log
+    is sampled at 50 Hz or less.
+    decimation: stride of the samples of a window; None: chosen for the filter.
+    gap: a time step longer than this multiple of the median step is a gap, at which a recording is cut.
+    torque_delay: delay of logged torques relative to positions [s]; None: estimated in fits to torques.
     """
 
     cutoff: float | None = None
@@ -41,43 +41,45 @@ class Preprocessing:
                 raise SettingsError(repr(getattr(self, name)), element=name, expected=expected)
 
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
-        """Return the options resolved for windows of logs with these sample rates [Hz], as a run keeps them.
+        """Return the resolved options for windows of logs with these sample rates [Hz], which the record of a run
+        contains.
 
-        The cutoff remains None for logs that are too slow to be filtered by default.
+        The cutoff remains None for logs whose rate is too low for the default filter.
         """
         rates = list(rates)
         cutoff, decimation = self.cutoff, self.decimation or 1
         if cutoff is None and all(rate > TUNING.dense_rate * FAST for rate in rates):
             cutoff = TUNING.automatic_cutoff
-        # every sample counts, unless filtered logs are denser than their filter needs
+        # no decimation, unless filtered logs have a higher rate than their filter needs
         if self.decimation is None and cutoff:
             decimation = max(1, int(min(rates) * FAST / (TUNING.samples_per_period * cutoff)))
         return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=self.torque_delay or 0.0)
 
     @property
     def acceleration_cutoff(self) -> float | None:
-        """The filter [Hz] before accelerations are taken; None: no filter."""
+        """Cutoff of the filter for accelerations [Hz]; None: no filter."""
         if self.cutoff is None:
             return TUNING.automatic_cutoff
         return self.cutoff or None
 
     @property
     def filtered(self) -> bool:
-        """True if windows are cut from filtered logs; needs a ``resolved`` one."""
+        """True if windows are cut from filtered logs; the options must be ``resolved``."""
         return bool(self.cutoff)
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """That the logs are filtered, if they are; of a ``resolved`` one."""
+        """A remark if the logs are filtered; the options must be ``resolved``."""
         if not self.cutoff:
             return []
         message = f"q, qd and tau filtered at {self.cutoff:g} Hz, zero phase"
         return [Diagnostic("info", "filter", "logs", None, message)]
 
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
-        """Return gap-free pieces (see `gap_ends`) of at least `shortest` samples, filtered; of a ``resolved`` one.
+        """Return filtered gap-free pieces (see `gap_ends`) of at least `shortest` samples; the options must be
+        ``resolved``.
 
-        Raises LogError where a trajectory has no piece that long.
+        Raises LogError for a trajectory without a piece of this length.
         """
         prepared: list[Trajectory] = []
         errors: list[SpelgenError] = []
@@ -94,7 +96,7 @@ class Preprocessing:
         return prepared
 
     def moved(self, trajectories: Sequence[Trajectory]) -> Sequence[Trajectory]:
-        """Return trajectories with torques at the times at which they act."""
+        """Return the trajectories with torques shifted by the delay to the times at which they act."""
         delay = self.torque_delay
         if not delay:  # most logs have no delay; new trajectories would be validated again
             return trajectories

@@ -1,4 +1,4 @@
-"""Read and write log files, in SI units and the URDF's senses: no filter, no resampling, no repair."""
+"""Reading and writing of log files, in SI units and with the URDF's signs; without filter and resampling."""
 
 from __future__ import annotations
 
@@ -31,20 +31,22 @@ def read_logs(
 ) -> list[Trajectory]:
     """Return all trajectories of the given files and folders, in sorted order of their files.
 
-    arm: one loaded from a URDF, a model, or the names of joints as the URDF has them; without a mapping, joint j
-    has the columns `q_<j>`, `qd_<j>`, `tau_<j>`, and the time `t` [s]. A column `trajectory` splits one file
-    into several. mapping: how the logs are named and measured, as a LogMapping, its keys in a dict, or a YAML file
-    of them; by default the group `logs` of the settings of the arm's URDF. role "train" or "test": of a folder
-    that contains train.* or test.* files, only those with this stem are read. joint_types: with which the
-    mapping's units are checked if `arm` is a list of names.
-    Raises LogError (or one error with several) naming file, row and column, and SettingsError where
-    the mapping does not fit the joints.
+    Without a mapping, the columns are the time `t` [s] and, for joint j, `q_<j>`, `qd_<j>` and `tau_<j>`. A column
+    `trajectory` divides a file into several trajectories.
+
+    arm: result of `load_arm`, a model, or the names of the joints in the URDF. mapping: columns and units of the logs,
+    as a LogMapping, a dict of its keys, or a YAML file; by default the group `logs` of the arm's settings. role:
+    "train" or "test": of a folder with files train.* or test.*, only the files with this stem are read. joint_types:
+    for the check of the mapping's units if `arm` is a list of names.
+
+    Raises LogError (or one error with several) with file, row and column, and SettingsError for a mapping that does
+    not fit the joints.
     """
     return _read(paths, log_source(arm, mapping), role, LogSegments(), joint_types)
 
 
 class BoundedLogs(NamedTuple):
-    """Logs within a bound of memory. notes: which part of the logs was kept, empty if all of them were."""
+    """Logs within a bound of memory. notes: statement of the kept part; empty if all samples were kept."""
 
     trajectories: list[Trajectory]
     notes: list[Diagnostic]
@@ -56,7 +58,7 @@ def read_bounded_logs(
     mapping: GivenMapping = None,
     role: str | None = None,
 ) -> BoundedLogs:
-    """Return the logs as `read_logs` does; of logs of more than `LogTuning.kept_bytes` evenly spread segments.
+    """Return the logs as `read_logs` does, reduced to evenly spread segments if they exceed `LogTuning.kept_bytes`.
 
     Each file is read and reduced by itself, so that memory is bounded by the largest file and the kept samples. A
     reduced recording has gaps between its segments. The same files give the same samples. Raises the errors of
@@ -82,13 +84,16 @@ def _read(
     segments: LogSegments,
     joint_types: Sequence[str] | None = None,
 ) -> list[Trajectory]:
-    """Return the trajectories of all files, through `segments`. Raises the first error of each file together."""
+    """Return the trajectories of all files, collected in `segments`.
+
+    Raises the first error of each file, all together.
+    """
     collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))
     files, errors = log_files(paths, role)
     for file in files:
         try:
             tables = read_tables(file, source.joints, source.mapping)
-            while tables:  # a table is released before the next one is read
+            while tables:  # each table is released before the next one is read
                 segments.add(*tables.pop(0))
         except LogError as error:
             errors.append(error)
@@ -103,10 +108,10 @@ def _read(
 
 
 def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: LoggedArm) -> Path:
-    """Write one Parquet or CSV file (by suffix) with a `trajectory` column, all or nothing; return the path.
+    """Write a Parquet or CSV file (by suffix) with a column `trajectory`, all or nothing; return the path.
 
-    arm: as for `read_logs`, which gives the same numbers back from either. Parquet files declare their units.
-    Raises LogError for another suffix, without trajectories, and for those of another number of joints.
+    `read_logs` returns the same numbers from both formats. Parquet files declare their units. arm: see `read_logs`.
+    Raises LogError for another suffix, without trajectories, and for trajectories with another number of joints.
     """
     path, joints = Path(path), log_source(arm).joints
     if path.suffix not in (".parquet", ".csv"):

@@ -1,4 +1,4 @@
-"""Make trajectories of rows in SI units: in order, without wraps and lost rows, with velocities, torques in time."""
+"""Conversion of rows in SI units to trajectories: order, wraps, repeats, outliers, velocities, delay of torques."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from spelgen.settings.log_mapping import LogMapping
 def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:
     """Return a trajectory of these rows (T, C) in SI units, velocities differentiated if none were logged.
 
-    Wrapped angles and overflowed registers are unwrapped, and rows that are written several times are read once,
-    before anything is differentiated; with 'dropouts: dropped' lost rows and outliers are removed, too.
+    Before the differentiation, wrapped angles and overflowed registers are unwrapped, and repeated rows are removed;
+    with 'dropouts: dropped' lost rows and outliers are removed, too.
     """
     mapping, remarks = layout.mapping, layout.remarks
     data, wraps = _without_wraps(data, mapping.signals(layout.joints), mapping)
@@ -47,7 +47,7 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
 def _without_wraps(
     data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return rows (T, C) in which signals with a period do not jump by it, and remarks on them."""
+    """Return rows (T, C) in which signals with a period are unwrapped, and remarks."""
     remarks: list[str] = []
     values = dict(zip(signals, data[:, 1:].T, strict=True))
     for (quantity, joint), logged in values.items():
@@ -57,9 +57,9 @@ def _without_wraps(
         count = jump_count(logged, period)
         result = unwrapped(logged, period)
         if quantity == "u":
-            # a command is close to the position, although the two registers may count from different revolutions
+            # commands are close to positions; their registers may start in different revolutions
             result = result - period * np.round(np.median(result - values["q", joint]) / period)
-        # without a jump, an angle beyond half a turn is as good as one within it
+        # angles are centred within half a turn only if they wrap
         elif count or abs(period - 2 * pi) > TUNING.limit_of_turn:
             offset = mapping.offset(quantity, joint)
             result = centred(result - offset, period) + offset
@@ -75,8 +75,8 @@ def _without_wraps(
 def _without_repeats(
     data: np.ndarray, positions: int, mapping: LogMapping
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return rows (T, C) without repeats if every row is written several times or repeats are dropped; and a note."""
-    # too short to tell motion from rest, and an archive may have thousands of them
+    """Return rows (T, C), without repeats if all rows are repeated or 'dropouts: dropped' is set, and messages."""
+    # too short to distinguish motion from rest; an archive may have thousands of such recordings
     if len(data) < TUNING.jump_window:
         return data, ()
     repeats, copies = repeated_rows(data[:, 1:], positions)
@@ -95,7 +95,7 @@ def _without_repeats(
 def _without_outliers(
     data: np.ndarray, signals: Sequence[tuple[str, str]]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return rows (T, C) without lost samples and outliers, and a message that lists them."""
+    """Return rows (T, C) without lost samples and outliers, and messages that list them."""
     outliers = np.zeros(len(data), bool)
     found = []
     for (quantity, joint), values in zip(signals, data[:, 1:].T, strict=True):
@@ -111,23 +111,23 @@ def _without_outliers(
 
 
 def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau"; a velocity may be 0 for a moment."""
+    """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau"; zero velocities are not lost."""
     rows = is_outlier(values, smooth=quantity == "q")
     return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
 
 
 def listed_times(t: np.ndarray) -> str:
-    """Return the first times (T,) [s] of a list as text, and the number of the others."""
+    """Return a text with the first of the times (T,) [s] and the number of the others."""
     shown = ", ".join(f"{x:.4g}" for x in t[: TUNING.listed].tolist())
     more = len(t) - TUNING.listed
     return f"{shown} s" + (f" and {more} more" if more > 0 else "")
 
 
 def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return values (T, C) of these rows of a file with increasing times, and messages on repairs.
+    """Return the values (T, C) of rows of a file with increasing times, and messages about repairs.
 
-    Rows are sorted if positions become smoother by it, and of equal rows of one time the first is kept. Times of a
-    coarse clock are reconstructed. Raises LogError for a clock that starts again, or that is too coarse.
+    Rows are sorted if this makes the positions smoother. Of several rows with one time the first is kept, or the times
+    are reconstructed if the clock is coarse. Raises LogError for a clock that restarts or is too coarse.
     """
     repairs: tuple[str, ...] = ()
     foreign = foreign_rows(data, len(layout.joints))
@@ -143,14 +143,14 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
     if late:
         ordered = data[np.argsort(t, kind="stable")]
         positions = slice(1, 1 + len(layout.joints))
-        # two recordings in one file would be interleaved by sorting
+        # sorting must not interleave two recordings in one file
         if _roughness(ordered[:, positions]) > _roughness(data[:, positions]):
             require_increasing_times(t, rows, layout)
         data = ordered
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
-    # different states of one time: the clock is too coarse for the rows
+    # many rows with equal times and different values: the clock is coarse
     if np.count_nonzero(differs) > max(TUNING.few_repeats, TUNING.coarse_clock * len(data)):
         t, message = _reconstructed(data[:, 0], layout)
         return np.column_stack([t, data[:, 1:]]), (*repairs, message)
@@ -162,13 +162,13 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
 
 
 def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
-    """Return evenly spaced times (T,) of a clock with few digits, and a message on them.
+    """Return evenly spaced times (T,) for times of a coarse clock, and a message.
 
-    Raises LogError unless every time is its own evenly spaced one, rounded to a tick of the clock.
+    Raises LogError unless each time equals the evenly spaced one within a tick of the clock.
     """
     steps = np.diff(t)
     tick = float(steps[steps > 0].min(initial=np.inf))
-    # a step that is longer than the clock's rounding allows is a hole in the recording
+    # a step longer than the rounding of the clock explains is a gap
     holes = np.flatnonzero(steps > TUNING.gap * max(tick, float(steps.mean()))) + 1
     times, rates = t.copy(), []
     for start, stop in pairwise([0, *holes.tolist(), len(t)]):
@@ -190,14 +190,14 @@ def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
 
 
 def _roughness(positions: np.ndarray) -> float:
-    """Return the sum of the distances between rows (T, n), each joint relative to its range."""
+    """Return the path length of positions (T, n), summed over joints and relative to their ranges."""
     ranges = np.ptp(positions, axis=0)
     length = np.abs(np.diff(positions, axis=0)).sum(axis=0)
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
 
 
 def require_increasing_times(t: np.ndarray, rows: Sequence[int] | np.ndarray, layout: Layout) -> None:
-    """Raise LogError unless times (T,), of these rows of the file, increase."""
+    """Raise LogError unless times (T,) increase; rows: their numbers in the file."""
     backward = np.flatnonzero(np.diff(t) < TUNING.shortest_step)
     if backward.size:
         k = backward[0]
@@ -207,21 +207,21 @@ def require_increasing_times(t: np.ndarray, rows: Sequence[int] | np.ndarray, la
 
 
 def _pieces(t: np.ndarray) -> Iterator[slice]:
-    """Yield the gap-free pieces of two samples or more of times (T,); of a lone sample no window is cut."""
+    """Yield the gap-free pieces of at least two samples of times (T,)."""
     for start, stop in pairwise(gap_ends(t)):
         if stop - start > 1:
             yield slice(start, stop)
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Return values (T, n) without their delay [s], constant at the ends of each gap-free piece."""
+    """Return delayed values (T, n) shifted back by the delay [s], constant at the ends of each gap-free piece."""
     if not delay:
         return values
     from scipy.interpolate import CubicSpline  # takes long to import, as in `low_pass`
 
     moved = values.copy()
     for rows in _pieces(t):
-        # a line from sample to sample would damp torques at times between samples, and noise with them
+        # cubic: linear interpolation would attenuate high frequencies of the torques
         spline = CubicSpline(t[rows], values[rows])
         moved[rows] = spline(np.clip(t[rows] + delay, t[rows][0], t[rows][-1]))
     return moved

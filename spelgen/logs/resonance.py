@@ -1,8 +1,8 @@
-"""Find elastic joints: the inertia that a motor's torque shows grows with frequency up to a resonance of the link.
+"""Detection of elastic joints, whose apparent inertia at the motor increases with frequency up to a resonance.
 
-Of a motor with inertia J_m that carries a link with inertia J_l by a spring, torque and acceleration in phase have the
-ratio H(f) = J_m + J_l / (1 - (f / f_0)^2), with f_0 the resonance of the link with a locked motor; a rigid joint has
-H = J + c / f^2, with c of gravity.
+For a motor with inertia J_m that drives a link with inertia J_l by a spring, the ratio of the torque in phase with the
+acceleration to the acceleration is H(f) = J_m + J_l / (1 - (f / f_0)^2), with the resonance f_0 of the link at a
+locked motor. A rigid joint has H = J + c / f^2, with a constant c due to gravity.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from spelgen.logs.tuning import RESONANCE as TUNING
 
 
 def find_elastic(signals: JointSignals) -> str | None:
-    """Find a joint whose torque shows the resonance of an elastic gear or belt."""
+    """Find joints whose torques show the resonance of an elastic gear or belt."""
     piece = max(split_at_gaps(signals.trajectory), key=len)
     rate, k = piece.sample_rate, signals.number
     length = round(TUNING.segment * rate)
@@ -34,7 +34,7 @@ def find_elastic(signals: JointSignals) -> str | None:
     rigid = _relative_error(np.stack([np.ones_like(frequency), frequency**-2.0], axis=1), inertia)[0]
     candidates = []
     for resonance in np.geomspace(frequency[0], TUNING.beyond * frequency[-1], TUNING.candidates):
-        # multiplied by the denominator: a band next to the resonance must not decide by itself
+        # multiplied by the denominator, so that one band at the resonance does not dominate
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error(
             np.stack([factor, np.ones_like(factor)], axis=1), factor * inertia
@@ -46,7 +46,7 @@ def find_elastic(signals: JointSignals) -> str | None:
     error, resonance, motor, link = min(candidates)
     if rigid < TUNING.rigid_error or error > min(TUNING.elastic_error, rigid / 2):
         return None
-    # up to there the apparent inertia is within `valid` of its value at rest
+    # up to this frequency the apparent inertia differs from its value at rest by less than `valid`
     share = TUNING.valid * (motor + link) / link
     valid = resonance * float(np.sqrt(share / (1 + share)))
     unit = "kg" if signals.kind == "prismatic" else "kg m^2"
@@ -59,7 +59,8 @@ def find_elastic(signals: JointSignals) -> str | None:
 def _apparent_inertia(
     qd: np.ndarray, tau: np.ndarray, rate: float, length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies (B,) [Hz] and the ratios (B,) of torque to acceleration in phase, where they are coherent.
+    """Return frequencies (B,) [Hz] and apparent inertias (B,), the in-phase ratios of torque to acceleration, of
+    coherent bands.
 
     Args:
         qd: (T,) velocity [rad/s, m/s].
@@ -88,6 +89,6 @@ def _apparent_inertia(
 
 
 def _relative_error(columns: np.ndarray, values: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the error of least squares relative to the values (B,), root mean square, and the coefficients (C,)."""
+    """Return the RMS residual of least squares relative to the RMS of the values (B,), and the coefficients (C,)."""
     x = np.linalg.lstsq(columns, values, rcond=None)[0]
     return float(np.linalg.norm(columns @ x - values) / np.linalg.norm(values)), x

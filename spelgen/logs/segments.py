@@ -1,4 +1,4 @@
-"""Collect the recordings of log tables, whole or as evenly spread segments within a bound of memory."""
+"""Collector of recordings from log tables: complete, or as evenly spread segments within a bound of memory."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class LogSegments:
             pieces += [(self._recordings, name, part) for part in np.array_split(rows, parts)]
             self._recordings += 1
         pieces = self._selected(pieces, 8 * len(layout.columns))
-        # the whole table at once if all of it is kept: it takes less time, and errors count its rows
+        # a table that is kept completely is converted at once: this is faster, and errors count its rows
         data = values_in_si(table, layout, start, range(table.num_rows)) if self.every == 1 else None
         for recording, name, rows in pieces:
             values = values_in_si(_taken(table, rows), layout, start, rows) if data is None else data[rows]
@@ -71,7 +71,7 @@ class LogSegments:
         self.rows += table.num_rows
 
     def trajectories(self) -> Iterator[Trajectory | LogError]:
-        """Yield each kept recording, or the error that its times have; no segments remain."""
+        """Yield each kept recording, or the error of its times, and remove its segments."""
         segments, self._segments = self._segments[::-1], []
         while segments:
             group = [segments.pop()]
@@ -89,7 +89,7 @@ class LogSegments:
                 yield error
 
     def _selected(self, pieces: list[Piece], row_bytes: int) -> list[Piece]:
-        """Return the pieces to keep of a table, after segments were left out so that all fit into the bound."""
+        """Return the pieces of a table to keep, after the removal of segments that exceed the bound of memory."""
         while True:
             kept = pieces[-self._count % self.every :: self.every]
             size = self._bytes + row_bytes * sum(len(rows) for _, _, rows in kept)
@@ -102,7 +102,7 @@ class LogSegments:
 
 
 def _taken(table: pa.Table, rows: np.ndarray) -> pa.Table:
-    """Return these rows (T,) of a table; without a copy if they lie together."""
+    """Return these rows (T,) of a table; without a copy if they are consecutive."""
     first, count = int(rows[0]), len(rows)
     return table.slice(first, count) if int(rows[-1]) - first + 1 == count else table.take(rows)
 
@@ -111,10 +111,10 @@ def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]
     """Return name and rows (T,) of each recording of a table, in order of their first rows."""
     if layout.labels is None:
         return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
-    # each label once: a name of a megabyte on a million rows is a small file
+    # each label once: names of a megabyte on a million rows compress to a small file
     labels = table[layout.labels].dictionary_encode("encode").combine_chunks()
     numbers = labels.indices.to_numpy()
-    # sorting keeps time and memory in proportion to the rows, however many recordings there are
+    # by sorting, time and memory are proportional to the rows for any number of recordings
     rows = np.argsort(numbers, kind="stable")
     ends = np.cumsum(np.bincount(numbers))
     return list(zip(map(str, labels.dictionary.to_pylist()), np.split(rows, ends[:-1]), strict=True))

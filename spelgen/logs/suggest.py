@@ -1,6 +1,6 @@
-"""Draft the mapping of a log that nobody has described, by the names and the first values of its columns.
+"""Draft of the mapping of an undescribed log, from the names and the first values of its columns.
 
-Units that neither names nor times state remain SI: the checks of logs find degrees, and state the lines to write.
+Units that neither names nor times specify remain SI: the checks of logs detect degrees, and state the lines to write.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ WORDS = {
     "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega"},
     "tau": {"tau", "torque", "torques", "effort", "efforts", "current", "currents", "curr", "cur", "moment", "load"},
 }  # fmt: skip
-# set points have the names of the measurements that they prescribe
+# set points have names similar to measurements
 COMMANDED = {
     "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
     "demand",
 }  # fmt: skip
 NOT_MEASURED = COMMANDED | {"error", "std"}
-# units in names, with their word in a mapping, per quantity that they imply
+# units in names, with their values in a mapping, per quantity
 UNITS = {
     "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "ns": "ns"},
     "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad",
@@ -42,19 +42,19 @@ UNITS = {
     "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "rpm": "rpm", "mm/s": "mm/s"},
     "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA"},
 }  # fmt: skip
-BARE = {"s", "n", "a", "m"}  # letters that are units in brackets only
+BARE = {"s", "n", "a", "m"}  # letters that count as units only in brackets
 CURRENT = {"current", "currents", "curr", "cur"}
 
 
 class Suggestion(NamedTuple):
-    """A mapping as YAML text, with comments on assumptions. missing: quantities that no column was found for."""
+    """A mapping as YAML text, with comments on assumptions. missing: quantities without a column."""
 
     text: str
     missing: tuple[str, ...]
 
 
 class ColumnName(NamedTuple):
-    """A column's name, with the words and the unit in it."""
+    """Name of a column, with its words and its unit."""
 
     name: str
     words: set[str]
@@ -62,7 +62,7 @@ class ColumnName(NamedTuple):
 
 
 def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False) -> Suggestion:
-    """Return a draft of the mapping of a file. commands: positions are commanded, and no velocities or torques read.
+    """Return a draft of the mapping of a file. commands: whether commanded positions are read, in place of torques.
 
     Raises LogError if the file cannot be opened, or has no column of times.
     """
@@ -79,7 +79,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     if not found["t"]:
         got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
         raise LogError(got, file=file, expected="one of times, called t or time")
-    # a column named header is the time of measurement, others may be times of receipt; else the shortest name
+    # a header has the time of measurement, other columns may be times of receipt; else the shortest name is used
     clock = min(found.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
     order = _order_in_cells(table, joints)
     by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in found.items()}
@@ -129,7 +129,7 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
 
 
 def _column_name(name: str) -> ColumnName:
-    """Return a name with its words and its unit, which is in brackets or the last word."""
+    """Return a name with its words and its unit; the unit is in brackets, or the last word."""
     bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d]+)[\])]", name)
     base, unit = bracketed.groups() if bracketed else (name, "")
     known = set().union(*UNITS.values())
@@ -143,7 +143,7 @@ def _column_name(name: str) -> ColumnName:
 def _by_quantity(
     columns: Sequence[ColumnName], commands: bool, joints: Sequence[str]
 ) -> dict[str, list[ColumnName]]:
-    """Return the columns of each quantity: by the words of their names, else by their units."""
+    """Return the columns per quantity: by the words of their names, or else by their units."""
     found: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
     names = {joint.lower() for joint in joints}
     for column in columns:
@@ -162,7 +162,7 @@ def _by_quantity(
 def _units(
     clock: ColumnName, by_joint: Mapping[str, Mapping[str, ColumnName]], table: pa.Table
 ) -> dict[str, str]:
-    """Return the units of times and quantities that names state, else the unit that fits the steps of times."""
+    """Return the units in the names of the columns; for times without one, the unit that fits their steps."""
     units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
     for quantity, named in by_joint.items():
         for column in named.values():
@@ -177,7 +177,7 @@ def _units(
 
 
 def _unit_of_times(name: str, table: pa.Table) -> str | None:
-    """Return the unit in which the median step of a column of times is one of a log."""
+    """Return the unit of a column of times in which its median step is plausible; None if there is none."""
     if name not in table.schema.names:
         return None
     times = table[name].drop_null()
@@ -188,7 +188,7 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
-    """Return the places of the joints that cells name: `name0` is elbow, or a list of names in each row."""
+    """Return the index per joint from cells with names of joints: a column `name0`, or a list of names per row."""
     order: dict[str, int] = {}
     for number, name in enumerate(table.schema.names):
         kind = table.schema.field(number).type
@@ -204,7 +204,7 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
 
 
 def _names(table: pa.Table) -> list[str]:
-    """Return the names of all columns, for columns of lists the names of their elements; no name that occurs twice."""
+    """Return the unique names of all columns, and of the elements of columns of lists."""
     names: list[str] = []
     for number, name in enumerate(table.column_names):
         if table.column_names.count(name) > 1:
@@ -220,7 +220,7 @@ def _names(table: pa.Table) -> list[str]:
 def _by_joint(
     columns: Sequence[ColumnName], joints: Sequence[str], order: Mapping[str, int]
 ) -> dict[str, ColumnName]:
-    """Return the column of each joint: by its name, else by the last number, in the URDF's order or the cells'."""
+    """Return the column per joint: by the joint's name, else by the last number, in the order of URDF or cells."""
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
     numbered: dict[int, ColumnName] = {}
     for column in columns:

@@ -1,4 +1,4 @@
-"""Results of every reader of logs: a table, and the columns of an arm's quantities in it."""
+"""Result of all readers of logs: a table, and its columns for the quantities of an arm."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from spelgen.errors import LogError, shortened
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
-UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # that a declared unit answers
-UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # declared in files of spelgen
+UNITS_KEY = b"units"  # key in the metadata of a Parquet file that declares its units
+UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # not checked for declared units
+UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # declaration in files of spelgen
 
 # Arrow, NumPy and zipfile raise all of these for damaged files
 UNREADABLE = (
@@ -32,9 +32,9 @@ UNREADABLE = (
 class Layout:
     """Columns of the quantities of an arm in a log, and their units.
 
-    file: named by errors and trajectories. columns: of t, then of q, qd and tau per joint; without qd if velocities
-    are differentiated. labels: the column that splits the log into recordings, None without. accepted: see
-    `Trajectory`. recording: its name, if the format separates recordings. remarks: facts about the file.
+    file: for errors and trajectories. columns: of t, then of q, qd and tau per joint; without qd if velocities are
+    differentiated. labels: the column with the names of recordings; None if there is none. accepted: see `Trajectory`.
+    recording: name of the recording if the format separates recordings. remarks: facts about the file.
     """
 
     file: Path
@@ -47,7 +47,7 @@ class Layout:
     remarks: tuple[str, ...] = ()
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about a column in a 0-based data row, with the line of a CSV, whose first is its header."""
+        """Return an error about a column in a data row, counted from 0, with the line of a CSV file."""
         line = int(row) + 2 if self.file.suffix == ".csv" else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
@@ -58,10 +58,11 @@ LogTable = tuple[Layout, pa.Table]
 
 @dataclass(frozen=True)
 class LogFormat:
-    """One format of logs: its files and its reader.
+    """A format of logs: its files and its reader.
 
-    read: from a path, the joints and the mapping to tables; raises LogError. suffixes: of its files. columns: from a
-    file to all its columns, of which `suggest` drafts a mapping; None if the format itself defines them.
+    read: function of a path, the joints and the mapping that returns tables, or raises LogError. suffixes: of its
+    files.
+    columns: function that returns all columns of a file, for a draft of a mapping; None if the format defines them.
     marker: a file in each folder that is a log of this format; folder: name of such a folder.
     """
 
@@ -78,7 +79,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     The mapping does not apply to files that spelgen wrote.
     """
     metadata = schema.metadata or {}
-    # simulated logs of an arm whose settings describe its real logger
+    # e.g. simulated logs of an arm whose settings are for the logger of the real arm
     if metadata.get(UNITS_KEY) == UNITS:
         mapping = mapping.in_si()
     columns = [mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))]
@@ -98,7 +99,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     if missing:
         raise missing_columns(missing, schema.names, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
-    # a list has no text that names a recording
+    # lists cannot be names of recordings
     if labels and pa.types.is_nested(schema.field(labels).type):
         kind = schema.field(labels).type
         raise LogError(f"values of type {kind}", file=file, element=f"column {labels}", expected="names")
@@ -111,7 +112,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
 
 
 def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
-    """Return the column of lists and the index that a name like `position[2]` means; None for other names."""
+    """Return the column of lists and the index for a name like `position[2]`; None for other names."""
     match = re.fullmatch(r"(.+)\[(\d{1,3})\]", name)
     if match is None or name in columns or match[1] not in columns:
         return None
@@ -119,7 +120,7 @@ def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
 
 
 def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
-    """Return the columns of a file that hold a layout's, each once."""
+    """Return the columns of a file that contain the columns of a layout, each once."""
     stored: dict[str, None] = {}
     for name in layout.columns:
         element = list_element(name, columns)
@@ -132,7 +133,7 @@ def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
 def missing_columns(
     missing: Sequence[str], columns: Collection[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> LogError:
-    """Return the error of missing columns, with its remedy."""
+    """Return the error for missing columns, with a remedy."""
     quantities, expected = mapping.quantities, [mapping.columns.t]
     for quantity in quantities:
         expected.append(getattr(mapping.columns, quantity).replace("{joint}", "<joint>"))
@@ -149,7 +150,7 @@ def missing_columns(
         )
     elif mapping.input == "torque" and _are_commands(columns, mapping, joints):
         do = "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
-    # the most frequent gap of loggers, and the only one with a remedy of its own
+    # loggers without velocities are frequent, and have their own remedy
     elif set(missing) <= set(of_quantity.get("qd", ())):
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
@@ -163,7 +164,7 @@ def missing_columns(
 
 
 def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequence[str]) -> bool:
-    """Whether a log has a command of each joint and no torque of any."""
+    """Return True if a log has commands of all joints and no torques."""
     commands = {mapping.column("u", joint) for joint in joints}
     torques = {mapping.column("tau", joint) for joint in joints}
     return commands <= set(columns) and torques.isdisjoint(columns)
@@ -172,7 +173,7 @@ def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequenc
 def _renaming(
     name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
 ) -> str:
-    """Offer a column in place of one that is missing: one that names the same joint and is no other quantity's."""
+    """Return the advice to rename an unused column of the same joint, or else to write the names in the settings."""
     joint, used = "", set(chain(*of_quantity.values()))
     for names in of_quantity.values():
         if name in names:
@@ -188,13 +189,13 @@ def _renaming(
 
 
 def names_joint(column: str, joint: str) -> bool:
-    """Whether a column's name holds a joint's as a word of its own: `q_1` holds 1, `q_12` does not."""
+    """Return True if a column's name contains a joint's name as a separate word: `q_1` has 1, `q_12` has not."""
     return re.search(rf"(?<![0-9a-z]){re.escape(joint)}(?![0-9a-z])", column, re.IGNORECASE) is not None
 
 
 @contextmanager
 def reading(file: Path) -> Iterator[None]:
-    """Convert exceptions of libraries for a damaged file to a LogError that names it."""
+    """Convert exceptions of libraries about a damaged file to a LogError with the file."""
     try:
         yield
     except UNREADABLE as error:

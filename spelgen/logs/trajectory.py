@@ -1,4 +1,4 @@
-"""One recording of an arm, for every step from log files to training samples."""
+"""A recording of an arm: the data between log files and training samples."""
 
 from __future__ import annotations
 
@@ -30,14 +30,15 @@ class Trajectory:
     t: (T,) sample times [s], strictly increasing, not necessarily regular.
     q, qd: (T, n) joint positions and velocities [rad, rad/s; m, m/s for prismatic joints].
     tau: (T, n) joint torques or forces [Nm; N]. In a simulated log tau[k] is constant from t[k] to t[k+1]; in a
-        measured one it is the torque measured at t[k]. (T, 0) if none was logged, with commands u.
-    u: (T, n) commanded positions [rad; m] of joints with servos, u[k] constant from t[k] to t[k+1]; None of others.
+        measured log it is the torque at t[k]. (T, 0) without torques, in logs of commands u.
+    u: (T, n) commanded positions of joints with servos [rad; m], u[k] constant from t[k] to t[k+1]; None without
+    servos.
     name: unique among the trajectories that are used together.
-    file: where it was read from, None if it was not.
-    accepted: codes of checks (see `spelgen.logs.checks`) that are not applied: their findings would be wrong.
-    repairs: changes of its rows when it was read; remarks: facts about them. mapping: how it was logged.
-    Raises LogError where shapes do not fit, a number is not finite or larger than any arm has, or times do not
-    increase.
+    file: source of the recording; None if it was not read from a file.
+    accepted: codes of checks (see `spelgen.logs.checks`) that are omitted.
+    repairs, remarks: changes of the rows at reading, and facts about them. mapping: columns and units of the log.
+    Raises LogError for inconsistent shapes, for numbers that are not finite or impossibly large, and for times that do
+    not increase.
     """
 
     t: np.ndarray
@@ -54,7 +55,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         for column in ("t", *self.quantities):
-            # frozen, and still from lists and tensors
+            # the dataclass is frozen, and accepts lists and tensors
             object.__setattr__(self, column, self._as_array(column))
         if self.t.ndim != 1 or not self.t.size:
             raise self.error(f"an array of shape {self.t.shape}", "(T,), a time for each sample", column="t")
@@ -67,7 +68,7 @@ class Trajectory:
         for column in ("t", *self.quantities):
             values = getattr(self, column)
             largest = TUNING.latest if column == "t" else TUNING.largest_value
-            possible = np.abs(values) < largest  # NaN is not
+            possible = np.abs(values) < largest  # False for NaN
             if not possible.all():
                 row = int(np.argwhere(~possible)[0, 0])
                 expected = (
@@ -84,7 +85,7 @@ class Trajectory:
         return len(self.t)
 
     def __getitem__(self, rows: slice) -> Trajectory:
-        """Return the same recording, only these rows."""
+        """Return the recording reduced to these rows."""
         u = None if self.u is None else self.u[rows]
         return replace(self, t=self.t[rows], q=self.q[rows], qd=self.qd[rows], tau=self.tau[rows], u=u)
 
@@ -95,18 +96,18 @@ class Trajectory:
 
     @property
     def duration(self) -> float:
-        """From the first sample to the last [s]."""
+        """Time from the first to the last sample [s]."""
         return float(self.t[-1] - self.t[0])
 
     @property
     def sample_rate(self) -> float:
-        """Samples per second outside gaps [Hz], from the mean step: the median of jittered steps is biased."""
+        """Sample rate outside gaps [Hz], from the mean time step; the median of jittered steps would be biased."""
         steps = self.regular_steps
         return float(1.0 / steps.mean()) if steps.size else 0.0
 
     @property
     def regular_steps(self) -> np.ndarray:
-        """Times (T,) [s] between samples, but gaps: a pause of a minute would halve the rate."""
+        """Times (T,) [s] between samples, without gaps, since a pause of a minute could halve the rate."""
         steps = np.diff(self.t)
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 
@@ -137,7 +138,7 @@ class Trajectory:
 
 
 def require_torques(trajectories: Sequence[Trajectory]) -> None:
-    """Raise LogError where no torques were logged."""
+    """Raise LogError for trajectories without torques."""
     for trajectory in trajectories:
         if trajectory.u is not None:
             do = "arms under position servos are fitted and judged by `train` and `evaluate`"
@@ -145,7 +146,7 @@ def require_torques(trajectories: Sequence[Trajectory]) -> None:
 
 
 def require_commands(trajectory: Trajectory) -> np.ndarray:
-    """Return its commanded positions, (T, n). Raises LogError where none were logged."""
+    """Return the commanded positions, (T, n). Raises LogError for a trajectory without commands."""
     if trajectory.u is None:
         raise trajectory.error("no commanded positions", "u: this arm has position servos")
     return trajectory.u
@@ -170,9 +171,12 @@ def require_joints(trajectory: Trajectory, joints: Sequence[str]) -> None:
 
 
 def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
-    """Return the first rows of the gap-free pieces of times (T,), and T. gap: in median steps; hole: shortest [s]."""
+    """Return the first rows of the gap-free pieces of times (T,), and T.
+
+    gap: shortest gap in median steps; hole: in [s].
+    """
     steps = np.diff(t)
-    # of ten thousand recordings hardly one has a gap, and a median takes longer than all else here
+    # few recordings have gaps, and the median takes most of the time
     if not steps.size or steps.max() <= gap * steps.min():
         return [0, len(t)]
     return [0, *(np.flatnonzero(steps > max(gap * np.median(steps), hole)) + 1).tolist(), len(t)]
@@ -181,7 +185,7 @@ def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
 def split_at_gaps(
     trajectory: Trajectory, gap: float = GAP, hole: float = 0.0, *, shortest: int = 1
 ) -> list[Trajectory]:
-    """Return the gap-free pieces of at least `shortest` samples, in order, all under the trajectory's name."""
+    """Return the gap-free pieces of at least `shortest` samples, in order; each has the name of the trajectory."""
     ends = gap_ends(trajectory.t, gap, hole)
     pieces = [trajectory]
     if len(ends) > 2:
@@ -195,7 +199,7 @@ def joined_column(trajectories: Sequence[Trajectory], name: str) -> np.ndarray:
 
 
 def set_aside(items: Sequence[T], numbers: np.ndarray) -> tuple[list[T], list[T]]:
-    """Return the items without these numbers (k,), and the items with them, in their order."""
+    """Return two lists: the items whose indices are not in `numbers` (k,), and the others, both in order."""
     remaining: list[T] = []
     chosen: list[T] = []
     chosen_numbers = set(numbers.tolist())
@@ -208,7 +212,7 @@ def set_aside(items: Sequence[T], numbers: np.ndarray) -> tuple[list[T], list[T]
 
 
 def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
-    """Return `seconds` of all logs; per joint `q` and `qd`: their range, and the samples in equal bins of it."""
+    """Return the total duration `seconds` and, per joint, the ranges of `q` and `qd` with histograms of samples."""
     result: dict[str, object] = {"seconds": _rounded(sum(log.duration for log in logs))}
     for name in ("q", "qd"):
         joints = []

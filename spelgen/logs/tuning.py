@@ -29,27 +29,27 @@ class LogTuning:
     local_jump: float = 4.0
     # [1] Samples on each side of an outlier that are its neighbours.
     jump_window: int = 8
-    # [1] Samples within which a signal that has left returns, if they are outliers; later it has jumped.
+    # [1] Largest number of samples of an outlier: a signal that returns later has jumped.
     excursion: int = 5
-    # [1] Fraction of steps that are jumps; a signal with more is noise.
+    # [1] Largest fraction of jumps among the steps; a signal with more is noisy.
     most_jumps: float = 0.05
-    # [1] Fraction of steps at which a signal around 0, and so the sign bit of its words, changes its sign at most.
+    # [1] Largest fraction of steps at which a signal about 0, and with it the sign bit of its words, changes its sign.
     most_words: float = 0.5
     # [1] Smallest step of words relative to the range of a signal: words of 18 bits.
     finest_word: float = 4e-6
-    # [1] Rounding of values on a grid, relative to its step.
+    # [1] Largest rounding error of values on a grid, relative to its step.
     word_rounding: float = 0.02
-    # [1] Noise of a wrapped angle beyond its period, relative to the period.
+    # [1] Largest excess of a wrapped angle over its period by noise, relative to the period.
     word_margin: float = 0.01
     # [rad/s, m/s] Largest velocity of an arm: a faster step is a jump.
     fastest: float = 40.0
     # [rad] Difference from one revolution within which a period is one revolution.
     limit_of_turn: float = 1e-6
-    # [1] Fraction of repeated rows that has no effect on a fit.
+    # [1] Fraction of repeated rows up to which they have no effect on a fit.
     repeats: float = 0.02
-    # [1] Rows of one time but different states that are an accident of a logger.
+    # [1] Number of rows with equal times and different values up to which they are accidental.
     few_repeats: int = 10
-    # [1] Fraction of such rows from which on the clock is too coarse.
+    # [1] Fraction of rows with equal times and different values above which the clock is too coarse.
     coarse_clock: float = 0.02
     # [1] A step longer than this multiple of the median step is a gap; jitter of USB loggers stays below 3.
     gap: float = 4.0
@@ -62,21 +62,21 @@ class LogTuning:
     clock_error: float = 0.002
     # [1] Order of the Butterworth low-pass, run forward and backward as in the logs' published protocols.
     filter_order: int = 4
-    # [1] Samples of a window per period of the cutoff; two is Nyquist's bound.
+    # [1] Smallest number of samples per period of the cutoff; Nyquist's bound is two.
     samples_per_period: int = 3
     # [s] Span of the cubic that differentiates encoder positions: a trade-off of noise and lag (SO-101).
     derivative_span: float = 0.18
     # [1] Largest first time of a clock that starts with the recording, in any unit of time; a larger one is a date.
     longest_clock: float = 1e8
-    # [1] Bars of a chart of the coverage of logs.
+    # [1] Number of bins of the histograms of coverage.
     bins: int = 24
-    # [B] Beginning of a CSV file from which encoding, delimiter and decimal point are detected.
+    # [B] Size of the head of a CSV file from which encoding, delimiter and decimal point are detected.
     csv_head: int = 2**16
-    # [1] Columns that a message lists: enough to see how they are named.
+    # [1] Largest number of columns in a message.
     listed: int = 5
-    # [s] Shortest time between samples: its fourth power is a floating-point number.
+    # [s] Shortest time between samples, so that its fourth power does not underflow.
     shortest_step: float = 1e-15
-    # [s] Largest time, for the same reason.
+    # [s] Largest time, so that its fourth power does not overflow.
     latest: float = 1e24
 
 
@@ -84,23 +84,22 @@ class LogTuning:
 class SignalCheckTuning:
     """Thresholds of the checks of the signals of a log."""
 
-    # [1] Samples over which q and the integral of qd are compared: quantisation is averaged out.
+    # [1] Number of samples over which q and the integral of qd are compared, to average out quantisation.
     increments: int = 10
-    # [rad, m] Motion according to qd from which on a constant q is called frozen.
+    # [rad, m] Integral of qd above which a constant q is frozen.
     drift: float = 0.05
-    # [1] Correlation from which on two signals are equal up to a factor; the factor may differ from 1 by the
-    # remainder.
+    # [1] Correlation from which on two signals are proportional; 1 minus it is the tolerance of a factor of 1.
     agreement: float = 0.9
-    # [1] A factor within this ratio of the factor of a unit is the factor of the unit.
+    # [1] Tolerance of the factor of a unit: its ratio to a measured factor is at most this number, or its inverse.
     unit_factor: float = 1.25
     # [s] Smallest and largest median time between samples: no arm is sampled above 10 kHz or below 2 Hz.
     fastest_step: float = 1e-4
     slowest_step: float = 0.5
-    # [1] Velocity of the rarer sign relative to the fastest one, below which it may be the magnitude of a velocity.
+    # [1] Largest velocity of the rarer sign, relative to the largest velocity, of a signal without sign.
     unsigned: float = 0.05
-    # [1] Correlation from which on a signal is the magnitude of dq/dt.
+    # [1] Smallest correlation of a velocity without sign with the magnitude of dq/dt.
     unsigned_agreement: float = 0.9
-    # [1] Remaining distance of commands from positions, relative to the former one, if words are decoded correctly.
+    # [1] Largest distance of decoded commands from positions, relative to the distance of undecoded ones.
     near_position: float = 0.3
 
 
@@ -114,7 +113,7 @@ class SampleTuning:
     moving: float = 0.02
     # [s] Shortest gap-free piece: shorter ones consist of filter transients.
     shortest_piece: float = 1.0
-    # [1] Periods of the filter's cutoff at both ends of a piece that are left out: the filter's error there is 20
+    # [1] Length of the transient at both ends of a piece, in periods of the cutoff; the filter's error there is 20
     # times the noise.
     unsettled: float = 0.75
 
@@ -123,7 +122,7 @@ class SampleTuning:
 class ServoRolloutTuning:
     """Integration of motion under position servos."""
 
-    # [s] Largest step; longer ones bias armatures by a few per cent (measured).
+    # [s] Largest integration step; longer ones bias armatures by a few per cent (measured).
     step: float = 3.4e-3
 
 
@@ -135,19 +134,19 @@ class ResonanceTuning:
     segment: float = 2.0
     # [1] Smallest number of segments of a recording.
     segments: int = 4
-    # [Hz] Band that is evaluated: below, gravity and friction prevail; links of arms resonate between 3 and 30 Hz.
+    # [Hz] Evaluated band: below, gravity and friction dominate; links of arms have resonances between 3 and 30 Hz.
     lowest: float = 0.9
     highest: float = 30.0
-    # [1] Logarithmic bands in it, and the smallest number of coherent bands.
+    # [1] Number of logarithmic bands in it, and the smallest number of coherent bands.
     bands: int = 25
     fewest_bands: int = 5
-    # [1] Squared coherence in phase, and power relative to the strongest band, of bands that count.
+    # [1] Smallest squared in-phase coherence of a band, and its smallest power relative to the strongest band.
     coherence: float = 0.85
     excited: float = 1e-3
-    # [1] Candidates of the resonance, up to this multiple of the highest excited frequency.
+    # [1] Number of candidate resonances, and their largest multiple of the highest excited frequency.
     candidates: int = 120
     beyond: float = 1.5
-    # [1] Relative error at least of the rigid, and at most of the elastic apparent inertia.
+    # [1] Smallest relative error of the rigid model, and largest one of the elastic model, of the apparent inertia.
     rigid_error: float = 0.1
     elastic_error: float = 0.06
     # [1] Smallest inertia of the link relative to the motor's.

@@ -1,4 +1,4 @@
-"""Turn columns as they were logged into numbers in SI units and the URDF's senses, or name the row without a number."""
+"""Conversion of logged columns to numbers in SI units with the URDF's signs; errors name rows without a number."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 
 
 def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows: Rows) -> np.ndarray:
-    """Return the columns of a layout (T, C) in SI units, times from `start` on. rows: of the table in its file.
+    """Return the columns of a layout (T, C) in SI units. start: time that becomes 0. rows: row numbers in the file.
 
-    Rows of another topic or publisher (see `foreign_rows`) contain NaN. Raises LogError naming row and column if a
-    value is no number, or none that an arm can have.
+    Rows of another topic or publisher (see `foreign_rows`) contain NaN. Raises LogError, with row and column, for
+    values that are not numbers, or beyond the range of any arm.
     """
     times, unit = _clock(table, layout)
     if start is not None:
-        # before they become floats: 1.7e18 ns keeps no microseconds as a double
+        # subtracted as integers: 1.7e18 ns as a double has no microseconds
         times = pa.compute.subtract(times, start)
     logged = [_floats(times, layout.columns[0], layout, rows)]
     for name in layout.columns[1:]:
@@ -40,7 +40,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
             logged[k] = signed(logged[k], sign_bit)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
     offsets = np.array([0.0, *starmap(mapping.offset, signals)])
-    # an overflow is reported below, with its row
+    # overflows are reported below, with their rows
     with np.errstate(over="ignore", invalid="ignore"):
         data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
     largest = np.full(data.shape[1], TUNING.largest_value)
@@ -65,19 +65,19 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 
 
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
-    """Return a mask (T,) of rows (T, C) of another topic or publisher: without values, or with positions only."""
+    """Return a mask (T,) of the rows of another topic or publisher: without values, or with positions only."""
     empty = np.isnan(data[:, 1 + joints :])
     return np.asarray(empty.all(axis=1))
 
 
 def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
-    """Return from where times count: the first one of a clock that shows the date, else None."""
+    """Return the origin of times: the first time if the clock shows the date, else None."""
     first_row = table.slice(0, 1)
     times, _ = _clock(first_row, layout)
     is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
     if pa.types.is_integer(times.type) or pa.types.is_floating(times.type):
         first = times[0].as_py()
-        # floating-point seconds since 1970 have too few digits
+        # seconds since 1970 as floating-point numbers have too few digits
         if first is not None and (is_stamp or TUNING.longest_clock < abs(first) < np.inf):
             return times[0]
     return None
@@ -105,7 +105,7 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
 
 
 def _column(table: pa.Table, name: str) -> Column:
-    """Return a column, or of a name like `position[2]` that element of each of its lists, written as text maybe."""
+    """Return a column, or for a name like `position[2]` this element of each of its lists; lists may be text."""
     element = list_element(name, table.schema.names)
     if element is None:
         return table.column(name)
@@ -114,7 +114,7 @@ def _column(table: pa.Table, name: str) -> Column:
     if is_text:
         bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[(]\s*|\s*[\])].*$", "")
         lists = pa.compute.split_pattern_regex(bare, r"[,;\s]+")
-    # Arrow raises for an index beyond a list, although a number is only missing
+    # a list that is too short has a missing number, for which Arrow would raise an error
     long_enough = pa.compute.greater(pa.compute.list_value_length(lists), index)
     lists = pa.compute.if_else(long_enough, lists, pa.scalar(None, lists.type))
     elements = pa.compute.list_element(lists, index)
@@ -124,11 +124,11 @@ def _column(table: pa.Table, name: str) -> Column:
 def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray:
     """Return a column as float64 (T,)."""
     try:
-        # integers beyond 2^53, times in nanoseconds, are rounded
+        # integers beyond 2^53, such as times in nanoseconds, are rounded
         floats = values.cast(pa.float64(), safe=not pa.types.is_integer(values.type))
         return np.asarray(floats.to_numpy(zero_copy_only=False))
     except (pa.ArrowException, ValueError) as error:
-        # Arrow does not state the row
+        # Arrow's error does not contain the row
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
         for index, text in enumerate(texts):
             if text and not is_number(text):
@@ -138,7 +138,7 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
 
 
 def is_number(text: str) -> bool:
-    """Whether a text is a number, as Python writes it."""
+    """Return True if a text is a number in Python's notation."""
     try:
         float(text)
     except ValueError:

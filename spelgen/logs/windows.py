@@ -1,4 +1,4 @@
-"""Cut gap-free trajectories into batched windows of a few samples, and split them into training and validation."""
+"""Windows of a few samples, cut from gap-free trajectories, and the split into training and validation."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Windows:
 
     dt: (W, K-1) steps between the samples [s].
     q, qd: (W, K, n) measured positions and velocities.
-    tau: (W, K-1, n) the input held over each step.
-    z: (W, n, B) [rad, m] states of friction's bristles at the first sample, from the motion before; None: not known.
+    tau: (W, K-1, n) the input, constant over each step.
+    z: (W, n, B) [rad, m] bristle states of friction at the first sample, from the history of motion; None: unknown.
     """
 
     dt: torch.Tensor
@@ -49,7 +49,7 @@ class Windows:
         return Windows(*(x.to(device) for x in self.columns()))
 
     def columns(self) -> list[torch.Tensor]:
-        """Return the tensors that are known."""
+        """Return the tensors that are not None."""
         columns = [self.dt, self.q, self.qd, self.tau]
         return columns if self.z is None else [*columns, self.z]
 
@@ -76,10 +76,10 @@ def cut_windows(
 ) -> Windows:
     """Return all windows of `window` samples, `decimation` apart, that start at every `stride`-th sample of a piece.
 
-    Between samples the input is held at its mean over time. measured: False reads tau[k] as held from t[k]
-    to t[k+1], as a simulator with zero-order hold applied it. True reads it as measured at t[k] and takes
-    the mean of both ends for a step; holding tau[k] would be half a sample late. reach: (n, B) of the bristles
-    whose states z are wanted, which begin straight with each piece. Raises LogError when there is no window.
+    The input of each step is its mean over time. measured: False: tau[k] is constant from t[k] to t[k+1], as in a
+    simulation with zero-order hold. True: tau[k] was measured at t[k], and the input of a step is the mean of both
+    ends; a constant tau[k] would have a delay of half a sample. reach: (n, B) break-away displacements of the bristles
+    whose states z are computed, zero at the start of each piece. Raises LogError if there is no window.
     """
     span = (window - 1) * decimation
     batches: list[Windows] = []
@@ -88,7 +88,7 @@ def cut_windows(
             tau = piece.tau[:-1]
             if measured:
                 tau = (tau + piece.tau[1:]) / 2
-            # sums of impulses: steps of a jittered clock differ
+            # means of impulses, since the steps of a jittered clock differ
             impulses = tau * np.diff(piece.t)[:, None]
             impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)  # (T - decimation, n)
             dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
@@ -104,14 +104,14 @@ def cut_windows(
 
 
 def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> torch.Tensor:
-    """(T, n) -> (W, window, n)."""
-    # torch takes no reversed views
+    """Return the windows (W, window, n) of values (T, n)."""
+    # torch does not accept reversed views
     windows = torch.tensor(np.ascontiguousarray(values)).unfold(0, (window - 1) * decimation + 1, stride)
     return windows[..., ::decimation].transpose(1, 2)
 
 
 class Split(NamedTuple):
-    """Training and validation pieces, which share no sample, and a note on their choice."""
+    """Training and validation pieces without common samples, and a note on their choice."""
 
     training: tuple[Trajectory, ...]
     validation: tuple[Trajectory, ...]
@@ -119,9 +119,9 @@ class Split(NamedTuple):
 
 
 def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: int) -> Split:
-    """Set whole trajectories aside for validation: `fraction` of them, at least one, chosen by the seed.
+    """Choose whole trajectories for validation: a `fraction` of them, at least one, at random by the seed.
 
-    A single trajectory is cut once in time, its last part validates.
+    A single trajectory is cut in time, and its last part is for validation.
     """
     total = len(trajectories)
     if total == 1:
@@ -135,7 +135,7 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
         note = Diagnostic("info", "validation-split", "logs", None, message)
         last = replace(trajectory[cut:], name=trajectory.name + LAST_PART)
         return Split((trajectory[:cut],), (last,), note)
-    # whole trajectories: neighbouring windows share samples, and would validate on training data
+    # whole trajectories, since neighbouring windows have common samples
     count = min(max(1, round(fraction * total)), total - 1)
     training, validation = set_aside(trajectories, np.random.default_rng(seed).permutation(total)[:count])
     names = ", ".join(x.name for x in validation) if count <= 3 else f"{count} of {total} trajectories"

@@ -54,8 +54,8 @@ class Panel:
 class JointRow:
     """One chart per joint.
 
-    axis: label of the y axis. quantity: position, velocity or torque, whose unit the y axis has; "": none. columns:
-    label, values (T, n) and style of each curve. height: without the numbers of the time axis [pixels].
+    axis: label of the y axis. quantity: position, velocity or torque, for the unit of the y axis; "": no unit.
+    columns: label, values (T, n) and style of each curve. height: without the numbers of the time axis [pixels].
     """
 
     title: str

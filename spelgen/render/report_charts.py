@@ -126,7 +126,7 @@ def friction_panels(
 
 
 def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
-    """Return a range for values (K,) without outliers, and for the model's curve (speeds,)."""
+    """Return the range of the y axis: of values (K,) without outliers, and of the model's curve (speeds,)."""
     values = values[np.isfinite(values)]
     if not values.size:
         return None

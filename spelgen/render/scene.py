@@ -45,7 +45,10 @@ class SceneLink:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Links, parents first; extent: sum of the lengths between joints [m]; tubes: sentence about links as tubes."""
+    """Links, parents first.
+
+    extent: sum of the lengths between joints [m]. tubes: sentence on links that are drawn as tubes.
+    """
 
     links: tuple[SceneLink, ...]
     extent: float

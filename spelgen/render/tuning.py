@@ -16,11 +16,11 @@ class RenderTuning:
     # [1] Baselines with an error beyond this multiple of the model's error are cut off, so that the others are
     # distinguishable.
     outlier: float = 100.0
-    # [1] Root mean square relative to the median from which on few starts dominate it; 1.5 for a normal distribution.
+    # [1] Ratio of root mean square to median above which a few starts dominate; a normal distribution has 1.5.
     dominated: float = 2.0
     # [1] Quantile of the measured friction that sets the axis: outliers are cut off.
     bulk: float = 0.995
-    # [1] An entry of M below this fraction of the largest entry is 0 with rounding.
+    # [1] An entry of M below this fraction of the largest entry is a rounding error.
     zero: float = 1e-9
     # [1] Faces of all links together, so that a page stays below 1 MB.
     faces: int = 4000

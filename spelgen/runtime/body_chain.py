@@ -20,8 +20,8 @@ class ChainConfiguration(NamedTuple):
     place: Tensor  # positions, (..., 3, bodies, 4)
     mass: Tensor  # square roots of the masses, (..., 1, bodies, 4)
     axes: Tensor  # twist of a body per rate of its own displacement, (..., 6, bodies)
-    jacobian: Tensor  # of the points with respect to the displacements of bodies, (..., bodies, 12 bodies)
-    weight: Tensor  # acceleration of the base that is equivalent to gravity, (..., 12 bodies)
+    jacobian: Tensor  # of the points, zero for bodies that a body does not carry, (..., bodies, 12 bodies)
+    weight: Tensor  # -gravity, the equivalent acceleration of the base, (..., 12 bodies)
 
 
 class BodyChain(nn.Module):
@@ -30,8 +30,8 @@ class BodyChain(nn.Module):
     Twists are (angular, linear) in the base frame (Featherstone, Rigid Body Dynamics Algorithms, 2008);
     frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). A body has the inertia of four
     points: the columns (position, 1) * sqrt(mass) of a root of its pseudo-inertia. Only the frames are
-    computed one body after the other; sums over carrying or carried bodies are products with a mask, which
-    takes the fewest operations.
+    computed one body after the other; sums over carrying or carried bodies are products with a mask,
+    since the number of operations determines the time for small arms.
     """
 
     def __init__(
@@ -50,17 +50,18 @@ class BodyChain(nn.Module):
         # displacements are ratios q + offset, (bodies, n) and (bodies,)
         self.ratios = nn.Buffer(vector(ratio).unsqueeze(-1) * torch.eye(n)[list(joint)])
         self.offset, self.turns = nn.Buffer(vector(offset)), nn.Buffer(turns)
-        # Rodrigues: rotation by x is 1 + sin x rate + (1 - cos x) rate^2; translation is 1 + x rate
+        # Rodrigues: a rotation by x is 1 + sin x rate + (1 - cos x) rate^2, a translation 1 + x rate
         start, rate = torch.eye(4).double().repeat(count, 1, 1), torch.zeros(count, 4, 4).double()
         start[:, :3] = torch.tensor(placement, dtype=torch.float64)
         rate[:, 1, 0], rate[:, 0, 1], rate[:, 2, 3] = turns, -turns, 1 - turns
         first, second = (start @ rate).flatten(1), (start @ rate @ rate).flatten(1)
         by_feature = [-second, turns.unsqueeze(-1) * first, (1 - turns).unsqueeze(-1) * first]
-        # from cos, sin and value of the displacements to the frames in parent frames, (16 bodies, 3 bodies)
+        # linear map from cos, sin and value of the displacements to the frames in parent frames,
+        # (16 bodies, 3 bodies)
         blocks = [torch.ops.aten.block_diag([*x.unsqueeze(-1)]) for x in by_feature]
         self.table = nn.Buffer(torch.cat(blocks, dim=1))
         self.fixed = nn.Buffer((start.flatten(1) + second).flatten())  # constant part
-        # from twists to the 3 x 4 matrices that map points to velocities, (6, 12)
+        # linear map from twists to 3 x 4 matrices, which map points to velocities, (6, 12)
         unit = torch.eye(3).double()
         skew = torch.linalg.cross(unit.unsqueeze(-1), unit.unsqueeze(0), dim=1)
         self.motions = nn.Buffer(
@@ -70,8 +71,9 @@ class BodyChain(nn.Module):
         for index, carrier in enumerate(parent):
             if carrier >= 0:
                 carriers[:, index] += carriers[:, carrier]
-        self.carriers = nn.Buffer(carriers)  # 1 if a body carries another or is the same, (bodies, bodies)
-        # the same for coordinates of the points, (bodies, 12 bodies)
+        # (bodies, bodies): 1 if the body of the row carries the body of the column, or is the same
+        self.carriers = nn.Buffer(carriers)
+        # the same mask for coordinates of the points, (bodies, 12 bodies)
         self.carried = nn.Buffer(carriers.repeat_interleave(4, dim=1).repeat(1, 3))
         # acceleration of the base that is equivalent to gravity, (3, 1, 1)
         self.base = nn.Buffer(-vector(gravity)[:, None, None])
@@ -100,7 +102,11 @@ class BodyChain(nn.Module):
         return ChainConfiguration(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, cache: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return velocities of points, (..., 3, bodies, 4), twists, and axis rates (Featherstone, 2.31)."""
+        """Return velocities of the points, twists and axis rates at qd, (..., n).
+
+        Velocities are (..., 3, bodies, 4), times the root masses. The twist of each body and the rate of
+        its axis are (..., 6, bodies) (Featherstone, 2.31).
+        """
         rates = qd @ self.ratios.mT
         # Sums over carrying bodies are products with masks.
         velocity = torch.unflatten(applied(cache.jacobian.mT, rates), -1, (3, -1, 4))
@@ -111,7 +117,7 @@ class BodyChain(nn.Module):
         return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
     def accelerations(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
-        """Return accelerations of the points at constant qd, gravity included, (..., 12 bodies)."""
+        """Return accelerations at constant qd, minus gravity, times the root masses, (..., 12 bodies)."""
         velocity, twists, turning = self.motion(cache, qd)
         steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
         w, (a, u) = twists[..., :3, :, None], steady.unsqueeze(-1).chunk(2, dim=-3)
@@ -124,7 +130,8 @@ class BodyChain(nn.Module):
         velocity, _, turning = self.motion(cache, qd)
         # Angular and linear momentum of the points about the origin of the base.
         momenta = [torch.linalg.cross(cache.place, velocity, dim=-3), cache.mass * velocity]
-        # momenta of all carried bodies, projected onto the axis of each body
+        # Momentum of all bodies that a body carries, projected onto the rate of its axis. The rotation of
+        # the points about the axis adds nothing: (a x v) . v = 0.
         carried = torch.cat(momenta, dim=-3).sum(dim=-1) @ self.carriers.mT
         return (turning * carried).sum(dim=-2) @ self.ratios
 

@@ -27,7 +27,7 @@ def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
     """Return C, (3 n, 3 n), lower triangular: C C^T is the nominal mean of M^-1 over all axes.
 
     ``mean`` is the lower triangle of the nominal mean of M without armature. A joint moves along z; its
-    inertia about the other axes is assumed to be the same.
+    inertia about the other axes is assumed to be equal.
     """
     n = len(joints)
     mass = torch.zeros(n, n, dtype=torch.float64)

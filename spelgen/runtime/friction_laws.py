@@ -22,7 +22,7 @@ SMOOTHING_VELOCITY = 0.006
 
 
 class FrictionConstants(NamedTuple):
-    """The constants of all joints, (n,), positive."""
+    """The constants of all joints, (n,); not negative, and zero for a joint without friction."""
 
     viscous: Tensor  # [Nm s/rad, N s/m]
     saturation: Tensor  # limit of the viscous friction that saturates [Nm, N]
@@ -30,7 +30,7 @@ class FrictionConstants(NamedTuple):
     coulomb: Tensor  # [Nm, N]
     stribeck: Tensor  # additional dry friction at low velocity [Nm, N]
     stribeck_velocity: Tensor  # [rad/s, m/s]
-    load_dependence: Tensor  # dry friction per gravity torque [1]
+    load_dependence: Tensor  # dry friction per magnitude of the gravity torque [1]
     stribeck_rounding: Tensor  # relative to the Stribeck velocity [1]
     coulomb_smoothing_velocity: Tensor  # of dry friction without bristles [rad/s, m/s]
     min_load: Tensor  # [Nm, N]
@@ -84,18 +84,19 @@ class FrictionConstants(NamedTuple):
 
 
 class FrictionLaws(nn.Module):
-    """A friction torque that opposes the motion for all parameters, which are logarithms:
+    """Friction that dissipates energy for all parameters (logarithms; of bristle fractions, logits):
 
     viscous qd + saturation s(qd, saturation_velocity)
     + (coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + load_dependence load) direction, with
     v = |qd| / stribeck_velocity, r the rounding, load = sqrt(gravity torque^2 + min_load^2) and
     s(x, width) = x / sqrt(x^2 + width^2).
 
-    The direction, from -1 to 1, is sum_k fraction_k z_k / breakaway_k over the bristles of a joint; at joints
-    without bristles, or if z is unknown, s(qd, coulomb_smoothing_velocity). There is no exponential, so that
-    a control loop takes a third of the time. For large r the Stribeck term is close to the Gaussian of
-    Armstrong-Helouvry (Control of Machines with Friction, 1991); for small r, to the exponential of Bo and
-    Pavelescu (Wear 82:277, 1982), without its corner at rest.
+    The direction, from -1 to 1, is sum_k fraction_k z_k / breakaway_k over the bristles of a joint, which
+    may return elastic energy; at joints without bristles, or if z is unknown, it is s(qd,
+    coulomb_smoothing_velocity). There is no exponential, so that a control loop takes a third of the
+    time. For large r the Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of
+    Machines with Friction, 1991); for small r, to the exponential of Bo and Pavelescu (Wear 82:277,
+    1982), without its corner at rest.
 
     Bristles are K elements per joint, elastic up to a break-away displacement and sliding beyond; z is
     (..., n, K) [rad, m] (Maxwell-slip elements: Lampaert, Al-Bender and Swevers, A Generalized Maxwell-Slip
@@ -103,7 +104,8 @@ class FrictionLaws(nn.Module):
     joint that stiction holds does not creep under an oscillating load.
     """
 
-    # parameter, group, unit, and the constant at zero, in units of typical friction and typical speed
+    # parameter, group, unit, and the constant for a parameter of zero, in units of typical friction and
+    # speed
     parameter_groups: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "effects", "Nm, N", 1.0),
@@ -118,13 +120,16 @@ class FrictionLaws(nn.Module):
     def __init__(
         self, joints: Sequence[Joint], *, breakaway: Mapping[str, Row], stribeck_rounding: float = 10.0
     ) -> None:
-        """Take the break-away displacements, (K,) [rad, m], of each type of joint, shortest first."""
+        """Set all parameters to zero.
+
+        breakaway: break-away displacements, (K,) [rad, m], by type of joint, shortest first.
+        """
         super().__init__()
         self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
         self.speed = nn.Buffer(vector(joint.speed for joint in joints))
         rows = [breakaway[joint.joint_type] for joint in joints]
         self.reach = nn.Buffer(torch.tensor(rows, dtype=torch.float64))  # break-away displacements, (n, K)
-        # a buffer: a fit to torques compares both forms
+        # a buffer, since a fit to torques chooses the form of each joint
         self.memoryless = nn.Buffer(torch.zeros_like(self.speed))
         self.stribeck_rounding = nn.Buffer(torch.full_like(self.speed, stribeck_rounding))
         for name, *_ in FrictionLaws.parameter_groups[:-1]:

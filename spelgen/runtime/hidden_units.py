@@ -1,4 +1,4 @@
-"""The joints that each unit of a network may depend on, so that no output depends on others than its own."""
+"""The joints that each unit of a network may depend on: each output depends only on its own joints."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def joint_masks(
         outputs: names of the joints that each output depends on.
         width: units of a hidden layer.
         depth: number of hidden layers.
-        min_units: least units for outputs that depend on the same joints.
+        min_units: smallest number of units for outputs that depend on the same joints.
     """
     number = {joint.name: index for index, joint in enumerate(joints)}
     numbers = [tuple(number[name] for name in names) for names in outputs]

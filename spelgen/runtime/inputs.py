@@ -51,7 +51,7 @@ class MotorInputs(nn.Module):
         return applied(self.gains(), tau)
 
     def torque(self, force: Tensor) -> Tensor:
-        """Return the inputs, (..., n), that give this force; of a passive joint, the torque that it lacks."""
+        """Return the inputs, (..., n), for this force; at a passive joint, the force required there."""
         matrix = self.gains() + torch.diag(self.passive)
         tau: Tensor = torch.linalg.solve(matrix, force.unsqueeze(-1))
         return tau.squeeze(-1)

@@ -38,7 +38,7 @@ class MaskedKAN(nn.Module):
         scales: a row (n,) of factors for each input per joint: cos q or the scaled q, sin q, and others.
         outputs: names of the joints that each output depends on; no unit has a path to another joint.
         width, depth: units of a hidden layer, and number of hidden layers.
-        min_units: least units of a hidden layer for outputs that depend on the same joints.
+        min_units: smallest number of units of a hidden layer for outputs that depend on the same joints.
     """
 
     def __init__(

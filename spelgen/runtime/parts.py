@@ -75,7 +75,7 @@ class Inputs(Protocol):
 
 
 def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
-    """Return the symmetric matrix, (..., n, n), of the rows of its lower triangle: (...) or numbers."""
+    """Return the symmetric matrix, (..., n, n), from its lower triangle: rows of tensors (...) or numbers."""
     n = len(rows)
     entries = [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)]
     like = next(entry for entry in entries if isinstance(entry, Tensor))

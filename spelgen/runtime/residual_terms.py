@@ -21,7 +21,7 @@ SPLINES = 34
 HARMONICS = 64
 # Bound of the logarithm of the friction factor: the factor stays between 0.1 and 10.
 LARGEST = math.log(10.0)
-# Fraction of the armature that the residual of M may subtract at most.
+# Largest fraction of the armature that the residual of M may subtract.
 PART = 0.9
 # Bound of a function in an entry of M that does not contain it.
 NEVER = 1e30
@@ -171,7 +171,7 @@ class ResidualTerms(nn.Module):
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, cache: ResidualConfiguration) -> Tensor:
-        """Return the residual of V, (...) [J]; each spline is zero in its middle."""
+        """Return the residual of V, (...) [J]; the energy of each spline is zero in its middle."""
         distance = self._distances(cache.q)
         size = distance.abs()
         # integral of the B-spline from its middle

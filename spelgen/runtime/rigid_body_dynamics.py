@@ -33,7 +33,7 @@ class RigidConfiguration(NamedTuple):
     mass: Tensor  # M(q), (..., n, n)
     gravity: Tensor  # dV/dq of the bodies, (..., n)
     prepared: RigidParameters
-    varied: Tensor | float = 1.0  # factor on friction, (..., n)
+    varied: Tensor | float = 1.0  # factor of the residual terms on friction, (..., n)
     residual: Configuration = None  # configuration cache of the residual terms
 
 
@@ -74,9 +74,10 @@ class RigidBodyDynamics(PortHamiltonian):
         # 1 for a joint that an input drives, (n,)
         self.actuated = nn.Buffer(self.input_matrix(self.nominal_armature).any(dim=0).double())
         self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))  # logarithm of the ratio to nominal
-        # of the measured torque, in units of typical friction
+        # offset of the measured torque, in units of typical friction
         self.raw_offset = nn.Parameter(torch.zeros_like(self.actuated))
-        # in units of typical friction per typical speed; a buffer: only a fit to torques may set it
+        # friction compensation, in units of typical friction per typical speed; a buffer, which only a
+        # fit to torques sets
         self.raw_friction_compensation = nn.Buffer(torch.zeros_like(self.actuated))
         motors = None if motor_speeds is None else torch.stack([vector(row) for row in motor_speeds])
         self.register_buffer("motors", motors)  # C, (n, n), and its inverse
@@ -183,7 +184,7 @@ class RigidBodyDynamics(PortHamiltonian):
     def memory(self, qd: Tensor) -> Tensor:
         """Return the state z, (..., n, K), of drives that have moved at qd for a long time.
 
-        Near the smoothing velocity friction is up to 7.4 % larger than without z, far above it the same.
+        Near the smoothing velocity friction is up to 7.4 % larger than without z, far above it equal.
         """
         # tanh reaches its limit within a few widths: an algebraic sign would be a stiff transient
         direction = (self._motor(qd) / self.friction.prepare().coulomb_smoothing_velocity).tanh()

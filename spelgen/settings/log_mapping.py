@@ -1,8 +1,7 @@
 """Names, units and signs of logged columns: the group `logs` of a settings file, or a separate mapping file.
 
 q = sign * unit * value + offset, and so is u, a commanded position; qd = sign * unit * value,
-tau = sign * gain * unit * value + torque_offset. Before that, words of a register become values by `sign_bit` and
-`period`.
+tau = sign * gain * unit * value + torque_offset. Register words are decoded before by `sign_bit` and `period`.
 """
 
 from __future__ import annotations
@@ -115,7 +114,7 @@ class LogUnits(JointUnits):
 
 
 class JointWords(Group):
-    """Sizes of the register words of one joint, in logged units; default: its values are not words of a register.
+    """Period or sign bit of the register words of one joint, in logged units; default: the values are plain numbers.
 
     Attributes:
         q: Position.
@@ -280,7 +279,7 @@ class LogMapping(Group):
         return self.model_copy(update={"joints": changed})
 
     def in_si(self) -> LogMapping:
-        """Return the mapping of a file in SI units with plain names: of this one only input and turns remain."""
+        """Return the mapping of a file in SI units with default names; only input and periods of one turn are kept."""
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 

@@ -39,7 +39,7 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
         raise SpelgenError(
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
-    arm_dynamics(arm.chain, arm.settings)  # complains of missing inertials under the name of the user's file
+    arm_dynamics(arm.chain, arm.settings)  # reports missing inertials with the name of the user's file
     settings, sidecar = _settings(arm, seed), path.with_suffix(".yaml")
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
     # magnitudes of friction and armature follow from the perturbed rigid bodies, without drives

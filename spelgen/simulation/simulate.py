@@ -127,7 +127,7 @@ def simulate(
 def _controlled(settings: Settings) -> Settings:
     """Return the settings with the defaults of a controlled arm if no protocol and no inputs are set.
 
-    Under random torques an arm that nobody tuned them for would fall.
+    Under random torques that are not tuned for an arm, the arm would fall.
     """
     simulation, tracking = settings.simulation, settings.tracking
     if settings.input == "position":

@@ -207,7 +207,7 @@ class Spans:
 
     @cached_property
     def _pivots(self) -> list[int]:
-        """Entries of M that are the coordinates in the basis of U: these columns of the basis are the identity."""
+        """Pivot entries of M, whose changes are the coordinates in the basis of U."""
         return [self.order[pivot] for pivot in field.pivots(self.varying[:, self.order])]
 
     @cached_property
@@ -217,7 +217,7 @@ class Spans:
 
     @cached_property
     def _nearer_root(self) -> list[np.ndarray]:
-        """For each joint, a basis (m, dim U) of the changes of M with the joints before it."""
+        """For each joint, a basis (m, dim U) of the changes of M with earlier joints, in the basis of U."""
         bases = [self._coordinates[0][:0]]
         for rows in self._coordinates[:-1]:
             bases.append(field.row_basis(np.concatenate([bases[-1], rows])))
@@ -225,7 +225,7 @@ class Spans:
 
     @cached_property
     def _nearer_tip(self) -> list[np.ndarray]:
-        """For each joint, a basis (m, dim U) of the changes of M with the joints after it."""
+        """For each joint, a basis (m, dim U) of the changes of M with later joints, in the basis of U."""
         bases = [self._coordinates[0][:0]]
         for rows in reversed(self._coordinates[1:]):
             bases.insert(0, field.row_basis(np.concatenate([bases[0], rows])))

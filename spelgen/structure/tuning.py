@@ -16,8 +16,8 @@ class StructureTuning:
     spare_samples: int = 4
     # [1] A smaller singular value, relative to the largest, is a rounding error.
     zero_singular_value: float = 1e-9
-    # [1] Components of null vectors with a smaller difference are equal; their errors are a thousand times larger than
-    # the errors of the matrix.
+    # [1] Difference below which components of null vectors count as equal; their errors are a thousand times larger
+    # than the errors of the matrix.
     equal_components: float = 1e-6
     # [1] Random configurations of the workspace over which magnitudes are averaged.
     points: int = 512

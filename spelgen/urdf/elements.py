@@ -114,7 +114,8 @@ def read_joint(notes: Notes, element: etree._Element) -> UrdfJoint | None:
     parent = _read_end(notes, element, "parent", where)
     child = _read_end(notes, element, "child", where)
     xyz, rpy = _read_origin(notes, element, where)
-    motion = notes if kind in MOVING else Notes(notes.path)  # a fixed joint needs none of it
+    # motion attributes of a fixed joint have no meaning: their errors are discarded
+    motion = notes if kind in MOVING else Notes(notes.path)
     axis = _read_axis(motion, element, kind, where)
     limits = _read_limit(motion, element, kind, where)
     damping, friction = _read_dynamics(motion, element, where)
@@ -167,7 +168,7 @@ def _read_limit(notes: Notes, element: etree._Element, kind: str | None, where: 
     if limit is None:
         return _NO_LIMITS
     where = f"{where} limit"
-    # exporters write 0 for an effort or a velocity that nobody stated
+    # exporters write 0 for an unknown effort or velocity
     effort, velocity = (read_limit(notes, limit, key, where) or None for key in ("effort", "velocity"))
     if kind == "continuous":
         # lower and upper of a continuous joint have no meaning

@@ -50,7 +50,7 @@ def read_urdf(path: Path) -> Robot:
     transmissions = []
     for element in root.findall("transmission"):
         transmissions.append(read_transmission(notes, element, joint_names))
-    # only if all joints could be read, because links of unread joints appear as roots
+    # only if all joints could be read, because the child links of unread joints would count as roots
     tops: list[str] = []
     if not notes.errors:
         tops = _check_tree(notes, root, links, joints)

@@ -11,7 +11,7 @@ class MeshTuning:
 
     # [bytes] Memory of the process that reads meshes.
     mesh_memory: int = 2**30
-    # [s] Processor time of this process: imports and the simplification of fine meshes take most of it.
+    # [s] Processor time of the process that reads meshes: imports and the simplification of meshes take most of it.
     mesh_seconds: int = 30
     # [bytes] Largest file with a mesh.
     max_mesh_bytes: int = 50_000_000

@@ -56,10 +56,10 @@ class FitStage(NamedTuple):
 class TorqueSolution:
     """Result of a fit.
 
-    rms_residual: (n,) root mean square torque residual [Nm, N]. steps, cost: of the solver, at the end. prior: standard
-    deviations as estimated. covariance, torque_std: see `ParameterCovariance`. compensated: (n,) joints whose drives
-    compensate friction. correlation_time: (n,) of the torque errors [s]. held_out_nmse: (n,) mean squared error of
-    held-out segments, divided by the variance of the torque. selected_terms: residual terms. stages: in order.
+    rms_residual: (n,) root mean square torque residual [Nm, N]. steps, cost: of the solver, at the end. prior: its
+    estimated standard deviations. covariance, torque_std: see `ParameterCovariance`. compensated: (n,) joints whose
+    drives compensate friction. correlation_time: (n,) of the torque errors [s]. held_out_nmse: (n,) mean squared error
+    of held-out segments, divided by the variance of the torque. selected_terms: residual terms. stages: in order.
     """
 
     rms_residual: np.ndarray

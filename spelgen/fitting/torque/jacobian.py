@@ -10,10 +10,9 @@ import torch
 from torch.autograd import grad as gradient
 
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.dynamics.parameters import friction_factor, residual_torque
+from spelgen.dynamics.parameters import NamedTensors, evaluate_with, friction_factor, residual_torque
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.functional_model import NamedTensors, evaluate_with
 from spelgen.fitting.torque import linearization
 from spelgen.fitting.torque.linearization import (
     NO_TERMS,
@@ -33,8 +32,9 @@ LOGARITHMIC_GROUPS = ("armature", "sizes", "effects", "load_dependence")
 class _RegressorBlock(NamedTuple):
     """T samples with all factors of the torque that do not depend on the parameters.
 
-    speed, acceleration: (T, n) of the drives. regressor: (T, n, 10 B) of the torque; load_regressor: likewise of the
-    gravity torque on the drives. residual_torque: (T, n) of the residual terms. friction_factor: (T, n), theirs.
+    speed, acceleration: (T, n) of the drives. regressor: (T, n, 10 B) of the joint torque. load_regressor: (T, n, 10
+    B) of the gravity torque on the drives. residual_torque, friction_factor: (T, n), torque of the residual terms and
+    their factor on friction.
     """
 
     samples: SampleBlock
@@ -59,9 +59,11 @@ class ResidualSamples(NamedTuple):
 class TorqueJacobian:
     """Torque residual of a model on samples, and its derivatives with respect to all rigid parameters x (K,).
 
-    The torque is Y(q, qd, qdd) theta + C^T (friction + armature a), with the inertial parameters theta of B bodies, the
-    speeds C qd of the drives and their accelerations a. The residual terms of the model are constant, those of the
-    moment when this object is created; `terms` are eliminated by variable projection in addition.
+    The modelled joint torque is Y(q, qd, qdd) theta + C^T (friction + armature a), plus the torque of the residual
+    terms, with the inertial parameters theta of B bodies, and the speeds C qd and accelerations a of the drives. The
+    residual is the measured minus the modelled torque. The residual terms of the model are constant: they are
+    evaluated when this object is created. `terms` are linear terms in addition, which are eliminated by variable
+    projection.
     """
 
     def __init__(
@@ -111,7 +113,10 @@ class TorqueJacobian:
         return ones
 
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return J^T W J (K, K) and J^T W r (K,) of the torque residual r, with W = 1 / noise^2, noise (n,)."""
+        """Return J^T W J (K, K) and J^T W r (K,) for W = 1 / noise^2, noise (n,).
+
+        J is the Jacobian of the modelled torque, r the torque residual: the second result is the negative gradient.
+        """
         rows: Iterable[JointRows] = self.joint_rows(x)
         if self.terms:
             rows = self._projected(rows)
@@ -268,8 +273,8 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
         """Return the residual of the logged torque (T, n), and minus its Jacobian, compressed over joints.
 
-        Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive have
-        one colour, so that each parameter affects at most one joint of a colour. The gradient of the sum of their
+        Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive get
+        the same colour, so that each parameter affects at most one joint of a colour. The gradient of the sum of their
         torques then has the rows of all of them, and there are as many reverse passes as colours, mostly one, instead
         of n. Each sample has its own copy of the parameters: one pass has the gradients of all samples.
 

@@ -14,7 +14,7 @@ from spelgen.fitting.torque.tuning import SELECTION, TUNING
 
 
 class JointRows(NamedTuple):
-    """Jacobian rows of one joint's torque: residual(x + s) = residual - jacobian @ s[columns].
+    """Jacobian rows of one joint's torque: residual(theta + s) = residual - jacobian @ s[columns].
 
     columns: (C,) parameters on which this torque depends. jacobian: (T, C). residual: (T,) [Nm, N].
     """

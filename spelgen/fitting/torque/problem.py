@@ -145,7 +145,7 @@ class TorqueProblem:
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
-        # iterated: the noise is the weight of the joints, whose torques have common parameters
+        # iterated: the solution depends on the noise, which weights the joints, and the noise on the solution
         for _ in range(TUNING.final_iterations):
             noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
         return replace(self, noise=noise)
@@ -209,7 +209,11 @@ class TorqueProblem:
 
 @dataclass(frozen=True, eq=False)
 class TorqueEstimate:
-    """MAP estimate: the problem with its noise and prior, the solver's state, and the posterior covariance (K, K)."""
+    """MAP estimate: the problem with its noise and prior, and the solver's last state.
+
+    covariance: (K, K), posterior covariance of x. After `alternate` it is the one under the noise and prior before
+    their last update; `with_current_covariance` recomputes it. termination: of the last call of the solver.
+    """
 
     problem: TorqueProblem
     state: State
@@ -253,7 +257,8 @@ def alternate(problem: TorqueProblem, state: State, iterations: int) -> TorqueEs
     Args:
         problem: with initial noise and prior.
         state: first iterate.
-        iterations: number of outer iterations; more, up to a multiple, follow while the noise of a joint decreases.
+        iterations: number of outer iterations. While the noise of any joint decreases they continue, up to
+            `TUNING.max_extension` times this number.
     """
     for number in range(TUNING.max_extension * iterations):
         result = problem.minimize(state, TUNING.iteration_steps)
@@ -267,7 +272,7 @@ def alternate(problem: TorqueProblem, state: State, iterations: int) -> TorqueEs
 def refine(
     estimate: TorqueEstimate, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
 ) -> TorqueEstimate:
-    """Return the estimate for other samples or residual terms, with the former one as warm start."""
+    """Return the estimate refitted to other samples or residual terms, with the given one as warm start."""
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
     noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
     return alternate(replace(estimate.problem, noise=noise), estimate.state, TUNING.final_iterations)

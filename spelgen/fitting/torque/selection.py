@@ -46,13 +46,13 @@ class SelectedTerm:
 
 
 def can_split(count: int, correlation_length: float) -> bool:
-    """Return whether the halves of `count` samples are longer than the gap between them."""
+    """Return True if the halves of `count` samples are longer than the gap between them."""
     first, last = split_halves(count, correlation_length)
     return bool(last.start - first.stop <= first.stop)
 
 
 def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
-    """Return the first half of the samples, without a gap before the last half, and the last half."""
+    """Return the first half of the samples, less the gap before the held-out samples, and the last half."""
     middle = count // 2
     return slice(0, max(0, middle - _gap(correlation_length))), slice(middle, count)
 

@@ -28,9 +28,9 @@ class TorqueTuning:
     # [s] Prior mean of the correlation time of torque errors: errors of recorded arms. The samples within it count as
     # one independent error.
     correlation_time: float = 0.2
-    # [s] The same for the comparison of friction models, which differ at reversals.
+    # [s] Correlation time of torque errors for the comparison of friction models, which differ at reversals.
     reversal_correlation_time: float = 0.1
-    # [1] Weight of this prior mean, as a number of independent errors.
+    # [1] Weight of the prior mean of the correlation time, as a number of independent errors.
     correlation_weight: float = 30.0
     # [s] Segments from which the correlation time is estimated.
     segment: float = 1.0
@@ -105,10 +105,11 @@ class TorqueTuning:
     weak_acceleration: float = 2.0
     # [1] Positions at which inertias are evaluated.
     report_positions: int = 50
-    # [1] Priors about the run that is adapted, by what is adapted. load: mass known to a factor of twenty (with 10 in
-    # place of 3 half a second of motion has an error of 27 times the variance of the torque, UR10e). friction: warmth
-    # changes the friction of all joints by tens of per cent, of a single joint less (Bittencourt and Gunnarsson, J.
-    # Dyn. Sys. Meas. Control 134:051013, 2012). unit: units of one make also differ by a few per cent in mass.
+    # [1] Prior standard deviations of an adapted fit, about the parameters of its source, by adapted part. load: mass
+    # known to a factor of twenty (with 10 in place of 3 half a second of motion has an error of 27 times the variance
+    # of the torque, UR10e). friction: warmth changes the friction of all joints by tens of per cent, of a single joint
+    # less (Bittencourt and Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: units of one make also
+    # differ by a few per cent in mass.
     priors: Mapping[Adaptation, GaussianPrior] = field(
         default_factory=lambda: {
             "load": GaussianPrior(bodies=3.0),
@@ -129,7 +130,7 @@ class ResidualTuning:
     # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
     # degrees of freedom.
     standard_errors: float = 2.82
-    # [1] The same for samples of one recording, whose motion may repeat errors: p = 0.001.
+    # [1] Standard errors for samples of one recording, whose motion may repeat errors: p = 0.001.
     standard_errors_of_one: float = 4.30
     # [1] Largest torque of position that one recording supports, as a fraction of the joint's torque.
     max_torque_fraction: float = 0.5
