@@ -192,9 +192,9 @@ def find_levels(
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
     """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
 
-    The logs are without payload: each estimate is an error. Windows of blocks in a row are independent trials. The squared
-    estimates relative to their covariance, of the mass, and of mass and first moments, are averaged together with the
-    prior, and the largest average counts: errors of the model average out slowly, so that longer windows may be worse.
+    The logs are without payload: each estimate is an error. Windows of blocks in a row are independent trials. The
+    squared normalised estimates of the mass, and of mass and first moments, are averaged together with the prior. The
+    largest average counts: errors of the model average out slowly, so that longer windows may be worse.
     """
     factors = []
     for window in TUNING.trial_blocks:
