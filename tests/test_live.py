@@ -123,7 +123,7 @@ def test_the_jacobian_is_the_velocity_of_the_tip(arm):
     tip = tip_frame(robot)
     assert tip.carrier == len(robot.chain.bodies) - 1
     q, qd = numbers(log.q[::400], log.qd[::400])
-    jacobian = load_terms(model, q, qd, torch.from_numpy(tip.pose[:3, 3].copy()))[2]
+    jacobian = load_terms(model.chain, q, qd, torch.from_numpy(tip.pose[:3, 3].copy()))[2]
     expected = tip_kinematics(robot).jacobian(q)[:, :3]
     assert (jacobian - expected).abs().max() < 1e-5
 
@@ -185,7 +185,7 @@ def test_a_changed_load_is_found_and_a_contact_is_none(arm, levels, run):
 def test_contacts_are_found_at_their_joint_with_their_force(arm, levels, run):
     """A force of 40 N at the tip for half a second."""
     model, log, _ = arm
-    jacobian = load_terms(model, *numbers(log.q, log.qd, levels.point))[2].numpy()
+    jacobian = load_terms(model.chain, *numbers(log.q, log.qd, levels.point))[2].numpy()
     force = np.array([0.0, 30.0, -27.0])
     torque = np.einsum("tij,i->tj", jacobian, force)
     begin, end = 7.0, 7.5
