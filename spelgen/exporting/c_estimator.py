@@ -11,7 +11,7 @@ import numpy as np
 from spelgen.exporting.c_source import CFunction, c_function
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.estimator_expressions import ENTRIES, estimator_functions
-from spelgen.live.noise import TAIL, NoiseLevels
+from spelgen.live.noise import NoiseLevels
 from spelgen.live.tuning import TUNING
 from spelgen.templates import render
 
@@ -55,7 +55,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "n": model.n,
         "tuning": TUNING,
         "supported": f"{levels.supported_alarms:.2g} per minute",
-        "windows": repr(60 / TUNING.window * TAIL * model.n),
+        "windows": repr(levels.tail_peaks),
         "evidence": repr(TUNING.evidence),
         "quantile": repr(levels.load_quantile),
         "iterations": TUNING.iterations,

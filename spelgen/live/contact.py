@@ -24,20 +24,19 @@ class ContactState(NamedTuple):
 class ContactObserver:
     """First-order low-pass filter of the momentum balance, updated with each sample.
 
-    Each low-passed term is a state, (15, n): torque, friction, its uncertainty, the momenta of the arm at two
-    bandwidths, and the regressor of the payload.
+    low: each low-passed term is a state, (15, n): torque, friction, its uncertainty, the momenta of the arm at two
+    bandwidths, and the regressor of the payload. baseline: disturbance that is no external torque, (n,) [Nm, N].
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
-        self.levels, self.factor = levels, levels.thresholds(alarms_per_minute)
+        self.levels, self.alarms_per_minute = levels, alarms_per_minute
         self.restart()
 
     def restart(self) -> None:
         """Discard the filter states; the next sample initialises them."""
         self.t: float | None = None
-        self.inputs = self.low = np.zeros((15, len(self.factor)))
-        self.baseline = np.zeros_like(self.factor)
-        self.touched = self.factor < 0
+        self.inputs = self.low = np.zeros((15, len(self.levels.speed)))
+        self.touched = np.zeros(len(self.levels.speed), dtype=bool)
 
     def step(
         self, t: float, qd: np.ndarray, at: Balance, payload: Payload, drift: np.ndarray
@@ -48,7 +47,7 @@ class ContactObserver:
         """
         signal, variance = self.residual(t, at, payload, drift)
         variance = variance + self.levels.observer_variance(qd)
-        threshold = self.factor * np.sqrt(variance)
+        threshold = self.levels.thresholds(self.alarms_per_minute) * np.sqrt(variance)
         self.touched = np.abs(signal) > threshold
         force = tip_force(at.jacobian, -signal, variance) if self.touched.any() else np.zeros(3)
         return ContactState(-signal, threshold, self.touched, force)

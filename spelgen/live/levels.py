@@ -30,7 +30,7 @@ from spelgen.live.contact import ContactObserver
 from spelgen.live.filters import Block, Blocks, JointFilters, LoadFilter
 from spelgen.live.intake import Intake, balance_along
 from spelgen.live.momentum import Balance
-from spelgen.live.noise import TAIL, BlockNoise, NoiseLevels
+from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.payload import NO_REPORT
 from spelgen.live.tuning import TUNING
 from spelgen.logs.dynamics_samples import dynamics_samples
@@ -160,19 +160,9 @@ def find_levels(
         point: the tip in the frame of the last body, (3,) [m].
     """
     logs = [log for _, fold in folds for log in fold]
-    unknown = np.ones(len(effort))
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    noise = BlockNoise(white=unknown, disturbance=unknown, time_constant=unknown)
-    levels = NoiseLevels(
-        drift=noise,
-        load=noise,
-        observer=unknown,
-        resting=unknown,
-        resting_speed=unknown,
-        peak_start=unknown,
-        peak_scale=unknown,
-        load_variance=1.0,
-        load_freedom=1.0,
+    # without the noise, which is found with these
+    levels = NoiseLevels.model_construct(
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
         # no limit is below the largest logged torque
@@ -281,7 +271,7 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
     # peaks of neighbouring samples are one event: the largest of each window counts
     starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
     peaks = np.maximum.reduceat(ratio, starts, axis=0)
-    start = np.quantile(peaks, 1 - TAIL, axis=0)
+    start = np.quantile(peaks, 1 - TUNING.tail, axis=0)
     tail = np.where(peaks > start, peaks - start, np.nan)
     return levels.model_copy(update={"peak_start": start, "peak_scale": np.nanmean(tail, axis=0)})
 

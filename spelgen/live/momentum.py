@@ -61,15 +61,12 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
     jacobian, rate = (torch.einsum("bn,tbxa->tnxa", ratios, change) for change in changes)
     weight = torch.zeros_like(velocity)
     weight[..., 3] = -chain.base.flatten()
+    directions, vectors = torch.stack([jacobian, rate, jacobian]), torch.stack([velocity, velocity, weight])
+    # tr(direction J vector^T) is linear in the pseudo-inertia J of the payload
+    products = torch.einsum("ktnxa,ktxb->ktnab", directions, vectors)
     units = pseudo_inertia(torch.eye(10).to(q))
-
-    def along(directions: Tensor, vectors: Tensor) -> Tensor:
-        """Return tr(direction J vector^T) per parameter of the pseudo-inertia J, (T, n, 10)."""
-        products = torch.einsum("tnxa,txb->tnab", directions, vectors)
-        return torch.tensordot(products, units, dims=([-2, -1], [1, 2]))
-
-    force = along(rate, velocity) + along(jacobian, weight)
-    return along(jacobian, velocity), force, (jacobian @ torch.cat([point, point.new_ones(1)])).mT
+    momentum, centrifugal, weighed = torch.tensordot(products, units, dims=([-2, -1], [1, 2]))
+    return momentum, centrifugal + weighed, (jacobian @ torch.cat([point, point.new_ones(1)])).mT
 
 
 def balance(

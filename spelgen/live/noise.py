@@ -74,8 +74,13 @@ class NoiseLevels(BaseModel):
 
     @property
     def load_quantile(self) -> float:
-        """Half width of 95 % intervals of a payload in standard deviations: Student's t, for an estimated variance."""
-        return float(stdtrit(self.load_freedom, 0.975))
+        """Half width of 95 % intervals of a payload, in standard deviations: Student's t, for an estimated variance.
+
+        The variance was found without payload, which is right for the evidence. With one, errors are not smaller than
+        in the prior: friction grows with the load.
+        """
+        with_load = max(TUNING.prior_variance / self.load_variance, 1.0)
+        return float(stdtrit(self.load_freedom, 0.975)) * math.sqrt(with_load)
 
     @property
     def supported_alarms(self) -> float:
@@ -88,12 +93,12 @@ class NoiseLevels(BaseModel):
         variance: np.ndarray = np.square(self.observer) + np.square(resting)
         return variance
 
+    @property
+    def tail_peaks(self) -> float:
+        """Number of peaks of all joints in the exponential tail per minute."""
+        return 60 / TUNING.window * TUNING.tail * len(self.observer)
+
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the thresholds of the normalised observer, (n,), for a total rate of false alarms of all joints."""
-        windows = 60 / TUNING.window * TAIL * len(self.observer)
-        tail = self.peak_start + self.peak_scale * math.log(windows / alarms_per_minute)
+        tail = self.peak_start + self.peak_scale * math.log(self.tail_peaks / alarms_per_minute)
         return TUNING.other_days * np.maximum(tail, 1.0)
-
-
-TAIL = 0.2
-"""Fraction of the peaks to which the exponential tail is fitted."""

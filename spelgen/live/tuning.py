@@ -75,8 +75,9 @@ class LiveTuning:
     other_days: float = 1.22
     # [1/min] Default rate of false alarms.
     alarms_per_minute: float = 1.0
-    # [s] Window of the peaks from which thresholds are found.
+    # [s] Window of the peaks from which thresholds are found, and the fraction of the peaks in the exponential tail.
     window: float = 0.5
+    tail: float = 0.2
 
     # Payload (`live.payload`).
 
