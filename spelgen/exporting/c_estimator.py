@@ -39,7 +39,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "peak_start": levels.peak_start,
         "peak_scale": levels.peak_scale,
         "load_variance": [levels.load_variance],
-        "resting_noise": levels.resting,
+        "resting_torque": levels.resting,
         "resting_speed": levels.resting_speed,
         "speed": levels.speed,
         "rest_speed": levels.rest_speed,

@@ -46,10 +46,10 @@ class ContactObserver:
         at: its terms. drift: friction scale minus one, and disturbance, (n, 2).
         """
         signal, variance = self.residual(t, at, payload, drift)
-        variance = variance + self.levels.observer_variance(qd)
-        threshold = self.levels.thresholds(self.alarms_per_minute) * np.sqrt(variance)
+        noise = np.sqrt(variance + np.square(self.levels.observer))
+        threshold = self.levels.thresholds(self.alarms_per_minute) * noise + self.levels.resting_torque(qd)
         self.touched = np.abs(signal) > threshold
-        force = tip_force(at.jacobian, -signal, variance) if self.touched.any() else np.zeros(3)
+        force = tip_force(at.jacobian, -signal, threshold) if self.touched.any() else np.zeros(3)
         return ContactState(-signal, threshold, self.touched, force)
 
     def residual(
@@ -94,14 +94,14 @@ class ContactObserver:
         return signal, variance
 
 
-def tip_force(jacobian: np.ndarray, torque: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def tip_force(jacobian: np.ndarray, torque: np.ndarray, threshold: np.ndarray) -> np.ndarray:
     """Return the weighted least-squares estimate of a force at the tip, (3,) [N], in root axes, from external torques.
 
     Args:
         jacobian: of the tip, (3, n).
-        torque, variance: external torques [Nm, N] and their variances, (n,).
+        torque, threshold: external torques and their thresholds, (n,) [Nm, N].
     """
-    weighted = jacobian / variance
+    weighted = jacobian / threshold**2
     matrix = weighted @ jacobian.T
     # a force that no joint torque depends on is zero
     matrix += 1e-3 * np.trace(matrix) / 3 * np.eye(3)

@@ -267,7 +267,8 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
                 drift.update(block, block.y)
     signal, variance, qd = (np.array(column) for column in zip(*columns, strict=True))
     levels = levels.model_copy(update=_observer_noise(signal, qd, levels))
-    ratio = np.abs(signal) / np.sqrt(variance + levels.observer_variance(qd))
+    beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
+    ratio = beyond / np.sqrt(variance + np.square(levels.observer))
     # peaks of neighbouring samples are one event: the largest of each window counts
     starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
     peaks = np.maximum.reduceat(ratio, starts, axis=0)
@@ -289,7 +290,11 @@ def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> 
         # Huber's cost: quadratic up to the outliers, then linear
         inner = np.minimum(normalised, TUNING.outlier)
         cost = np.mean(np.log(level**2 * shape) + inner * (2 * normalised - inner), axis=0)
-        found = {"observer": level, "resting": ratio * level, "resting_speed": speed * levels.speed}
+        found = {
+            "observer": level,
+            "resting": TUNING.outlier * ratio * level,
+            "resting_speed": speed * levels.speed,
+        }
         best = {key: np.where(cost < lowest, x, best.get(key, x)) for key, x in found.items()}
         lowest = np.minimum(cost, lowest)
     return best

@@ -42,12 +42,12 @@ class BlockNoise(BaseModel):
 class NoiseLevels(BaseModel):
     """Noise levels and limits of an arm that the estimator uses in addition to its model; vectors are (n,).
 
-    drift, load: noise of blocks of both filters. observer, resting: standard deviations of the momentum observer of a
-    moving joint and, in addition, of a joint at rest [Nm, N]; the latter falls with exp(-|qd| / resting_speed) [rad/s,
-    m/s]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer, beyond the largest fifth.
-    load_variance: factor on the covariance of payloads, an estimate with load_freedom degrees of freedom. speed:
-    largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m]. effort: torque limit [Nm, N].
-    minutes: duration of the training logs. point: tip in the frame of the last body, (3,) [m].
+    drift, load: noise of blocks of both filters. observer: standard deviation of the momentum observer of a moving
+    joint. resting: three more standard deviations of a joint at rest [Nm, N], which fall with exp(-|qd| /
+    resting_speed) [rad/s, m/s]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer,
+    beyond the largest fifth. load_variance: factor on the covariance of payloads, an estimate with load_freedom
+    degrees of freedom. speed: largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m]. effort:
+    torque limit [Nm, N]. minutes: duration of the training logs. point: tip in the frame of the last body, (3,) [m].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -87,11 +87,13 @@ class NoiseLevels(BaseModel):
         """Lowest rate of false alarms [1/min] that the training logs support: one in their whole duration."""
         return 1 / self.minutes
 
-    def observer_variance(self, qd: np.ndarray) -> np.ndarray:
-        """Return the variance of the momentum observer at velocities (..., n), (..., n) [Nm^2, N^2]."""
-        resting = self.resting * np.exp(-np.abs(qd) / self.resting_speed)
-        variance: np.ndarray = np.square(self.observer) + np.square(resting)
-        return variance
+    def resting_torque(self, qd: np.ndarray) -> np.ndarray:
+        """Return the error of friction near standstill, at velocities (..., n), (..., n) [Nm, N].
+
+        It is bounded, and so it is added to thresholds, in which the noise is multiplied by its rarest peaks.
+        """
+        torque: np.ndarray = self.resting * np.exp(-np.abs(qd) / self.resting_speed)
+        return torque
 
     @property
     def tail_peaks(self) -> float:
