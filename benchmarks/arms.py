@@ -41,12 +41,12 @@ from rivals import deep_lagrangian, network
 import spelgen
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.pinocchio_dynamics import drives_known, urdf_dynamics
 from spelgen.emission.build import build
 from spelgen.fitting.torque.fit import fit_torque
+from spelgen.labels import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 

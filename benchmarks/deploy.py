@@ -29,8 +29,7 @@ from spelgen.exporting.c_export import called_by_c, compile_library, compiler
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import ENTRY_POINTS
+from spelgen.exporting.description import ENTRY_POINTS, TrainedModel
 from spelgen.exporting.mjcf_export import check_mjcf, mjcf_text
 from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session

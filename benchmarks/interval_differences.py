@@ -1,27 +1,37 @@
 """Differences between fits to disjoint recordings of an arm, compared with their 95 % intervals.
 
     python benchmarks/interval_differences.py ARM.urdf LOGS... [--preset hybrid] [--parts 1]
+    python benchmarks/interval_differences.py ARM.urdf LOGS... --halvings 10
 
-Each recording, or each of its parts, is fitted separately. For each pair of fits and each quantity (base parameters,
-constants of the drives, diagonal of M and gravity torque at positions within 30 % of the joints' ranges), the
-difference is compared with both half intervals, added as squares. Printed is the share of differences inside, per
-quantity.
+Each recording, or each of its parts, is fitted separately, and each pair of fits is compared. With --halvings both
+halves of the logs are fitted, the logs in order of their names first, then in random orders. For each quantity the
+difference is compared with both half intervals, added as squares. Printed is the share of differences inside.
+
+Quantities of a fit to torques: base parameters, constants of the drives, and the diagonal of M and the gravity torque
+at positions within 30 % of the joints' ranges. Of a fit of servos: the delay, and the ratios to kp that both fits
+determine.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
 
 import spelgen
+from spelgen.fitting.run_record import Content
 from spelgen.identification.intervals import QUANTILE
 
 POSITIONS = 10
 FRACTION = 0.3  # of half a joint's range
+RATIOS = ("kd", "armature", "dry", "static_error", "dead_zone")
+
+Estimates = dict[str, tuple[np.ndarray, np.ndarray]]
+"""Values and half intervals by quantity, (k,) each; NaN for values that a fit does not determine."""
 
 
 def main() -> None:
@@ -33,25 +43,39 @@ def main() -> None:
     parser.add_argument("logs", type=Path, nargs="+")
     parser.add_argument("--preset", default="hybrid")
     parser.add_argument("--parts", type=int, default=1)
+    parser.add_argument("--halvings", type=int, default=0)
     options = parser.parse_args()
-    arm, fits = spelgen.load_arm(options.urdf), []
-    for part in parts_of(spelgen.read_logs(options.logs, arm), options.parts):
-        fits.append(estimates(spelgen.fit(spelgen.build(arm, options.preset), [part]).posterior))
-        print(f"fitted {part.name}: {len(part)} samples", flush=True)
-    shares = {}
-    for name in fits[0]:
-        inside = []
-        for one, other in combinations(fits, 2):
-            (first, first_std), (second, second_std) = one[name], other[name]
-            bound = QUANTILE * np.hypot(first_std, second_std)
-            # both may be exactly zero: a joint that gravity does not load
-            inside.append(np.abs(first - second) <= bound + 1e-12)
-        shares[name] = np.mean(inside)
-        print(f"{name:10} {100 * shares[name]:5.1f} %")
-    print(f"{'mean':10} {100 * np.mean(list(shares.values())):5.1f} %")
+    arm = spelgen.load_arm(options.urdf)
+    logs = spelgen.read_logs(sorted(options.logs), arm)
+    inside: dict[str, list[bool]] = {}
+    for group in groups(logs, options.parts, options.halvings):
+        fits = []
+        for recordings in group:
+            fits.append(estimates(spelgen.fit(spelgen.build(arm, options.preset), recordings)))
+            print("fitted", *(log.name for log in recordings), flush=True)
+        for first, second in combinations(fits, 2):
+            for name in first:
+                inside.setdefault(name, []).extend(agreements(first[name], second[name]))
+    shares = {name: 100 * np.mean(found) for name, found in inside.items() if found}
+    for name, share in shares.items():
+        print(f"{name:14} {share:5.1f} % of {len(inside[name])}")
+    print(f"{'mean':14} {np.mean(list(shares.values())):5.1f} %")
 
 
-def parts_of(logs: list[spelgen.Trajectory], count: int) -> Iterator[spelgen.Trajectory]:
+def groups(
+    logs: Sequence[spelgen.Trajectory], parts: int, halvings: int
+) -> Iterator[list[list[spelgen.Trajectory]]]:
+    """Yield groups of disjoint sets of recordings, whose fits are compared: all parts, or both halves per halving."""
+    if not halvings:
+        yield [[part] for part in parts_of(logs, parts)]
+    for number in range(halvings):
+        order = np.arange(len(logs))
+        if number:
+            np.random.default_rng(number).shuffle(order)
+        yield [[logs[k] for k in order[half::2]] for half in (0, 1)]
+
+
+def parts_of(logs: Sequence[spelgen.Trajectory], count: int) -> Iterator[spelgen.Trajectory]:
     """Yield each recording in `count` parts of equal length."""
     for log in logs:
         edges = np.linspace(0, len(log), count + 1).astype(int)
@@ -59,19 +83,45 @@ def parts_of(logs: list[spelgen.Trajectory], count: int) -> Iterator[spelgen.Tra
             yield log[start:stop]
 
 
-def estimates(posterior: spelgen.Posterior) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return values and standard deviations, (k,) each, by quantity."""
-    groups = {"base": posterior.base_parameters, **posterior.drives}
-    result = {}
-    for name, intervals in groups.items():
-        result[name] = np.array([x.value for x in intervals]), np.array([x.std for x in intervals])
+def agreements(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> list[bool]:
+    """Return True for each difference inside both half intervals, of the values that both fits determine."""
+    difference = np.abs(first[0] - second[0])
+    # both may be exactly zero: a joint that gravity does not load
+    inside = difference <= np.hypot(first[1], second[1]) + 1e-12
+    return list(inside[np.isfinite(difference)])
+
+
+def estimates(fit: spelgen.Fit) -> Estimates:
+    """Return values and half intervals by quantity."""
+    if fit.record.servo is not None:
+        return servo_estimates(fit.record.servo)
+    posterior, result = fit.posterior, {}
+    for name, intervals in {"base": posterior.base_parameters, **posterior.drives}.items():
+        result[name] = np.array([x.value for x in intervals]), np.array([x.half for x in intervals])
     joints, draw = posterior.model.spec.joints, np.random.default_rng(0)
     places = FRACTION * draw.uniform(-1.0, 1.0, (POSITIONS, len(joints)))
     q = np.array([joint.center for joint in joints]) + places * [joint.half_range for joint in joints]
     mass, gravity = posterior.mass_matrix(q), posterior.gravity(q)
     diagonal = [np.diagonal(x, axis1=1, axis2=2).ravel() for x in mass]
-    result["M"] = diagonal[0], diagonal[1]
-    result["g"] = gravity.value.ravel(), gravity.std.ravel()
+    result["M"] = diagonal[0], QUANTILE * diagonal[1]
+    result["g"] = gravity.value.ravel(), QUANTILE * gravity.std.ravel()
+    return result
+
+
+def servo_estimates(servo: Content) -> Estimates:
+    """Return the delay [s] and the logarithms of the ratios to kp of a fit of servos, with their half intervals."""
+    delay = servo["delay"]
+    result = {"delay": (np.array([delay["value"]]), np.array([delay["half"]]))}
+    for ratio in RATIOS:
+        rows = []
+        for joint in servo["joints"]:
+            interval = joint.get(ratio, {"determined": False})
+            row = (math.nan, math.nan)
+            if interval["determined"]:
+                row = math.log(interval["value"]), math.log(interval["high"] / interval["value"])
+            rows.append(row)
+        values = np.array(rows)
+        result[ratio] = values[:, 0], values[:, 1]
     return result
 
 

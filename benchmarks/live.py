@@ -29,7 +29,7 @@ from real_logs import LOADED, OUTSIDE, TESTS, TRAINING, after, first
 from recordings import folder_of, panda_urdf
 
 import spelgen
-from spelgen.baselines.baseline import arm_of_model
+from spelgen.baselines.registry import arm_of_model
 from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.evaluation.torque import mean_nmse, predicted_torques

@@ -5,7 +5,7 @@
 Every draw is an arm with inertials 30 % wrong in the URDF, friction of one of five kinds, noise of 0.5 to 5 % of the
 torques, and 20 s of excitation or pick-and-place. The log is compared unchanged, and with single random faults:
 the sense of a joint's position, torque or both, an order of all columns or of the torques, a zero offset (a multiple of
-90 degrees, or any), and another gravity than the settings state.
+90 degrees, or any), another gravity than the settings state, and angles in revolutions or small angles in degrees.
 
 A fault is named if the first reading is the right one, named with others if it is among the readings that the
 message lists, and not found without a finding. It is invisible if the evidence for the right reading is below the
@@ -30,8 +30,8 @@ from truth import Case, Truth, record_log, wrong_urdf
 
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm, load_arm
-from spelgen.identification.drive_samples import DriveLog
-from spelgen.identification.geometry_search import compare_readings
+from spelgen.identification.drive_hints import DriveLog
+from spelgen.identification.geometry_search import angle_scalings, compare_readings
 from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, MotionSamples
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.preprocessing import Preprocessing
@@ -44,7 +44,7 @@ OTHERS = (
 )  # fmt: skip
 KINDS = (
     "position", "torque", "position and torque", "order", "order of torques", "two torques", "zero, 90 degrees",
-    "zero, any angle", "gravity",
+    "zero, any angle", "gravity", "unit of angles",
 )  # fmt: skip
 SECONDS = 20.0
 NEAR = 0.2  # rad, and of the size of gravity: angles that are found within it are right
@@ -109,6 +109,7 @@ def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
         "zero, 90 degrees": replace(right, offset=offset),
         "zero, any angle": replace(right, offset=offset),
         "gravity": replace(right, gravity=(x, y, z)),
+        "unit of angles": replace(right, motion_scale=angle_scalings(arm)[rng.integers(2)].motion),
     }[kind]
 
 
@@ -133,7 +134,9 @@ def result_of(arm: Arm, true: Arm, samples: MotionSamples, kind: str, right: Hyp
         chain, ideal = replace(chain, gravity=right.gravity), replace(ideal, gravity=right.gravity)
         right = Hypothesis.unchanged(arm.chain)
     wrong = right.logged(samples)
-    comparison = compare_readings(GeometryProblem(chain, wrong, drives.speeds, SECONDS))
+    comparison = compare_readings(
+        GeometryProblem(chain, wrong, drives.speeds, SECONDS), angle_scalings(chain)
+    )
     named = [is_same(fit.hypothesis, right) for fit in comparison.better]
     if any(named):
         return "named" if named[0] else "with others"
@@ -168,7 +171,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             with tempfile.TemporaryDirectory() as folder:
                 case, arm, true, samples = draw_log(urdf, number, Path(folder))
             unchanged = compare_readings(
-                GeometryProblem(arm.chain, samples, arm.actuation.drives().speeds, SECONDS)
+                GeometryProblem(arm.chain, samples, arm.actuation.drives().speeds, SECONDS),
+                angle_scalings(arm.chain),
             )
             clean["false" if unchanged.better else "silent"] += 1
             rng = np.random.default_rng([number, 1])

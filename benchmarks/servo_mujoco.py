@@ -34,7 +34,7 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.evaluation.replay import replays
 from spelgen.exporting.tuning import TUNING as EXPORT_TUNING
 from spelgen.fitting.servo.windows import ServoWindows, servo_windows
-from spelgen.logs.commands import LogRows, delayed_commands, steps_between
+from spelgen.logs.trajectory import LogRows, delayed_commands, steps_between
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel

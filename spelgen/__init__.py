@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from spelgen.design import Design as Design
     from spelgen.dynamics.friction import FrictionModel as FrictionModel
     from spelgen.dynamics.tip import tip_kinematics as tip_kinematics
+    from spelgen.emission.assemble import load_module as load_module
     from spelgen.emission.build import build as build
-    from spelgen.emission.loading import load_module as load_module
     from spelgen.emission.specify import generate as generate
     from spelgen.errors import SpelgenError as SpelgenError
     from spelgen.evaluation.evaluate import evaluate as evaluate
@@ -54,7 +54,7 @@ _MODULES = {
     "emission.specify": "generate",
     "design": "Design",
     "emission.build": "build",
-    "emission.loading": "load_module",
+    "emission.assemble": "load_module",
     "certificate.module_check": "check",
     "logs.read": "read_logs write_logs",
     "logs.trajectory": "Trajectory",

@@ -64,6 +64,7 @@ def load_design(preset: str | Path | Design) -> Design:
     """Return the design of a preset of spelgen, or of a YAML file. Raises SettingsError."""
     if isinstance(preset, Design):
         return preset
+    # names first: a file without suffix cannot hide a preset
     if str(preset) in PRESET_NAMES:
         return _read(PRESETS / f"{preset}.yaml")
     if Path(preset).suffix in (".yaml", ".yml"):
@@ -78,6 +79,7 @@ def _read(path: Path) -> Design:
     content = document.value()
     if not isinstance(content, dict):
         raise SettingsError("no keys with values", file=path, expected=f"the keys {', '.join(CHOICES)}")
+    # the description is for readers of the file
     values = {key: value for key, value in content.items() if key != "about"}
     validate(values, document)
     return Design(**values)
@@ -90,28 +92,30 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
     """
     file = None if document is None else document.path
 
-    def line(name: str) -> int | None:
-        return None if document is None else document.line((name,))
-
+    lines = {name: None if document is None else document.line((name,)) for name in {*values, *CHOICES}}
     errors = []
     for name in values:
         if name not in CHOICES:
             do = suggestion(str(name), CHOICES)
-            errors.append(SettingsError(f"unknown key {name!r}", file=file, line=line(name), do=do))
+            errors.append(SettingsError(f"unknown key {name!r}", file=file, line=lines[name], do=do))
     for name, choices in CHOICES.items():
-        got = repr(values[name]) if name in values else "nothing"
         if values.get(name) not in choices:
-            expected = f"one of {', '.join(choices)}"
-            errors.append(SettingsError(got, file=file, line=line(name), element=name, expected=expected))
+            got, expected = (
+                repr(values[name]) if name in values else "nothing",
+                f"one of {', '.join(choices)}",
+            )
+            errors.append(SettingsError(got, file=file, line=lines[name], element=name, expected=expected))
+    # wrong values first: whether a wrong value conflicts with another one is unknown
     collect(errors)
     for first, second, do in _conflicts(values):
         got = f"{first}: {values[first]} with {second}: {values[second]}"
-        errors.append(SettingsError(got, file=file, line=line(first), do=do))
+        errors.append(SettingsError(got, file=file, line=lines[first], do=do))
     collect(errors)
 
 
 def _conflicts(values: Mapping[str, object]) -> Iterator[tuple[str, str, str]]:
     """Yield pairs of keys with contradicting values, and advice."""
+    # rules in the order in which a reader of the file meets the keys
     rigid = values["mass"] == "closed-form"
     if rigid != (values["potential"] == "closed-form"):
         yield "mass", "potential", "rigid bodies give both: name closed-form for both or for neither"

@@ -49,14 +49,14 @@ def read_bytes(
         # The size is read first: a sparse file of many gigabytes takes no space.
         size = path.stat().st_size
         require_regular_file(path, error, kind)
+        # a parser of JSON cannot be interrupted, so its input is limited
         if size <= largest:
             return path.read_bytes()
     except FileNotFoundError:
         raise error("no such file", file=path) from None
     except (OSError, ValueError) as problem:  # ValueError: a null character in the name
         reason = problem.strerror if isinstance(problem, OSError) else None
-        reason = reason or str(problem)
-        raise error(f"cannot be read ({reason})", file=path) from None
+        raise error(f"cannot be read ({reason or problem})", file=path) from None
     raise error(f"a file of {size} bytes", file=path, expected=f"at most {largest}", do=do)
 
 
@@ -66,6 +66,7 @@ def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
         content = json.loads(read_bytes(path, error))
     except (ValueError, RecursionError) as problem:
         raise error(f"broken JSON ({problem})", file=path) from problem
+    # all files of spelgen are objects, which can get further keys
     if not isinstance(content, dict):
         raise error(f"{type(content).__name__} in JSON", file=path, expected="an object")
     return content
@@ -105,6 +106,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     with naming(path):
+        # a new run folder is no reason for a command to fail after minutes of work
         path.parent.mkdir(parents=True, exist_ok=True)
         # In the same folder: a file is renamed atomically only within a file system.
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -165,6 +167,7 @@ def local(path: Path | str) -> Path:
     Files written to the copy are sent to the address (see `sent`). Raises SpelgenError if the address cannot be
     reached, or has keys outside itself.
     """
+    # a local file whose name looks like an address takes precedence
     match = ADDRESS.match(str(path))
     if match is None or Path(path).exists():
         return Path(path)

@@ -1,11 +1,18 @@
-"""Names of joints, units and entries of M in charts, tables and sentences."""
+"""Names of joints, units, entries of M and predictors in charts, tables and sentences."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import groupby
 
-MAX_NAME = 36
+# predictors in results, charts and tables
+MODEL = "model"  # the trained model
+CONSTANT_VELOCITY = "velocity stays constant"
+URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
+LEAST_SQUARES = "least squares"
+LEAST_SQUARES_WITH_MEMORY = "least squares with memory"
+LINEAR_SERVOS, DELAYED_COMMAND = "linear servo", "delayed command"
 
 
 @dataclass(frozen=True)
@@ -53,64 +60,51 @@ def named_joints(names: Sequence[str], joint_types: Sequence[str]) -> list[Named
 
 def joint_ranges(joints: tuple[int, ...]) -> str:
     """Return the numbers of joints, from 1, with ranges of three or more: ``2-6`` or ``2,4``."""
-    runs: list[list[int]] = []
-    for joint in joints:
-        if runs and joint == runs[-1][-1] + 1:
-            runs[-1].append(joint)
-        else:
-            runs.append([joint])
     texts = []
-    for run in runs:
-        if len(run) > 2:
-            texts.append(f"{run[0] + 1}-{run[-1] + 1}")
-        else:
-            texts += [str(joint + 1) for joint in run]
+    # consecutive joints have the same difference to their places
+    for _, indices in groupby(range(len(joints)), key=lambda index: joints[index] - index):
+        run = [str(joints[index] + 1) for index in indices]
+        texts += [f"{run[0]}-{run[-1]}"] if len(run) > 2 else run
     return ",".join(texts)
 
 
 def joints_in_ranges(joints: tuple[int, ...]) -> str:
     """Return ``joint 2``, or ``joints 2-4,6``."""
-    return f"{_plural('joint', joints)} {joint_ranges(joints)}"
+    return f"joint{'s' * (len(joints) > 1)} {joint_ranges(joints)}"
 
 
 def entry_name(row: int, column: int) -> str:
     """Return the name of an entry of M with indices from 0: M21, or M12,1 from the tenth joint."""
-    if max(row, column) >= 9:
-        return f"M{row + 1},{column + 1}"
-    return f"M{row + 1}{column + 1}"
+    # M111 could be row 1 and column 11, or row 11 and column 1
+    comma = "," * (max(row, column) >= 9)
+    return f"M{row + 1}{comma}{column + 1}"
 
 
 def joints_in_words(joints: Sequence[int]) -> str:
     """Return ``joint 2``, or ``joints 2, 3 and 5``."""
-    return f"{_plural('joint', joints)} {listed([str(joint + 1) for joint in sorted(joints)])}"
+    return f"joint{'s' * (len(joints) > 1)} {listed([str(joint + 1) for joint in sorted(joints)])}"
 
 
 def axes_in_words(joints: Sequence[int]) -> str:
     """Return ``the axis of joint 2``, or ``the axes of joints 2 and 3``."""
-    if len(joints) == 1:
-        return f"the axis of {joints_in_words(joints)}"
-    return f"the axes of {joints_in_words(joints)}"
+    return f"the {'axes' if len(joints) > 1 else 'axis'} of {joints_in_words(joints)}"
 
 
 def listed(names: Sequence[str]) -> str:
     """Return ``a``, or ``a, b and c``."""
     *preceding, last = names
-    if not preceding:
-        return last
-    return f"{', '.join(preceding)} and {last}"
+    return f"{', '.join(preceding)} and {last}" if preceding else last
 
 
 def counted(count: int, noun: str) -> str:
     """Return ``1 joint`` or ``2 joints``, ``1 trajectory`` or ``2 trajectories``."""
-    if count == 1:
-        return f"1 {noun}"
-    if noun.endswith("y"):
-        return f"{count} {noun[:-1]}ies"
-    return f"{count} {noun}s"
+    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{count} {noun if count == 1 else plural}"
 
 
 def share(fraction: float, reference: str = "") -> str:
     """Return ``5 % of the motion``, or ``13.6 times the motion`` for a fraction above 1."""
+    # 250 % of the motion is harder to imagine than 2.5 times the motion
     if fraction > 1:
         return f"{fraction:.3g} times {reference}".rstrip()
     # four digits close to 100 %
@@ -121,33 +115,29 @@ def share(fraction: float, reference: str = "") -> str:
 
 def printable(text: str, allowed: str = "") -> str:
     """Return text from a file with escaped control characters, except the characters ``allowed``."""
-    characters = []
-    for character in text:
-        if not character.isprintable() and character not in allowed:
-            character = character.encode("unicode_escape").decode()
-        characters.append(character)
-    return "".join(characters)
+    safe = (x if x.isprintable() or x in allowed else x.encode("unicode_escape").decode() for x in text)
+    return "".join(safe)
 
 
 def short_name(name: str) -> str:
     """Return a name from a file for a line of a table: shortened, without control characters."""
+    # line ends and tabs of a name would break the table
     line = " ".join(printable(name).split())
-    if len(line) > MAX_NAME:
-        return f"{line[: MAX_NAME - 3]}..."
-    return line or '""'
+    # a table of 80 columns has room for a name of 36 characters
+    return f"{line[:33]}..." if len(line) > 36 else line or '""'
 
 
 def thousandths(joint_types: Sequence[str]) -> str:
     """Return the unit of small distances of these joints: ``mrad``, ``mm`` or, for both types, ``mrad, mm``."""
-    kinds = {kind == "prismatic" for kind in joint_types}
-    if kinds == {True}:
-        return "mm"
-    if kinds == {False}:
-        return "mrad"
-    return "mrad, mm"
+    units = {"mm" if joint_type == "prismatic" else "mrad" for joint_type in joint_types}
+    return ", ".join(sorted(units, reverse=True)) or "mrad, mm"
 
 
-def _plural(noun: str, items: Sequence[int]) -> str:
-    if len(items) > 1:
-        return f"{noun}s"
-    return noun
+def observed(predictor: str) -> str:
+    """Return the name of the predictor with the constant disturbance that a momentum observer estimates."""
+    return f"{predictor} + observer"
+
+
+def is_drawn(predictor: str) -> bool:
+    """True if charts show the predictor: with an observer only the model is shown."""
+    return predictor == observed(MODEL) or not predictor.endswith(observed(""))

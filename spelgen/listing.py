@@ -14,8 +14,6 @@ from typing import Literal
 WIDTH = 80
 MIN_NAME = 8
 """Characters of the name of a row in one line, if a table is too wide; longer names are wrapped."""
-MIN_HEAD = 14
-"""The same number for the name of a column."""
 SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s\))")  # a name may be wrapped after it
 
 
@@ -38,21 +36,17 @@ class Listing:
         """Return the table for a terminal or a file, without a line end."""
         columns = list(map(list, zip(self.head, *self.rows, strict=True)))
         tables = "\n\n".join(self._layout(columns, group) for group in _groups(_fitted(columns)))
+        # indented as the rows, so that the next title is found at a glance
         note = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
         return "\n".join([*textwrap.wrap(self.title, WIDTH), tables, *note])
 
     def html(self) -> str:
         """Return the table for a notebook."""
-        lines = []
-        if self.title:
-            lines.append(f"<p><b>{escape(self.title)}</b></p>")
-        lines += ["<table><thead>", self._html_row(self.head, "th"), "</thead><tbody>"]
-        for row in self.rows:
-            lines.append(self._html_row(row, "td"))
-        lines.append("</tbody></table>")
-        if self.note:
-            lines.append(f"<p>{escape(self.note)}</p>")
-        return "".join(lines)
+        title = f"<p><b>{escape(self.title)}</b></p>" if self.title else ""
+        note = f"<p>{escape(self.note)}</p>" if self.note else ""
+        rows = "".join(self._html_row(row, "td") for row in self.rows)
+        head = f"<thead>{self._html_row(self.head, 'th')}</thead>"
+        return f"{title}<table>{head}<tbody>{rows}</tbody></table>{note}"
 
     def _html_row(self, cells: tuple[str, ...], tag: str) -> str:
         text = ""
@@ -61,9 +55,7 @@ class Listing:
         return f"<tr>{text}</tr>"
 
     def _side(self, column: int) -> Literal["left", "right"]:
-        if column in self.left:
-            return "left"
-        return "right"
+        return "left" if column in self.left else "right"
 
     def _layout(self, columns: Sequence[Sequence[str]], group: Sequence[int]) -> str:
         """Return the table of the names of rows and the columns of a group."""
@@ -85,10 +77,8 @@ def _fitted(columns: Sequence[Sequence[str]]) -> list[Sequence[str]]:
     """Return the columns, with wrapped heads if the table is too wide."""
     if sum(2 + _width(column) for column in columns) <= WIDTH:
         return list(columns)
-    fitted = [columns[0]]
-    for head, *cells in columns[1:]:
-        fitted.append([_folded(head, max(MIN_HEAD, _width(cells))), *cells])
-    return fitted
+    # heads of fewer than 14 characters are not wrapped: most words would be cut
+    return [columns[0], *([_folded(head, max(14, _width(cells))), *cells] for head, *cells in columns[1:])]
 
 
 def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
@@ -98,6 +88,7 @@ def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
     room = WIDTH - 2 - max(MIN_NAME, _width(words))
     groups: list[list[int]] = [[]]
     used = 0
+    # greedy: columns keep their order, and only the last table may be narrow
     for column in range(1, len(columns)):
         width = 2 + _width(columns[column])
         if used and used + width > room:
@@ -132,6 +123,7 @@ def number(value: float | None) -> str:
     """
     if value is None or not math.isfinite(value):
         return "-"
+    # a count is exact: rounding would hide a lost sample
     if isinstance(value, int):
         return f"{value:,}"
     # Plain decimals in the range in which three digits need no exponent.

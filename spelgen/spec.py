@@ -24,9 +24,6 @@ Entries = tuple[tuple[int, int, float], ...]
 
 # Format of specifications. It changes when a specification, or weights, of an earlier version cannot be used any more.
 SPEC_FORMAT = 9
-# Largest number of weights in the hidden layers of one network: 134 MB in double precision.
-MAX_WEIGHTS = 2**24
-MAX_LAYERS = 16
 
 
 @dataclass(frozen=True)
@@ -45,12 +42,11 @@ class Options:
 
     def __post_init__(self) -> None:
         """Raise SettingsError for networks that are too large for memory."""
-        weights = self.width * self.width * self.depth
-        if min(self.width, self.depth) < 1 or self.depth > MAX_LAYERS or weights > MAX_WEIGHTS:
-            raise SettingsError(
-                f"{self.depth} hidden layers of {self.width} units",
-                expected=f"1 to {MAX_LAYERS} layers of at least 1, with at most {MAX_WEIGHTS:,} weights",
-            )
+        # weights in the hidden layers of one network: 134 MB in double precision
+        max_weights = 2**24
+        if not (self.width >= 1 and 1 <= self.depth <= 16 and self.width**2 * self.depth <= max_weights):
+            expected = f"1 to 16 layers of at least 1, with at most {max_weights:,} weights"
+            raise SettingsError(f"{self.depth} hidden layers of {self.width} units", expected=expected)
 
 
 @dataclass(frozen=True)
@@ -182,6 +178,7 @@ class ModelSpec:
         joints += [index for basis in bases for row in basis for index in row[:2]]
         joints += [index for x in self.inputs for index in (x.joint, x.motor)]
         joints += [index for row, column, _, depends in self.entries for index in (row, column, *depends)]
+        # logs and exports find joints and links by name
         names = [joint.name for joint in self.joints], [link.name for link in links]
         consistent = (
             n > 0
@@ -225,14 +222,16 @@ def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
         # The format is compared before the keys, so that the error of an older file is clear.
         version = content.pop("format") if isinstance(content, dict) and "format" in content else None
         if version != SPEC_FORMAT:
+            expected = f"{SPEC_FORMAT}, of this version"
+            again = "build the module again with `spelgen build`, and train it again"
             raise ModuleError(
-                f"a specification of format {version!r}", file=file, expected=f"{SPEC_FORMAT}, of this version",
-                do="build the module again with `spelgen build`, and train it again",
-            )  # fmt: skip
+                f"a specification of format {version!r}", file=file, expected=expected, do=again
+            )
         spec = TypeAdapter(ModelSpec).validate_python(content)
-        # Written again it must be the same: pydantic converts numbers and ignores keys.
+        # Compared with its own JSON form: pydantic converts values and ignores unknown keys.
         if json.loads(spec.to_json()) == {"format": version, **content}:
             return spec
+        # not ignored: a specification that was edited by hand would be another model than its text states
         reason = "keys or values of other types"
     except (ValidationError, ValueError, RecursionError, SettingsError) as problem:
         reason = " ".join(str(problem).split())[:200]

@@ -14,8 +14,6 @@ from spelgen.errors import RunError
 
 # Number of times that a task is run again after its worker died.
 RETRIES = 5
-# Shared memory of Ray [bytes]. It is small because tasks exchange only paths and a few numbers.
-OBJECT_STORE = 100_000_000
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -41,6 +39,7 @@ def run_here(
     work: Callable[[Task], Result], tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result | Exception]]:
     """Run one task after the other in this process."""
+    # the exception is yielded, not raised: one failed run must not stop the others
     for task in tasks:
         try:
             outcome: Result | Exception = work(task)
@@ -61,11 +60,8 @@ def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
         yield run_here
         return
     if find_spec("ray") is None:
-        raise RunError(
-            "several runs at a time without Ray",
-            expected="the extra parallel",
-            do="pip install 'spelgen[parallel]', or --jobs 1",
-        )
+        do = "pip install 'spelgen[parallel]', or --jobs 1"
+        raise RunError("several runs at a time without Ray", expected="the extra parallel", do=do)
     # no usage statistics are sent
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # avoids a warning of Ray about a changed default
@@ -74,16 +70,15 @@ def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
 
     cluster: dict[str, Any] = {"address": address}
     if address is None:
-        # Without the dashboard, which opens a port.
-        cluster = {"num_cpus": jobs, "include_dashboard": False, "object_store_memory": OBJECT_STORE}
+        # Without the dashboard, which opens a port. Tasks exchange only paths and a few numbers: 100 MB are plenty.
+        cluster = {"num_cpus": jobs, "include_dashboard": False, "object_store_memory": 100_000_000}
     try:
         ray.init(**cluster, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError) as error:
         location = "this machine" if address is None else repr(address)
-        raise RunError(
-            f"no Ray cluster at {location} ({' '.join(str(error).split())[:200]})",
-            do="start one by `ray start --head`, or omit --address",
-        ) from error
+        reason = " ".join(str(error).split())[:200]
+        do = "start one by `ray start --head`, or omit --address"
+        raise RunError(f"no Ray cluster at {location} ({reason})", do=do) from error
     try:
         # Ray reports dead workers on stdout, which is for results
         with redirect_stdout(sys.stderr):
@@ -101,6 +96,7 @@ def _run_on_ray(
     remote: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_work_or_die)
     waiting = {remote.remote(work, task): task for task in tasks}
     try:
+        # in the order in which tasks end: each result is stored at once, and survives a later failure
         while waiting:
             (reference,), _ = ray.wait(list(waiting), num_returns=1)
             yield waiting.pop(reference), _outcome(reference)
@@ -125,12 +121,8 @@ def _outcome(reference: Any) -> Any:
     try:
         return ray.get(reference)
     except RayTaskError as error:
-        if isinstance(error.cause, Exception):
-            return error.cause
-        return error
+        return error.cause if isinstance(error.cause, Exception) else error
     except RayError as error:
         # the workers of the task died each time, or processes of Ray itself did
-        return RunError(
-            f"a worker that died {RETRIES + 1} times ({type(error).__name__})",
-            do="the same command runs the remaining tasks",
-        )
+        got = f"a worker that died {RETRIES + 1} times ({type(error).__name__})"
+        return RunError(got, do="the same command runs the remaining tasks")

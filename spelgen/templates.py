@@ -1,25 +1,31 @@
-"""Templates -> text. Templates contain layout only; their content is computed in Python."""
+"""Templates -> text. Templates contain layout only; their content is computed in Python.
+
+Every page has the same frame: style sheet, scripts, and a policy that forbids all other scripts and all loading.
+"""
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import json
 from functools import cache
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 
-_BESIDE_THE_CODE = Path(__file__).parent / "templates"  # in an installed package
-_IN_THE_REPOSITORY = Path(__file__).parent.parent / "templates"
+from spelgen.version import __version__
 
-
-@cache
-def _folder() -> Path:
-    return _BESIDE_THE_CODE if _BESIDE_THE_CODE.is_dir() else _IN_THE_REPOSITORY
+# an installed package has the templates inside itself, the repository next to it
+_INSTALLED = Path(__file__).parent / "templates"
+_FOLDER = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1] / "templates"
 
 
 @cache
 def _environment(autoescape: bool) -> Environment:
     return Environment(
-        loader=FileSystemLoader(_folder()),
+        loader=FileSystemLoader(_FOLDER),
+        # a misspelt name would otherwise be an empty text in a page or in generated code
         undefined=StrictUndefined,
         autoescape=autoescape,
         trim_blocks=True,
@@ -38,4 +44,42 @@ def render(template: str, **context: object) -> str:
 
 def read(name: str) -> str:
     """Return the text of a file in the folder of templates, which pages contain unchanged."""
-    return (_folder() / name).read_text(encoding="utf-8")
+    return (_FOLDER / name).read_text(encoding="utf-8")
+
+
+SCRIPTS = ("page.js", "arm.js")
+
+
+def render_page(template: str, **context: object) -> str:
+    """Return one self-contained HTML page from a template.
+
+    The Content-Security-Policy of the page admits its own style sheet and scripts by their digests and nothing else:
+    the page loads no file or address, and text from a user's file cannot run as a script.
+    """
+    # inline, not linked: a page is one file, which can be sent by mail
+    style, *scripts = _assets()
+    return render(
+        template,
+        version=__version__,
+        style=style,
+        style_hash=Markup(_digest(style)),
+        scripts=scripts,
+        script_hashes=Markup(" ").join(Markup("'{}'").format(_digest(script)) for script in scripts),
+        **context,
+    )
+
+
+def json_data(data: object) -> Markup:
+    """Return JSON for a <script> element: without the characters that could end the element."""
+    # NaN is not valid JSON: an error here, instead of a script that stops in the browser
+    text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
+
+
+@cache
+def _assets() -> tuple[Markup, ...]:
+    return tuple(Markup(read(name).strip()) for name in ("page.css", *SCRIPTS))
+
+
+def _digest(text: str) -> str:
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"

@@ -12,19 +12,19 @@ ROOT = Path(__file__).parents[1]
 
 # The files that take longest. Workers of pytest-xdist take whole files in this order, so the longest start first.
 LONGEST_FILES = (
-    "test_types",
     "test_export_onnx",
+    "test_docs",
     "test_torque_fit",
-    "test_servo",
-    "test_meshes",
     "test_workflow",
+    "test_servo",
     "test_training",
+    "test_types",
     "test_coupled_motors",
     "test_contracts",
-    "test_docs",
     "test_evaluation",
-    "test_selection",
     "test_run_folder",
+    "test_selection",
+    "test_meshes",
 )
 
 

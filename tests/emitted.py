@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import subprocess
 import sys
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -17,9 +19,11 @@ from flint import fmpq_mpoly
 from polynomials import polynomials
 from torch import nn
 
+from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.design import Design
 from spelgen.emission.plan import derive_spec
+from spelgen.emission.specify import generate
 from spelgen.emission.text import module_text
 from spelgen.spec import Options
 from spelgen.structure.structure import Structure, derive
@@ -31,6 +35,22 @@ GANTRY = """<robot name="gantry"><link name="base"/><link name="bridge"/><link n
 <joint name="across" type="prismatic"><parent link="bridge"/><child link="trolley"/><axis xyz="0 1 0"/>
 <limit lower="-1" upper="1" effort="10" velocity="1"/></joint></robot>"""
 """Nothing of its M or V depends on q: no network is needed."""
+FOLLOWED = """<robot name="followed">
+  <link name="base"/>
+  <link name="a"><inertial><origin xyz="0.2 0 0.1"/><mass value="2"/>
+    <inertia ixx="0.1" ixy="0.01" ixz="0" iyy="0.1" iyz="0.02" izz="0.15"/></inertial></link>
+  <link name="b"><inertial><origin xyz="0.1 0.1 0"/><mass value="1"/>
+    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
+  <link name="c"><inertial><origin xyz="0 0.1 0.1"/><mass value="1.5"/>
+    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.2" iyz="0" izz="0.15"/></inertial></link>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="10" velocity="2"/></joint>
+  <joint name="follow" type="revolute"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/>
+    <origin xyz="0.4 0 0"/><mimic joint="turn" multiplier="-2" offset="0.3"/>
+    <limit lower="-2" upper="2" effort="10" velocity="2"/></joint>
+  <joint name="slide" type="prismatic"><parent link="b"/><child link="c"/><axis xyz="0 0 1"/>
+    <origin xyz="0 0.2 0" rpy="0.4 0 0"/><limit lower="0" upper="0.5" effort="10" velocity="1"/></joint>
+</robot>"""
 NETWORKS = Design(
     mass="derived", potential="derived", dissipation="per-joint", input="derived", memory="none", net="mlp",
     encoding="joint",
@@ -49,6 +69,28 @@ def import_source(source: str, path: Path) -> ModuleType:
     module = sys.modules[name] = importlib.util.module_from_spec(spec)  # where torch.compile looks for it
     spec.loader.exec_module(module)
     return module
+
+
+def closed_forms(robots: Iterable[str], folder: Path) -> dict[str, tuple[ModuleType, Chain]]:
+    """Return the emitted closed-form module and the arm, by name, of the robots and of the arm `FOLLOWED`."""
+    urdf = folder / "followed.urdf"
+    urdf.write_text(FOLLOWED, encoding="utf-8")
+    made = {}
+    for path in (*(ROBOTS / f"{name}.urdf" for name in robots), urdf):
+        source = generate(path, preset="closed-form")
+        made[path.stem] = import_source(source, folder / f"{path.stem}_closed_form.py"), load_arm(path).chain
+    return made
+
+
+def printed_without_structure(code: str, path: Path) -> str:
+    """Return the output of `code`, with `path` as argument, if nothing that derives structure can be imported."""
+    blocked = ("sympy", "flint", "spelgen.structure", "spelgen.emission.plan", "spelgen.arm.arm")
+    program = f"import sys\nfor name in {blocked}:\n    sys.modules[name] = None\n{code}"
+    run = subprocess.run(
+        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=False
+    )
+    assert not run.returncode, run.stderr
+    return run.stdout
 
 
 @cache

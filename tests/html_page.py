@@ -2,8 +2,7 @@
 
 from html.parser import HTMLParser
 
-from spelgen.render.page import SCRIPTS
-from spelgen.templates import read
+from spelgen.templates import SCRIPTS, read
 
 OWN = {read(name).strip() for name in SCRIPTS}
 VOID = {"meta", "br", "link", "input"}

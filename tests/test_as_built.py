@@ -16,10 +16,9 @@ import spelgen
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import LogError, SettingsError, SpelgenError, SpelgenErrors
-from spelgen.evaluation.truth import mass_error, true_mass
+from spelgen.evaluation.rollout import mass_error, true_mass
 from spelgen.excitation.trajectory import Motion
-from spelgen.settings.joint import JointSettings
-from spelgen.settings.settings import Settings
+from spelgen.settings.settings import JointSettings, Settings
 from spelgen.simulation.as_built import perturbed_urdf
 from spelgen.simulation.prescribed import friction_along, prescribed, read_motion
 from spelgen.simulation.protocol import make_friction

@@ -4,45 +4,18 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from emitted import import_source
+from emitted import closed_forms
 
-from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.emission.specify import generate
-from spelgen.structure.pseudo_inertia import pseudo_inertia
+from spelgen.structure.nominal import pseudo_inertia
 from spelgen.structure.sampling import float_energies
 
 ROBOTS = ("two_link", "rpr", "six_dof", "ur10e", "panda")
 
-FOLLOWED = """<robot name="followed">
-  <link name="base"/>
-  <link name="a"><inertial><origin xyz="0.2 0 0.1"/><mass value="2"/>
-    <inertia ixx="0.1" ixy="0.01" ixz="0" iyy="0.1" iyz="0.02" izz="0.15"/></inertial></link>
-  <link name="b"><inertial><origin xyz="0.1 0.1 0"/><mass value="1"/>
-    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
-  <link name="c"><inertial><origin xyz="0 0.1 0.1"/><mass value="1.5"/>
-    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.2" iyz="0" izz="0.15"/></inertial></link>
-  <joint name="turn" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>
-    <limit lower="-2" upper="2" effort="10" velocity="2"/></joint>
-  <joint name="follow" type="revolute"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/>
-    <origin xyz="0.4 0 0"/><mimic joint="turn" multiplier="-2" offset="0.3"/>
-    <limit lower="-2" upper="2" effort="10" velocity="2"/></joint>
-  <joint name="slide" type="prismatic"><parent link="b"/><child link="c"/><axis xyz="0 0 1"/>
-    <origin xyz="0 0.2 0" rpy="0.4 0 0"/><limit lower="0" upper="0.5" effort="10" velocity="1"/></joint>
-</robot>"""
-
 
 @pytest.fixture(scope="module")
-def emitted(robots, tmp_path_factory):
-    """Robot name -> (module, arm)."""
-    folder = tmp_path_factory.mktemp("closed_form")
-    (folder / "followed.urdf").write_text(FOLLOWED, encoding="utf-8")
-    made = {}
-    for name in (*ROBOTS, "followed"):
-        urdf = (folder if name == "followed" else robots) / f"{name}.urdf"
-        source = generate(urdf, preset="closed-form")
-        made[name] = import_source(source, folder / f"{name}_closed_form.py"), load_arm(urdf).chain
-    return made
+def emitted(tmp_path_factory):
+    return closed_forms(ROBOTS, tmp_path_factory.mktemp("closed_form"))
 
 
 def drawn(module, seed, deviation=0.5):

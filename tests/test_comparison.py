@@ -23,16 +23,15 @@ from spelgen.baselines.predictor import Predictor
 from spelgen.baselines.registry import hold_velocity
 from spelgen.cli.main import app
 from spelgen.comparison import jobs
-from spelgen.comparison.arms import ComparedArm, Comparison, ablation_designs, load_comparison
+from spelgen.comparison.arms import ComparedArm, Comparison, ablation_designs, arm_inputs, load_comparison
 from spelgen.comparison.figures import PredictionLoss, predict_example, spread_windows
-from spelgen.comparison.inputs import arm_inputs
 from spelgen.comparison.study import duration, prepare_study, run_study
 from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, comparison_sentence
 from spelgen.design import load_design
 from spelgen.emission.build import build
 from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.evaluation import rollout
-from spelgen.evaluation.truth import mass_error, true_mass
+from spelgen.evaluation.rollout import mass_error, true_mass
 from spelgen.evaluation.tuning import EvaluationTuning
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.rollout import roll_out

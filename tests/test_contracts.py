@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from emitted import GANTRY, SIX, built, import_source, randomise
+from emitted import FOLLOWED, GANTRY, SIX, built, import_source, randomise
 from torch import Tensor, nn
 from torch.func import hessian, jacfwd, jacrev, jvp, vmap
 
 import spelgen
 from spelgen.design import load_design
-from tests.test_closed_form import FOLLOWED
 
 VARIANTS = {  # preset and design
     "phnode": ("phnode", None),

@@ -10,8 +10,8 @@ import torch
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.module_check import check
 from spelgen.design import CHOICES, PRESETS, Design, Preset, load_design
+from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import SettingsError, SpelgenError
 

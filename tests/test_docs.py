@@ -31,6 +31,8 @@ HISTORY = re.compile(
     re.IGNORECASE,
 )
 SLOW = {"tutorial_servo.md"}  # a fit of half a minute: only `pytest --update` runs it
+# Without the rows of the table of control.md that it does not assert.
+SHORTER = {"control.md": {'("estimator", "learned", "URDF"):': '("estimator", "learned"):'}}
 RUN = [page for page in PAGES if page.name not in SLOW or "--update" in sys.argv]
 TUTORIALS = sorted((ROOT / "docs").glob("tutorial_*.md"))
 
@@ -44,6 +46,10 @@ def test_examples(page, tmp_path, monkeypatch, request):
     files = tree(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     text, names = page.read_text(encoding="utf-8"), {"__name__": "example"}
+    update = request.config.getoption("--update")
+    for full, shorter in SHORTER.get(page.name, {}).items():
+        assert full in text
+        text = text if update else text.replace(full, shorter)
     happened = text
     for language, block in BLOCK.findall(text):
         if language == "console":
@@ -56,7 +62,7 @@ def test_examples(page, tmp_path, monkeypatch, request):
                 happened = happened.replace(cell(text, block), cell("", block, printed.getvalue()))
     if page in TUTORIALS:
         assert tree(tmp_path) == files
-    if request.config.getoption("--update"):
+    if update:
         page.write_text(happened, encoding="utf-8")
     else:
         assert text == happened

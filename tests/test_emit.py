@@ -14,8 +14,8 @@ from emitted import GANTRY, built, import_source
 
 from spelgen.certificate.module_check import check
 from spelgen.design import Preset
-from spelgen.emission.module_file import read_spec
 from spelgen.emission.specify import generate
+from spelgen.emission.text import read_spec
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = Path(__file__).parent / "golden"

@@ -13,14 +13,13 @@ from planar_model import JOINTS, write_module
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.names import observed
 from spelgen.baselines.registry import hold_velocity
 from spelgen.cli import evaluate_command
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
@@ -30,6 +29,7 @@ from spelgen.evaluation.tables import table
 from spelgen.evaluation.torque import coarse_torques, torque_errors
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.train import train
+from spelgen.labels import observed
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs

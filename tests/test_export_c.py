@@ -21,7 +21,7 @@ from spelgen.exporting.c_export import c_files, called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import called_by_state, export_casadi
 from spelgen.exporting.describe import Trained, identifier
-from spelgen.exporting.entry_points import ENTRY_POINTS
+from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.export import export
 from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.parity import check_parity, random_inputs, require_parity

@@ -14,10 +14,10 @@ import spelgen
 from spelgen import design
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines import registry
-from spelgen.baselines.baseline import Baseline
 from spelgen.baselines.predictor import Predictor
+from spelgen.baselines.registry import Baseline
 from spelgen.emission import specify
-from spelgen.emission.loading import load_module
+from spelgen.emission.assemble import load_module
 from spelgen.errors import RunError
 from spelgen.exporting import exported
 from spelgen.log_checks.check_logs import check_logs

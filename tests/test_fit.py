@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from emitted import random_model
+from emitted import FOLLOWED, random_model
 from planar_model import JOINTS, Model, true_model, write_module
 
 import spelgen
@@ -18,7 +18,6 @@ from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit
-from tests.test_closed_form import FOLLOWED
 from tests.test_training import (
     QUICK,
     Oscillator,

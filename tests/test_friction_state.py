@@ -16,8 +16,8 @@ from spelgen.dynamics.bristles import (
     reach_of,
 )
 from spelgen.dynamics.friction import FrictionModel
+from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.identification.identification import LeastSquares
 from spelgen.identification.identify import least_squares

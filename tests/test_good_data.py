@@ -17,8 +17,8 @@ from spelgen.errors import LogError, RunError, SpelgenError
 from spelgen.excitation.design import excite
 from spelgen.fitting.run_folder import _require_finite
 from spelgen.log_checks.check_logs import check_logs
+from spelgen.logs.bags import mcap_messages
 from spelgen.logs.checks import check
-from spelgen.logs.mcap import mcap_messages
 from spelgen.logs.read import read_logs
 from spelgen.logs.suggest import suggest_mapping
 from spelgen.logs.trajectory import Trajectory

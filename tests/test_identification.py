@@ -21,7 +21,7 @@ from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.structure.base_parameters import base_parameters as exact_base_parameters
-from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
+from spelgen.structure.nominal import parameters_of, pseudo_inertia, reference_factor
 
 ROBOTS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")
 

@@ -5,7 +5,6 @@ import pytest
 import torch
 from planar_model import Model
 
-from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.baselines.predictor import Solver
 from spelgen.dynamics.protocol import VelocityState
 from spelgen.evaluation import horizons
@@ -13,6 +12,7 @@ from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.horizons import observe, past_steps, without_past
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.tuning import EvaluationTuning
+from spelgen.labels import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from emitted import FOLLOWED
 from motions import smooth_motion
 from scipy.signal import lfilter
 from typer.testing import CliRunner
@@ -14,7 +15,7 @@ from typer.testing import CliRunner
 import spelgen
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
-from spelgen.dynamics.base_combinations import base_combinations
+from spelgen.dynamics.body_regressor import base_combinations
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
@@ -36,7 +37,7 @@ from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.report_page import render_report, report_data
 from spelgen.settings.fits import TorqueFit
-from tests.test_closed_form import FOLLOWED, drawn
+from tests.test_closed_form import drawn
 
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "six_dof", "followed"])

@@ -15,8 +15,7 @@ from spelgen.dynamics.protocol import integrable
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics, urdf_parameters
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import ArmError, SpelgenErrors
-from spelgen.settings.joint import JointSettings
-from spelgen.settings.settings import Settings, load_settings
+from spelgen.settings.settings import JointSettings, Settings, load_settings
 from spelgen.urdf.read import read_urdf
 from tests.hand_built import SIDEWAYS, arm, body, coordinate, point, slider
 

@@ -19,7 +19,7 @@ from spelgen.evaluation.tables import CSV_HEAD, csv_text
 from spelgen.identification.identify import identify
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.arm_pages import identification_page
-from spelgen.render.runs_page import render_runs
+from spelgen.render.report_page import render_runs
 
 
 def test_runs_are_compared_and_the_better_one_is_named(run, tmp_path):  # noqa: F811

@@ -19,15 +19,12 @@ from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
 from spelgen.emission.build import build
 from spelgen.emission.standalone import bundle, load_runtime, names_in
 from spelgen.fitting.torque.parameters import log_cholesky_parameters, upper_cholesky
+from spelgen.runtime.body_chain import InertialParameters
 from spelgen.runtime.derived_mass import DerivedMass
-from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.friction_laws import SlidingFriction, turning
-from spelgen.runtime.hidden_units import hidden_units
-from spelgen.runtime.masked_kan import MaskedKAN
-from spelgen.runtime.masked_mlp import MaskedMLP
+from spelgen.runtime.networks import JointEncoding, MaskedKAN, MaskedMLP, hidden_units
 from spelgen.runtime.parts import symmetric
 from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
-from spelgen.runtime.rigid_body import InertialParameters
 from spelgen.runtime.rows import Constant, Joint, Link, vector
 
 NUMBERS = Path(__file__).parent / "golden" / "numbers.json"

@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.render.arm_section import arm_section, matrix
-from spelgen.render.page import json_data
-from spelgen.render.scene import scene
-from spelgen.render.shapes import joined, tube
+from spelgen.render.scene import joined, scene, tube
 from spelgen.structure.structure import derive
+from spelgen.templates import json_data
 
 
 def frames(links, q):

@@ -15,7 +15,6 @@ from servo_arm import COM, GRAVITY, MASS, STRIBECK_VELOCITY, Servos, servo_logs,
 from typer.testing import CliRunner
 
 import spelgen
-from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS
 from spelgen.cli.main import app
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, SettingsError
@@ -27,10 +26,10 @@ from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.identification.intervals import jackknife_covariance
+from spelgen.labels import DELAYED_COMMAND, LINEAR_SERVOS
 from spelgen.listing import number
-from spelgen.logs.commands import delayed_commands
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, delayed_commands
 from spelgen.render.report_page import render_report
 from spelgen.structure.servo_rank import servo_rank
 

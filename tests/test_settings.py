@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import SettingsError, SpelgenErrors
-from spelgen.settings.joint import JointSettings
-from spelgen.settings.settings import OF_A_STEP, Settings, load_mapping, load_settings
+from spelgen.settings.settings import OF_A_STEP, JointSettings, Settings, load_mapping, load_settings
 from spelgen.simulation.protocol import make_friction
 
 

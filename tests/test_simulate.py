@@ -10,8 +10,7 @@ from spelgen.arm.arm import make_arm
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import RunError, SettingsError
-from spelgen.settings.joint import JointSettings
-from spelgen.settings.settings import Settings, load_settings
+from spelgen.settings.settings import JointSettings, Settings, load_settings
 from spelgen.simulation import integration
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.protocol import make_friction

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from delan_characters import TESTS, read_characters, write_arm
-from emitted import import_source
+from emitted import closed_forms, import_source
 from lxml import etree
 from motions import smooth_motion
 from scipy.optimize import minimize_scalar
@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import LogError
 from spelgen.fitting.fit import default_objective, fit
@@ -48,23 +48,15 @@ from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import GaussianPrior, Rollout, TorqueFit
-from tests.test_closed_form import FOLLOWED, drawn
+from tests.test_closed_form import drawn
 
 ROBOTS = ("two_link", "rpr", "six_dof")
 BODIES = "bodies.raw"
 
 
 @pytest.fixture(scope="module")
-def emitted(robots, tmp_path_factory):
-    """Robot name -> (module, arm)."""
-    folder = tmp_path_factory.mktemp("rigid_bodies")
-    (folder / "followed.urdf").write_text(FOLLOWED, encoding="utf-8")
-    made = {}
-    for name in (*ROBOTS, "followed"):
-        urdf = (folder if name == "followed" else robots) / f"{name}.urdf"
-        source = generate(urdf, preset="closed-form")
-        made[name] = import_source(source, folder / f"{name}_closed_form.py"), load_arm(urdf).chain
-    return made
+def emitted(tmp_path_factory):
+    return closed_forms(ROBOTS, tmp_path_factory.mktemp("rigid_bodies"))
 
 
 def recorded(model, seconds, noise, seed=0):

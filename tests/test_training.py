@@ -18,8 +18,8 @@ import torch
 from planar_model import JOINTS, Model, true_model, write_module
 from rich.console import Console
 
-from spelgen.emission.loading import load_module
-from spelgen.emission.module_file import read_spec
+from spelgen.emission.assemble import load_module
+from spelgen.emission.text import read_spec
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs

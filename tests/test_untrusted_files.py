@@ -20,8 +20,8 @@ from time_bounds import in_time
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.comparison.jobs import RunResult
+from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import LogError, RunError, SettingsError, SpelgenError
 from spelgen.exporting.exported import readme
@@ -31,7 +31,7 @@ from spelgen.logs import bags
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import MomentumFit, Rollout
-from spelgen.settings.messages import validated
+from spelgen.settings.yaml_document import validated
 
 JOINTS = ("joint1", "joint2")
 SAMPLES = 60

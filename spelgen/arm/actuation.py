@@ -4,9 +4,7 @@ Logs contain joint torques, or motor torques if the settings specify ``torque: m
 the couplings of wrists.
 """
 
-from __future__ import annotations
-
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -64,22 +62,19 @@ class Actuation:
 
     def matrix(self) -> np.ndarray:
         """Return G (n, n), with trained gains at their initial values."""
-        return self._matrix(self.entries)
+        result = np.zeros((self.joints, self.joints))
+        for entry in self.entries:
+            result[entry.row, entry.column] = entry.value
+        return result
 
     def drives(self) -> Drives:
         """Return the input matrix G, (n, n), and the motor speeds C per joint velocity, (n, n)."""
         torques = self.matrix()
         for coupling in self.couplings:
             torques[coupling.row] = 0.0  # the logged torque acts at the joint, not at its motors
-        torques += self._matrix(self.couplings)
+        for coupling in self.couplings:
+            torques[coupling.row, coupling.column] = coupling.value
         return Drives(self.matrix(), motor_speeds(torques))
-
-    def _matrix(self, entries: Sequence[InputEntry]) -> np.ndarray:
-        """Return the matrix (n, n) of these entries."""
-        result = np.zeros((self.joints, self.joints))
-        for entry in entries:
-            result[entry.row, entry.column] = entry.value
-        return result
 
 
 def motor_speeds(inputs: np.ndarray) -> np.ndarray:
@@ -107,27 +102,24 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
     # the row of a passive joint is zero
     driven = [name for name in joints if settings.joint(name).actuated]
     remarks = tuple(_undriven(robot, settings, driven))
-    couplings = _couplings(robot, settings, joints)
+    couplings = tuple(_couplings(robot, settings, joints))
     if settings.torque == "joint":
-        direct: list[InputEntry] = []
-        for name in driven:
-            direct.append(InputEntry(joints.index(name), joints.index(name), "fixed", 1.0))
-        return Actuation(len(joints), tuple(direct), remarks, tuple(couplings))
-    entries = list(couplings)
+        direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
+        return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    for name in driven:
-        index = joints.index(name)
-        if index not in coupled:
-            entries.append(_geared(robot, settings, name, index))
-    entries.sort(key=lambda entry: (entry.row, entry.column))
+    # G is known for coupled joints, and a gear of their own would count twice
+    geared = [
+        _geared(robot, settings, name, k)
+        for k, name in enumerate(joints)
+        if name in driven and k not in coupled
+    ]
+    entries = sorted([*couplings, *geared], key=lambda entry: (entry.row, entry.column))
     return Actuation(len(joints), tuple(entries), remarks)
 
 
 def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterator[Diagnostic]:
     """Yield a remark for each joint without transmission if other joints have one: it may be a passive joint."""
-    transmitted: set[str] = set()
-    for transmission in robot.transmissions:
-        transmitted.update(transmission.joint_names)
+    transmitted = {name for transmission in robot.transmissions for name in transmission.joint_names}
     # most URDFs have no transmissions
     if transmitted.isdisjoint(driven):
         return
@@ -140,15 +132,11 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
 def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEntry:
     """Return the entry of a motor and its joint: the gear of the settings, else of the URDF, else a trained gain."""
     joint = settings.joint(name)
-    gear: float | None = joint.gear
-    if "gear" not in joint.model_fields_set:
-        gear = _reduction(robot, name)
+    gear = joint.gear if "gear" in joint.model_fields_set else _reduction(robot, name)
     # an unknown gain is trained, not assumed to be 1
     if gear is None:
         return InputEntry(index, index, "gain", 1.0)
-    if joint.gain == "trained":
-        return InputEntry(index, index, "gain", gear)
-    return InputEntry(index, index, "fixed", gear)
+    return InputEntry(index, index, "gain" if joint.gain == "trained" else "fixed", gear)
 
 
 def _reduction(robot: Robot, name: str) -> float | None:
@@ -166,37 +154,30 @@ def _reduction(robot: Robot, name: str) -> float | None:
 def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[InputEntry]:
     """Return the couplings of the settings, then the differential transmissions of the URDF for all other joints."""
     entries: list[InputEntry] = []
-    coupled: set[str] = set()
+    free = set(joints)
     errors = []
     for coupling in settings.couplings:
         locked = [name for name in coupling.joints if name not in joints]
         # a coupling of only locked joints belongs to another part of the robot
-        if len(locked) < len(coupling.joints):
-            for name in locked:
-                errors.append(_locked(name, joints))
-            coupled.update(coupling.joints)
-            if not locked:
-                entries += _block(joints, coupling.joints, coupling.matrix)
+        if len(locked) == len(coupling.joints):
+            continue
+        free.difference_update(coupling.joints)
+        expected = f"joints of the arm: {', '.join(joints)}"
+        for name in locked:
+            got = f"the joint {name!r}, which is locked"
+            errors.append(SettingsError(got, element="couplings", expected=expected))
+        if not locked:
+            entries += _block(joints, coupling.joints, coupling.matrix)
     collect(errors)
     for transmission in robot.transmissions:
-        if _is_differential(transmission, set(joints) - coupled):
-            if transmission.errors and settings.torque == "joint":
-                continue  # not needed
+        names = transmission.joint_names
+        is_pair = _DIFFERENTIAL in transmission.type and len(names) == len(transmission.actuators) == 2
+        # for logged joint torques an unusable transmission is not needed
+        if is_pair and free.issuperset(names) and not (transmission.errors and settings.torque == "joint"):
             collect(transmission.errors)
-            entries += _block(joints, transmission.joint_names, _differential(transmission))
-            coupled.update(transmission.joint_names)
+            entries += _block(joints, names, _differential(transmission))
+            free.difference_update(names)
     return entries
-
-
-def _locked(name: str, joints: Sequence[str]) -> SettingsError:
-    expected = f"joints of the arm: {', '.join(joints)}"
-    return SettingsError(f"the joint {name!r}, which is locked", element="couplings", expected=expected)
-
-
-def _is_differential(transmission: Transmission, free: Collection[str]) -> bool:
-    names = transmission.joint_names
-    pair = len(names) == len(transmission.actuators) == 2
-    return _DIFFERENTIAL in transmission.type and pair and set(names) <= set(free)
 
 
 def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]:

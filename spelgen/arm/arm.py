@@ -1,27 +1,21 @@
-"""Robot -> Chain: the serial chain with exact geometry; links on fixed and locked joints are lumped."""
+"""Robot -> Chain: the serial chain with exact geometry; links on fixed and locked joints are lumped into bodies."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import pi
+from typing import NamedTuple
 
-from spelgen.arm.chain import ChainChoice, choose_chain, leaders
-from spelgen.arm.lump_links import MovingJoint, lump_links
-from spelgen.arm.placement import TenVector
-from spelgen.arm.rational import Matrix, Vector, as_matrix, as_vector, exact
+import numpy as np
+
+from spelgen.arm.chain import ChainChoice, Leader, choose_chain, leaders
+from spelgen.arm.placement import AngleRounding, Frame, Placement, TenVector
+from spelgen.arm.rational import Matrix, Vector, bounded, exact, rotation_from_rpy
 from spelgen.errors import ArmError, Diagnostic
-from spelgen.urdf.robot import JointType, Robot, UrdfJoint
-
-# Largest number of joints: the cost of the derivation increases with about the fifth power.
-MAX_JOINTS = 16
-# Largest number of mimic joints, each of which is a separate body in the derivation.
-MAX_FOLLOWERS = 48
+from spelgen.urdf.robot import JointType, Robot, UrdfJoint, UrdfLink
 
 
-@dataclass(frozen=True)
-class Coordinate:
+class Coordinate(NamedTuple):
     """A degree of freedom; limits as in the file (rad or m, N m or N, per second), None if absent."""
 
     name: str
@@ -97,6 +91,23 @@ class Chain:
         return all(body.inertia is not None and body.inertia[0] > 0 for body in self.bodies)
 
 
+class MovingJoint(NamedTuple):
+    """A moving joint, the ``links`` with an inertial that move rigidly with it, and their body."""
+
+    joint: UrdfJoint
+    links: tuple[UrdfLink, ...]
+    body: Body
+
+
+class LumpedLinks(NamedTuple):
+    """Moving joints (the chain first), locked joints (fixed ones included), and the frames of all links by name."""
+
+    moved: tuple[MovingJoint, ...]
+    locked: tuple[UrdfJoint, ...]
+    frames: Mapping[str, Frame]
+    diagnostics: tuple[Diagnostic, ...]
+
+
 def make_arm(
     robot: Robot,
     *,
@@ -104,6 +115,7 @@ def make_arm(
     tip: str | None = None,
     angle_tolerance: float = 2e-3,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
+    passive: Collection[str] = (),
 ) -> Chain:
     """Return an arm of a robot; all joints that are not part of the arm are locked at 0.
 
@@ -113,6 +125,7 @@ def make_arm(
         tip: the last link, in place of ``joints``; without both, the arm is the longest serial chain.
         angle_tolerance: angles within it [rad] of a multiple of pi/2 are rounded to it; 0: none are.
         gravity: acceleration of gravity in the frame of the root link [m/s2].
+        passive: names of the joints without an actuator.
 
     Raises ArmError.
     """
@@ -123,15 +136,12 @@ def make_arm(
     _require_small(robot, chain)
     lumped = lump_links(robot, chain, angle_tolerance)
     locked = {joint.name for joint in lumped.locked if joint.type != "fixed"}
-    bodies = []
-    for moved in lumped.moved:
-        bodies.append(_body(moved, chain.names.index(moved.followed.leader.name)))
     # exact, so that the gravity torque of a vertical axis is 0 and not 1e-17
     x, y, z = map(exact, map(float, gravity))
     return Chain(
         name=robot.name,
-        coordinates=tuple(map(_coordinate, chain.joints)),
-        bodies=tuple(bodies),
+        coordinates=tuple(_coordinate(joint, joint.name in passive) for joint in chain.joints),
+        bodies=tuple(moving.body for moving in lumped.moved),
         gravity=(x, y, z),
         diagnostics=lumped.diagnostics,
         locked=tuple(joint.name for joint in robot.joints if joint.name in locked),
@@ -140,49 +150,159 @@ def make_arm(
 
 def _require_small(robot: Robot, chain: ChainChoice) -> None:
     """Raise ArmError for an arm whose derivation would take more than some seconds."""
-    moving = len(chain.joints)
-    if moving > MAX_JOINTS:
+    # the cost of the derivation increases with about the fifth power of the joints
+    moving, largest, most_followers = len(chain.joints), 16, 48
+    if moving > largest:
         do = "choose fewer with --joints or --tip"
-        raise ArmError(f"{moving} joints", file=robot.source, expected=f"at most {MAX_JOINTS}", do=do)
-    following = -moving  # each joint of the chain is its own leader
-    for follow in leaders(robot).values():
-        following += follow.leader.name in chain.names
-    if following > MAX_FOLLOWERS:
+        raise ArmError(f"{moving} joints", file=robot.source, expected=f"at most {largest}", do=do)
+    # each mimic joint is a separate body in the derivation; each joint of the chain is its own leader
+    following = sum(x.leader.name in chain.names for x in leaders(robot).values()) - moving
+    if following > most_followers:
         got = f"{following} joints that follow others by <mimic>"
-        raise ArmError(got, file=robot.source, expected=f"at most {MAX_FOLLOWERS}", do="fix some of them")
+        raise ArmError(got, file=robot.source, expected=f"at most {most_followers}", do="fix some of them")
 
 
-def _body(moved: MovingJoint, coordinate: int) -> Body:
-    return Body(
-        name=moved.joint.name,
-        link=moved.joint.child,
-        joint_type=_joint_type(moved.joint),
-        parent=moved.pose.parent,
-        coordinate=coordinate,
-        multiplier=moved.followed.multiplier,
-        offset=float(moved.followed.offset),
-        rotation=as_matrix(moved.pose.rotation),
-        translation=as_vector(moved.pose.translation),
-        inertia=moved.inertia,
-    )
-
-
-def _coordinate(joint: UrdfJoint) -> Coordinate:
-    return Coordinate(
-        name=joint.name,
-        joint_type=_joint_type(joint),
-        continuous=joint.type == "continuous",
-        lower=joint.lower,
-        upper=joint.upper,
-        effort=joint.effort,
-        velocity=joint.velocity,
-        damping=joint.damping,
-        friction=joint.friction,
-        passive=False,
-    )
+def _coordinate(joint: UrdfJoint, passive: bool) -> Coordinate:
+    limits = joint.lower, joint.upper, joint.effort, joint.velocity
+    is_continuous = joint.type == "continuous"
+    friction = joint.damping, joint.friction
+    return Coordinate(joint.name, _joint_type(joint), is_continuous, *limits, *friction, passive)
 
 
 def _joint_type(joint: UrdfJoint) -> JointType:
-    if joint.type == "prismatic":
-        return "prismatic"
-    return "revolute"
+    return "prismatic" if joint.type == "prismatic" else "revolute"
+
+
+def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> LumpedLinks:
+    """Return the robot with moving joints of the chain and their followers, and all other joints locked."""
+    rounding = AngleRounding(angle_tolerance)
+    placement = Placement(robot.root, rounding)
+    # Chains of mimic joints are resolved to the joint that leads them, with products of the multipliers.
+    following = leaders(robot)
+    poses = []
+    locked: list[UrdfJoint] = []
+    # bodies have this order: parents first, and the chain before followers on branches
+    path = robot.path_to(chain.joints[-1].child)
+    for joint in dict.fromkeys([*path, *robot.joints_from_root]):
+        followed = following[joint.name]
+        if joint.moves and followed.leader.name in chain.names and followed.multiplier:
+            poses.append((joint, *placement.move(joint)))
+        else:
+            # the position of a follower of a locked joint is its offset
+            locked.append(joint)
+            placement.lock(joint, float(followed.offset) if joint.moves else 0.0)
+    moved = []
+    for index, (joint, parent, rotation, translation) in enumerate(poses):
+        followed = following[joint.name]
+        # M and V depend only on the sum of the inertias of links that move together
+        links = tuple(x for x in robot.links if x.inertial and placement.frames[x.name].body == index)
+        body = Body(
+            name=joint.name,
+            link=joint.child,
+            joint_type=_joint_type(joint),
+            parent=parent,
+            coordinate=chain.names.index(followed.leader.name),
+            multiplier=followed.multiplier,
+            offset=float(followed.offset),
+            rotation=tuple(map(tuple, rotation)),
+            translation=tuple(translation),
+            inertia=_total(placement, links),
+        )
+        moved.append(MovingJoint(joint, links, body))
+    diagnostics = [
+        *chain.diagnostics,
+        *rounding.diagnostics,
+        *_moved_remarks(moved, following),
+        *_locked_remarks(following, locked),
+        *_dependent_remarks(placement, moved, locked),
+    ]
+    diagnostics.sort(key=lambda diagnostic: diagnostic.line or 0)
+    return LumpedLinks(tuple(moved), tuple(locked), placement.frames, tuple(diagnostics))
+
+
+def _total(placement: Placement, links: Sequence[UrdfLink]) -> TenVector | None:
+    """Return the sum of the inertias of links about the origin of their body; None without links."""
+    tens = [placement.inertia(link, link.inertial) for link in links if link.inertial]
+    if not tens:
+        return None
+    total = tens[0]
+    # bounded after each sum: of an untrusted file digits could grow with every link
+    for ten in tens[1:]:
+        total = tuple(bounded(a + b) for a, b in zip(total, ten, strict=True))
+    return total
+
+
+def _remark(code: str, joint: UrdfJoint, message: str) -> Diagnostic:
+    return Diagnostic("info", code, f"joint {joint.name!r}", joint.line, message)
+
+
+def _moved_remarks(moved: Sequence[MovingJoint], following: Mapping[str, Leader]) -> Iterator[Diagnostic]:
+    for moving in moved:
+        joint, followed = moving.joint, following[moving.joint.name]
+        if joint.mimic is not None:
+            message = f"moves at {float(followed.multiplier):g} times {followed.leader.name!r}"
+            if followed.offset:
+                message += f" plus {float(followed.offset):g}"
+            yield _remark("mimic-folded", joint, message)
+        carried = {
+            repr(x.name): x.inertial.mass for x in moving.links if x.inertial and x.name != joint.child
+        }
+        if carried:
+            mass = sum(carried.values())
+            message = f"also carries {', '.join(carried)} ({mass:.4g} kg) by fixed or locked joints"
+            yield _remark("lumped", joint, message)
+
+
+def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
+    # one remark for all: a humanoid has thirty locked joints
+    outside = [joint for joint in locked if joint.moves and joint.mimic is None]
+    if outside:
+        names = ", ".join(repr(joint.name) for joint in outside)
+        message = f"locked at 0, not part of the chain: {names}"
+        yield Diagnostic("info", "locked-joint", "joints", outside[0].line, message)
+    for joint in locked:
+        if joint.type == "fixed" or joint in outside:
+            continue
+        followed = following[joint.name]
+        message = f"a {joint.type} joint that is not part of the chain: fixed at its origin"
+        if joint.mimic is not None:
+            message = f"follows {followed.leader.name!r}: locked at {float(followed.offset):g}"
+        yield _remark("locked-joint", joint, message)
+
+
+def _dependent_remarks(
+    placement: Placement, moved: Sequence[MovingJoint], locked: Sequence[UrdfJoint]
+) -> Iterator[Diagnostic]:
+    """Yield a warning for each locked joint that is parallel to a joint of the chain with the same parent body.
+
+    Such a pair indicates a parallelogram linkage whose loop was opened in the URDF.
+    """
+    behind: set[str] = set()
+    for joint in locked:
+        if joint.moves or joint.parent in behind:
+            behind.add(joint.child)
+        turns = joint.type in ("revolute", "continuous") and joint.mimic is None
+        # joints behind a locked joint are not part of a linkage of the arm
+        if joint.parent in behind or not turns:
+            continue
+        beside = _parallel_beside(placement.frames[joint.parent], moved, joint)
+        if beside:
+            message = (
+                f"turns parallel to {beside[0]!r} beside it, and has no <mimic>: "
+                "if a linkage couples the two, add one; locked at 0 until then"
+            )
+            yield Diagnostic("warning", "dependent-joints", f"joint {joint.name!r}", joint.line, message)
+
+
+def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], joint: UrdfJoint) -> list[str]:
+    """Return the revolute joints with the same parent body as ``joint``, in its frame, and a parallel axis."""
+    rotation = np.array(frame.rotation, dtype=float) @ rotation_from_rpy(joint.rpy)
+    axis = rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis)
+    parallel = []
+    for body in (moving.body for moving in moved):
+        # a body rotates about the z axis of its frame
+        beside = np.array(body.rotation, dtype=float)[:, 2]
+        is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2  # [rad] parallel within rounding errors
+        if body.parent == frame.body >= 0 and body.joint_type != "prismatic" and is_parallel:
+            parallel.append(body.name)
+    return parallel

@@ -1,12 +1,10 @@
 """Robot -> the joints that are the coordinates of the arm, and the leaders of mimic joints."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
+from typing import NamedTuple
 
 from spelgen.arm.rational import bounded, exact
 from spelgen.errors import ArmError, Diagnostic, Severity, suggestion
@@ -14,11 +12,9 @@ from spelgen.urdf.robot import Robot, UrdfJoint
 
 # names of joints of grippers, at which the arm ends
 _GRIPPER = re.compile(r"gripper|finger|thumb|knuckle|(?:^|[^a-z])jaws?(?:[^a-z]|$)", re.IGNORECASE)
-_CHOOSE = "choose one with --tip LINK or --joints A,B,..., or write tip or moving_joints into the settings"
 
 
-@dataclass(frozen=True)
-class ChainChoice:
+class ChainChoice(NamedTuple):
     """The selected joints, root first, and diagnostics of the selection."""
 
     joints: tuple[UrdfJoint, ...]
@@ -30,8 +26,7 @@ class ChainChoice:
         return [joint.name for joint in self.joints]
 
 
-@dataclass(frozen=True)
-class Leader:
+class Leader(NamedTuple):
     """The leader of a joint, which is no mimic joint: q = multiplier * q_leader + offset."""
 
     leader: UrdfJoint
@@ -49,13 +44,24 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
     if joints is not None:
         chain = ChainChoice(_named(robot, joints))
     elif tip is not None:
-        chain = ChainChoice(_up_to(robot, tip))
+        if tip not in robot.link:
+            raise ArmError(f"no link is named {tip!r}", file=robot.source, do=suggestion(tip, robot.link))
+        chain = ChainChoice(_independent(robot.path_to(tip)))
     else:
         chain = _longest(robot)
     if not chain.joints:
         expected = "a serial chain of joints"
         raise ArmError("no joint that moves by itself", file=robot.source, expected=expected)
-    _refuse_free_joints(robot, chain.joints)
+    # A mobile base has a floating joint below the arm, which is described relative to it: held fixed.
+    below = robot.path_to(chain.joints[0].parent)
+    for joint in robot.path_to(chain.joints[-1].parent):
+        if joint.type in ("floating", "planar") and joint not in below:
+            raise ArmError(
+                f"a {joint.type} joint on the way to the joint {chain.joints[-1].name!r}", file=robot.source,
+                line=joint.line, element=f"joint {joint.name!r}",
+                expected="revolute, continuous, prismatic and fixed joints there",
+                do="make the joint fixed, or take it out",
+            )  # fmt: skip
     return chain
 
 
@@ -87,22 +93,6 @@ def _independent(joints: Iterable[UrdfJoint]) -> tuple[UrdfJoint, ...]:
     return tuple(filter(_moves_by_itself, joints))
 
 
-def _refuse_free_joints(robot: Robot, chain: Sequence[UrdfJoint]) -> None:
-    """Raise ArmError for a floating or planar joint between the chain's joints; one below the arm is held fixed."""
-    # A mobile base has such a joint below the arm: the arm is described relative to it.
-    below = robot.path_to(chain[0].parent)
-    for joint in robot.path_to(chain[-1].parent):
-        if joint.type in ("floating", "planar") and joint not in below:
-            raise ArmError(
-                f"a {joint.type} joint on the way to the joint {chain[-1].name!r}",
-                file=robot.source,
-                line=joint.line,
-                element=f"joint {joint.name!r}",
-                expected="revolute, continuous, prismatic and fixed joints there",
-                do="make the joint fixed, or take it out",
-            )
-
-
 def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
     """Return the joints of these names. Raises ArmError unless they are in their order on one path."""
     chosen = [_usable(robot, name) for name in names]
@@ -116,20 +106,14 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
     ordered = tuple(joint for joint in robot.path_to(deepest.child) if joint in chosen)
     for joint in chosen:
         if joint not in ordered:
+            got = f"the joints {joint.name!r} and {deepest.name!r}, which lie on different branches"
             raise ArmError(
-                f"the joints {joint.name!r} and {deepest.name!r}, which lie on different branches",
-                file=robot.source,
-                line=joint.line,
-                expected="joints on one path from the root",
+                got, file=robot.source, line=joint.line, expected="joints on one path from the root"
             )
     # columns of logs have the given order, which sorting would permute
     if list(ordered) != chosen:
-        raise ArmError(
-            f"the joints in the order {','.join(names)}",
-            file=robot.source,
-            expected="the order from the root to the tip",
-            do=f"use {','.join(joint.name for joint in ordered)}",
-        )
+        got, do = f"the joints in the order {','.join(names)}", f"use {','.join(x.name for x in ordered)}"
+        raise ArmError(got, file=robot.source, expected="the order from the root to the tip", do=do)
     return ordered
 
 
@@ -141,54 +125,52 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
         raise ArmError(f"no joint is named {name!r}", file=robot.source, do=suggestion(name, names))
     if _moves_by_itself(joint):
         return joint
-    got = f"a {joint.type} joint"
-    expected = "a revolute, continuous or prismatic joint"
-    do = None
+    got, expected, do = f"a {joint.type} joint", "a revolute, continuous or prismatic joint", None
     if joint.moves:
-        got = "a mimic joint"
-        expected = "its leader"
+        got, expected = "a mimic joint", "its leader"
         do = f"name {leaders(robot)[name].leader.name!r} instead: what follows it moves with it"
     element = f"joint {name!r}"
     raise ArmError(got, file=robot.source, line=joint.line, element=element, expected=expected, do=do)
 
 
-def _up_to(robot: Robot, tip: str) -> tuple[UrdfJoint, ...]:
-    if tip not in robot.link:
-        raise ArmError(f"no link is named {tip!r}", file=robot.source, do=suggestion(tip, robot.link))
-    return _independent(robot.path_to(tip))
-
-
 def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain. Raises ArmError for several of equal length without an unambiguous criterion."""
     # Arms are the longest chain of a robot; hands, tools and sensors are on shorter branches.
-    chains = _chains(robot)
+    tips = [link.name for link in robot.links if not robot.joints_below[link.name]]
+    # several fixed fingers are at the end of the same chain
+    chains = dict.fromkeys(_without_gripper(_independent(robot.path_to(tip))) for tip in tips)
     length = max(map(len, chains), default=0)
     longest = [chain for chain in chains if len(chain) == length]
-    if not longest:
+    if not length:
         return ChainChoice(())
+    first, last = longest[0], longest[0][-1]
     if len(longest) == 1:
-        return ChainChoice(longest[0], _possible_gripper(robot, longest[0]))
-    # two jaws form two chains of equal length
-    if _is_parallel_gripper(longest):
+        return ChainChoice(first, _possible_gripper(robot, last))
+    # two jaws form two chains of equal length, which differ only in a last prismatic joint with the same parent link
+    if first[:-1] and {(*x[:-1], x[-1].type, x[-1].parent) for x in longest} == {
+        (*first[:-1], "prismatic", last.parent)
+    }:
         jaws = ", ".join(repr(chain[-1].name) for chain in longest)
         message = f"{jaws} slide side by side at the end of the chain: taken as a gripper's and locked"
-        return ChainChoice(longest[0][:-1], (_remark(longest[0][-1], "info", message),))
+        return ChainChoice(first[:-1], _remark(last, "info", message))
     # nothing drives a joint without an effort limit, which is 0 in the file
     driven = [chain for chain in longest if all(joint.effort is not None for joint in chain)]
     if len(driven) == 1:
         message = f"{len(longest)} chains of {length} joints: the only one with effort limits of all joints is taken"
-        return ChainChoice(driven[0], (_remark(driven[0][-1], "warning", message),))
-    raise _ambiguous(robot, longest)
+        return ChainChoice(driven[0], _remark(driven[0][-1], "warning", message))
+    listed = [f"one to the link {x[-1].child!r} ({x[0].name} ... {x[-1].name})" for x in longest[:4]]
+    if len(longest) > 4:
+        listed.append(f"{len(longest) - 4} more")
+    got = f"{len(longest)} chains of {length} joints: {' and '.join(listed)}"
+    do = "choose one with --tip LINK or --joints A,B,..., or write tip or moving_joints into the settings"
+    raise ArmError(got, file=robot.source, expected="one longest chain", do=do)
 
 
-def _possible_gripper(robot: Robot, chain: Sequence[UrdfJoint]) -> tuple[Diagnostic, ...]:
+def _possible_gripper(robot: Robot, last: UrdfJoint) -> tuple[Diagnostic, ...]:
     """Return a remark if the last joint may open a gripper: it moves a link of that name, and no other joint does.
 
     No jaw opens by half a turn: a joint with a larger range turns the gripper.
     """
-    if not chain:
-        return ()
-    last = chain[-1]
     turns = last.lower is not None and last.upper is not None and last.upper - last.lower > math.pi
     if turns or not _GRIPPER.search(last.child) or any(map(_GRIPPER.search, robot.joint)):
         return ()
@@ -196,22 +178,11 @@ def _possible_gripper(robot: Robot, chain: Sequence[UrdfJoint]) -> tuple[Diagnos
         f"moves the link {last.child!r}, as the last joint of the arm: if it opens a gripper, exclude it by "
         f"'--tip {last.parent}', or by 'tip' in the settings"
     )
-    return (_remark(last, "info", message),)
+    return _remark(last, "info", message)
 
 
-def _remark(joint: UrdfJoint, severity: Severity, message: str) -> Diagnostic:
-    return Diagnostic(severity, "ambiguous-chain", f"joint {joint.name!r}", joint.line, message)
-
-
-def _chains(robot: Robot) -> list[tuple[UrdfJoint, ...]]:
-    """Return the distinct chains from the root to a tip, without joints of grippers."""
-    chains: dict[tuple[str, ...], tuple[UrdfJoint, ...]] = {}
-    for link in robot.links:
-        if not robot.joints_below[link.name]:
-            chain = _without_gripper(_independent(robot.path_to(link.name)))
-            # several fixed fingers are at the end of the same chain
-            chains.setdefault(tuple(joint.name for joint in chain), chain)
-    return list(chains.values())
+def _remark(joint: UrdfJoint, severity: Severity, message: str) -> tuple[Diagnostic, ...]:
+    return (Diagnostic(severity, "ambiguous-chain", f"joint {joint.name!r}", joint.line, message),)
 
 
 def _without_gripper(chain: tuple[UrdfJoint, ...]) -> tuple[UrdfJoint, ...]:
@@ -220,23 +191,3 @@ def _without_gripper(chain: tuple[UrdfJoint, ...]) -> tuple[UrdfJoint, ...]:
         end -= 1
     # if all joints are joints of fingers, the finger is the arm
     return chain[:end] or chain
-
-
-def _is_parallel_gripper(chains: Sequence[tuple[UrdfJoint, ...]]) -> bool:
-    """Whether chains differ only in a last prismatic joint with the same parent link."""
-    *arm, jaw = chains[0]
-    for chain in chains:
-        last = chain[-1]
-        if list(chain[:-1]) != arm or last.type != "prismatic" or last.parent != jaw.parent:
-            return False
-    return bool(arm)
-
-
-def _ambiguous(robot: Robot, chains: Sequence[tuple[UrdfJoint, ...]]) -> ArmError:
-    listed = []
-    for chain in chains[:4]:
-        listed.append(f"one to the link {chain[-1].child!r} ({chain[0].name} ... {chain[-1].name})")
-    if len(chains) > 4:
-        listed.append(f"{len(chains) - 4} more")
-    got = f"{len(chains)} chains of {len(chains[0])} joints: {' and '.join(listed)}"
-    return ArmError(got, file=robot.source, expected="one longest chain", do=_CHOOSE)

@@ -1,9 +1,7 @@
 """An arm from its URDF and its settings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from spelgen.arm.actuation import Actuation, derive_actuation
@@ -68,15 +66,15 @@ def load_arm(
     settings = load_settings(path, robot.joint)
     if joints is None and tip is None:
         joints, tip = settings.moving_joints, settings.tip
-    arm = make_arm(robot, joints=joints, tip=tip, angle_tolerance=angle_tolerance, gravity=settings.gravity)
-    coordinates = tuple(
-        replace(coordinate, passive=not settings.joint(coordinate.name).actuated)
-        for coordinate in arm.coordinates
+    passive = [name for name in robot.joint if not settings.joint(name).actuated]
+    gravity = settings.gravity
+    arm = make_arm(
+        robot, joints=joints, tip=tip, angle_tolerance=angle_tolerance, gravity=gravity, passive=passive
     )
     return Arm(
         robot=robot,
         settings=settings,
-        chain=replace(arm, coordinates=coordinates),
+        chain=arm,
         actuation=derive_actuation(robot, settings, arm.joint_names),
         joints=None if joints is None else tuple(joints),
         tip=tip,

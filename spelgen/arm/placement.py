@@ -5,22 +5,122 @@ joints (a segment), and approximated by a rational matrix once: 45 degrees, a pr
 exactly 90, and every rotation is exactly orthogonal.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from fractions import Fraction
+from math import pi
+from typing import NamedTuple
 
 import numpy as np
 
-from spelgen.arm.angle_rounding import AngleRounding
-from spelgen.arm.rational import IDENTITY, ZERO, alignment, exact, exact_rotation, lost_zeros, rotation_about
+from spelgen.arm.rational import (
+    IDENTITY,
+    TUNING,
+    ZERO,
+    alignment,
+    bounded,
+    exact,
+    exact_rotation,
+    lost_zeros,
+    rotation_about,
+    rotation_from_rpy,
+    rounded_angle,
+)
+from spelgen.errors import Diagnostic
 from spelgen.urdf.robot import Inertial, UrdfJoint, UrdfLink
 
 TenVector = tuple[Fraction, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
+@dataclass(frozen=True)
+class AngleRounding:
+    """Rounding of origins and axes of a URDF to the special values that they represent, with diagnostics.
+
+    Angles are rounded within ``tolerance`` [rad], also offsets, axes and tensors; a tolerance of 0 disables it.
+    ``diagnostics`` has one entry per changed origin or axis.
+    """
+
+    tolerance: float
+    diagnostics: list[Diagnostic] = field(default_factory=list)
+
+    @property
+    def rotation_error(self) -> float:
+        """Largest error of rational rotations [rad]."""
+        # 1.57079632679 is pi/2 within 5e-12: without rounding it must not become pi/2
+        return TUNING.rotation_error if self.tolerance else 1e-15
+
+    def origin(
+        self, xyz: Sequence[float], rpy: Sequence[float], where: str, line: int
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return position (3,) [m] and rotation (3, 3) of an <origin>; None: no rotation."""
+        written = np.array(list(map(exact, xyz)))
+        offset = self.position(written)
+        if (offset != written).any():
+            self._note("snapped-offset", where, line, f"{_text(xyz)} m is taken as {_text(offset)}")
+        angles = [rounded_angle(angle, self.tolerance) for angle in rpy]
+        changes = []
+        for angle, special in zip(rpy, angles, strict=True):
+            if abs(special - angle) > TUNING.notable:
+                changes.append(f"{angle:.10g} is taken as {_in_pi(special)}")
+        if changes:
+            self._note("snapped-angle", where, line, "; ".join(changes))
+        # most origins have no rotation: None avoids a product of exact matrices
+        return offset, rotation_from_rpy(angles) if any(angles) else None
+
+    def tensor(self, link: UrdfLink, inertial: Inertial) -> np.ndarray:
+        """Return the exact inertia tensor (3, 3) [kg m2]; products of inertia of the order of rounding errors are 0."""
+        xx, xy, xz, yy, yz, zz = inertial.tensor
+        if self.tolerance:
+            # CAD programs export products of inertia of 1e-18 for symmetric parts.
+            noise = TUNING.zero_noise * max(abs(xx), abs(yy), abs(zz))
+            products = [0.0 if abs(product) < noise else product for product in (xy, xz, yz)]
+            if [xy, xz, yz] != products:
+                message = f"{_text((xy, xz, yz))} kg m2 is taken as {_text(products)}"
+                self._note("snapped-inertia", f"link {link.name!r} inertial products", inertial.line, message)
+            xy, xz, yz = products
+        rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+        tensor: np.ndarray = np.vectorize(exact, otypes=[object])(rows)
+        return tensor
+
+    def axis(self, joint: UrdfJoint) -> np.ndarray:
+        """Return the axis of a joint as a unit vector in the frame of the joint, (3,)."""
+        # axes in URDFs often have other lengths, such as 0 0 -1.0001
+        unit: np.ndarray = np.array(joint.axis) / np.linalg.norm(joint.axis)
+        if self.tolerance == 0.0:
+            return unit
+        rounded = np.where(np.abs(unit) < 1e-3, 0.0, unit)  # CAD exporters print three digits
+        # A unit vector again, as components below the noise were removed.
+        rounded /= np.linalg.norm(rounded)
+        if np.abs(rounded - unit).max() > TUNING.notable:
+            message = f"{_text(joint.axis)} is taken as {_text(rounded)}"
+            self._note("snapped-axis", f"joint {joint.name!r} axis", joint.line, message)
+        return rounded
+
+    def position(self, vector: np.ndarray) -> np.ndarray:
+        """Return a composed position (3,) [m] without the noise of rounded rotations."""
+        noise = 1e-9 if self.tolerance else 0.0  # [m] rounding errors of composed rotations
+        return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
+
+    def _note(self, code: str, where: str, line: int, message: str) -> None:
+        self.diagnostics.append(Diagnostic("info", code, where, line, message))
+
+
+def _in_pi(angle: float) -> str:
+    """Return a rounded angle as a multiple of pi: "-3 pi/4"."""
+    multiple = Fraction(angle / pi).limit_denominator(120)  # a common multiple of the divisors
+    numerator, denominator = multiple.as_integer_ratio()
+    if not numerator:
+        return "0"
+    text = {1: "pi", -1: "-pi"}.get(numerator, f"{numerator} pi")
+    return text if denominator == 1 else f"{text}/{denominator}"
+
+
+def _text(values: Sequence[float] | np.ndarray) -> str:
+    """Return a vector (3,) as text with six digits."""
+    return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
+
+
+class Frame(NamedTuple):
     """The frame of a link at zero position in the frame of its body (-1: the root link).
 
     composed: float64 rotation (3, 3) in the frame of the last revolute body before the link. rotation: exact rotation
@@ -33,24 +133,8 @@ class Frame:
     position: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class _SegmentFrame:
-    """The rotation of a frame in the frame of the last revolute body before it, (3, 3), in float64 and rational."""
-
-    composed: np.ndarray
-    exact: np.ndarray
-
-
-_UNROTATED = _SegmentFrame(np.eye(3), IDENTITY)
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """The frame of a joint, with +z along its axis, in the frame of the body ``parent``."""
-
-    parent: int
-    rotation: np.ndarray
-    translation: np.ndarray
+_Rotation = tuple[np.ndarray, np.ndarray]
+"""Rotation (3, 3) of a frame in the frame of the last revolute body before it, in float64 and rational."""
 
 
 class Placement:
@@ -60,22 +144,29 @@ class Placement:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
         # per body, the frames from the last revolute body (the body itself if it is revolute) to the body
-        self._segments: list[tuple[_SegmentFrame, ...]] = [(_UNROTATED,)]
+        self._segments: list[tuple[_Rotation, ...]] = [((np.eye(3), IDENTITY),)]
 
     def lock(self, joint: UrdfJoint, value: float) -> None:
         """Add the child of a joint that is locked at ``value`` [rad, m]."""
         frame = self._joint_origin(joint)
-        if value and joint.type == "prismatic":
-            axis = np.array(list(map(exact, self._rounding.axis(joint).tolist())))
-            frame = self._turned(frame, self._offset(frame, exact(value) * axis), None)
-        elif value:
-            # A revolute joint locked off zero turns all later frames by a constant angle.
-            turn = rotation_about(self._rounding.axis(joint), self._rounding.angle(value))
-            frame = self._turned(frame, frame.position, turn)
+        if value:
+            axis = self._rounding.axis(joint)
+            offset, turn = ZERO, None
+            if joint.type == "prismatic":
+                offset = exact(value) * np.array(list(map(exact, axis.tolist())))
+            else:
+                # A revolute joint locked off zero turns all later frames by a constant angle.
+                turn = rotation_about(axis, rounded_angle(value, self._rounding.tolerance))
+            frame = self._placed(frame, offset, turn)
         self.frames[joint.child] = frame
 
-    def move(self, joint: UrdfJoint) -> Pose:
-        """Add a moving joint and its child, which start a body; bodies are numbered in the order of the calls."""
+    def move(self, joint: UrdfJoint) -> tuple[int, np.ndarray, np.ndarray]:
+        """Add a moving joint and its child, which start a body; bodies are numbered in the order of the calls.
+
+        Returns:
+            The parent body, and rotation (3, 3) and position (3,) [m] of the joint's frame, with +z along its axis, in
+            the frame of the parent body.
+        """
         frame = self._joint_origin(joint)
         # in the recursion all axes are z axes
         aligning = alignment(self._rounding.axis(joint))
@@ -85,39 +176,35 @@ class Placement:
         if joint.type == "prismatic":
             # a prismatic joint does not rotate: rotations before and behind it compose to a constant rotation
             segment = self._segments[frame.body + 1]
-            self._segments.append((*segment, _SegmentFrame(aligned, segment[-1].exact @ rotation)))
+            self._segments.append((*segment, (aligned, segment[-1][1] @ rotation)))
             composed = frame.composed
         else:
             # a revolute joint has any angle: a new segment begins
-            self._segments.append((_UNROTATED,))
+            self._segments.append(((np.eye(3), IDENTITY),))
             composed = aligning.T
         self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)
-        return Pose(frame.body, rotation, self._seen_from_both(rotation, frame.position))
+        return frame.body, rotation, self._seen_from_both(rotation, frame.position)
 
     def inertia(self, link: UrdfLink, inertial: Inertial) -> TenVector:
         """Return (m, m c, I) of a link about the origin of its body, in the frame of the body (parallel-axis theorem).
 
         M and V are linear in these parameters.
         """
-        offset, turn = self._rounding.inertial_origin(link, inertial)
-        frame = self._turned(self.frames[link.name], self._offset(self.frames[link.name], offset), turn)
-        mass = exact(inertial.mass)
-        center = frame.position
+        where = f"link {link.name!r} inertial origin"
+        origin = self._rounding.origin(inertial.com, inertial.rpy, where, inertial.line)
+        frame = self._placed(self.frames[link.name], *origin)
+        mass, center = exact(inertial.mass), frame.position
         tensor = frame.rotation @ self._rounding.tensor(link, inertial) @ frame.rotation.T
         tensor = tensor + mass * (center @ center * IDENTITY - np.outer(center, center))
         return (mass, *mass * center, *tensor[np.triu_indices(3)])
 
     def _joint_origin(self, joint: UrdfJoint) -> Frame:
-        frame = self.frames[joint.parent]
-        offset, turn = self._rounding.joint_origin(joint)
-        return self._turned(frame, self._offset(frame, offset), turn)
+        origin = self._rounding.origin(joint.xyz, joint.rpy, f"joint {joint.name!r} origin", joint.line)
+        return self._placed(self.frames[joint.parent], *origin)
 
-    def _offset(self, frame: Frame, offset: np.ndarray) -> np.ndarray:
-        """Return the position (3,) [m] at ``offset`` (3,) in ``frame``, in the frame of the body."""
-        return self._rounding.position(frame.position + frame.rotation @ offset)
-
-    def _turned(self, frame: Frame, position: np.ndarray, turn: np.ndarray | None) -> Frame:
-        """Return ``frame`` rotated by ``turn`` (3, 3), if not None, with its origin at ``position`` (3,)."""
+    def _placed(self, frame: Frame, offset: np.ndarray, turn: np.ndarray | None) -> Frame:
+        """Return ``frame`` moved by ``offset`` (3,) [m] and then rotated by ``turn`` (3, 3), if not None."""
+        position = self._rounding.position(frame.position + frame.rotation @ offset)
         if turn is None:
             return Frame(frame.body, frame.composed, frame.rotation, position)
         composed = frame.composed @ turn
@@ -132,9 +219,7 @@ class Placement:
         in_own_frame = self._rounding.position(rotation.T @ position)
         # An offset without a component along an axis may be a zero of M: it is kept if both frames agree.
         moved = self._rounding.position(rotation @ in_own_frame)
-        if np.array_equal(rotation.T @ moved, in_own_frame):
-            return moved
-        return position
+        return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
         """Return the exact rotation (3, 3) in the frame of a body for a rotation ``composed`` (3, 3) in its segment.
@@ -143,14 +228,12 @@ class Placement:
         of the segment: an axis at 45 degrees, which is not rational, may be normal to several other axes.
         """
         segment = self._segments[body + 1]
-        best = IDENTITY
-        min_lost: int | None = None
-        for frame in segment:
-            candidate = frame.exact @ exact_rotation(frame.composed.T @ composed)
-            lost = sum(lost_zeros(x.exact.T @ candidate, x.composed.T @ composed) for x in segment)
-            if min_lost is None or lost < min_lost:
-                best, min_lost = candidate, lost
+        candidates: list[tuple[int, int, np.ndarray]] = []
+        for turned, rational in segment:
+            candidate = rational @ exact_rotation(turned.T @ composed, self._rounding.rotation_error)
+            lost = sum(lost_zeros(y.T @ candidate, x.T @ composed) for x, y in segment)
+            candidates.append((lost, len(candidates), candidate))
             if not lost:
                 break
-        rotation: np.ndarray = segment[-1].exact.T @ best
+        rotation: np.ndarray = segment[-1][1].T @ min(candidates)[2]
         return rotation

@@ -1,18 +1,32 @@
 """Exact rotations and vectors as arrays of fractions, and rational approximation of angles and rotations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from math import atan2, cos, lcm, pi, sin, tan
 
 import numpy as np
 
-from spelgen.arm.tuning import TUNING
+Vector = tuple[Fraction, ...]
+Matrix = tuple[Vector, ...]
 
-Vector = tuple[Fraction, Fraction, Fraction]
-Matrix = tuple[Vector, Vector, Vector]
 
+@dataclass(frozen=True)
+class GeometryTuning:
+    """Tolerances for the exact values that rounded numbers of a URDF represent."""
+
+    # [rad, 1] A change of an angle or of an axis below this bound is not reported.
+    notable: float = 1e-9
+    # [1] An element of a rotation, or a moment divided by the largest moment, below this bound is rounding and means
+    # 0.
+    zero_noise: float = 1e-12
+    # [rad] Largest error of a rational rotation: thousands of times below the accuracy of any calibration.
+    rotation_error: float = 1e-11
+    # [1] Bounds of denominators, tried in turn so that the shortest fractions are found first.
+    denominators: tuple[int, ...] = (10**7, 10**10, 10**13)
+
+
+TUNING = GeometryTuning()
 
 IDENTITY: np.ndarray = np.eye(3, dtype=object) * Fraction(1)
 ZERO = np.array([Fraction(0)] * 3)
@@ -29,9 +43,7 @@ def bounded(value: Fraction) -> Fraction:
     Such a number results from dozens of consecutive approximated rotations, and is not exact. Arithmetic with it could
     take hours for a file from an untrusted source.
     """
-    if value.denominator.bit_length() <= TUNING.max_bits:
-        return value
-    return Fraction(float(value))
+    return value if value.denominator.bit_length() <= 4096 else Fraction(float(value))
 
 
 def rounded_angle(angle: float, tolerance: float) -> float:
@@ -41,13 +53,13 @@ def rounded_angle(angle: float, tolerance: float) -> float:
     """
     if tolerance == 0.0:
         return angle
-    nearest = round(angle / (pi / 2)) * (pi / 2)
-    if abs(nearest - angle) <= tolerance:
-        return nearest
-    for divisor in TUNING.fine_divisors:
+    # The special angles on the CAD drawings of 189 arms. The tolerance of multiples of pi/12, pi/8 and pi/5 is small
+    # because 0.26, 0.39 and 0.63 also occur as exact values.
+    limits = {2: tolerance, 12: 2e-5, 8: 2e-5, 5: 2e-5}
+    for divisor, limit in limits.items():
         step = pi / divisor
         nearest = round(angle / step) * step
-        if abs(nearest - angle) <= TUNING.fine_tolerance:
+        if abs(nearest - angle) <= limit:
             return nearest
     return angle
 
@@ -85,24 +97,18 @@ def alignment(axis: np.ndarray) -> np.ndarray:
     cross = np.cross(closest, axis)
     skew = np.cross(np.eye(3), cross)
     smallest = np.eye(3) + skew + skew @ skew / (1.0 + float(closest @ axis))
-    turned: np.ndarray = smallest @ _coordinate_alignment(index, sign)
+    # a signed permutation that maps +z to the closest coordinate axis, or to its opposite
+    first, second = np.eye(3)[(index + 1) % 3], np.eye(3)[(index + 2) % 3]
+    columns = [first, second, closest] if sign > 0 else [second, first, closest]
+    if sign < 0 and index == 2:
+        # Rotation by pi about x. Parameters of existing modules depend on this convention for -z axes.
+        columns = [first, -second, closest]
+    turned: np.ndarray = smallest @ np.stack(columns, axis=1)
     return turned
 
 
-def _coordinate_alignment(index: int, sign: float) -> np.ndarray:
-    """Return a signed permutation (3, 3) that maps +z to the coordinate axis ``index``, or to its opposite."""
-    following, last = np.eye(3)[(index + 1) % 3], np.eye(3)[(index + 2) % 3]
-    axis = sign * np.eye(3)[index]
-    if sign > 0:
-        return np.stack([following, last, axis], axis=1)
-    if index == 2:
-        # Rotation by pi about x. Parameters of existing modules depend on this convention for -z axes.
-        return np.stack([following, -last, axis], axis=1)
-    return np.stack([last, following, axis], axis=1)
-
-
-def exact_rotation(rotation: np.ndarray) -> np.ndarray:
-    """Return a rational approximation (3, 3) of a float64 rotation (3, 3): orthogonal, error 1e-11, same zeros.
+def exact_rotation(rotation: np.ndarray, error: float = TUNING.rotation_error) -> np.ndarray:
+    """Return a rational approximation (3, 3) of a float64 rotation (3, 3): orthogonal, within ``error``, same zeros.
 
     The unit quaternion is divided by its largest component and each ratio is replaced by a close fraction; the rotation
     matrix of an unnormalised rational quaternion is rational (Euler-Rodrigues). A zero that depends on several ratios
@@ -114,12 +120,12 @@ def exact_rotation(rotation: np.ndarray) -> np.ndarray:
     # Short fractions make exact arithmetic fast.
     for bound in TUNING.denominators:
         candidate = _rotation_of([Fraction(ratio).limit_denominator(bound) for ratio in ratios])
-        if np.abs(candidate.astype(float) - rotation).max() < TUNING.rotation_error:
+        if np.abs(candidate.astype(float) - rotation).max() < error:
             break
     if not lost_zeros(candidate, rotation):
         return candidate
     row, column = np.argwhere(np.abs(rotation) < TUNING.zero_noise)[0].tolist()
-    return _rotation_with_zero(rotation, row, column)
+    return _rotation_with_zero(rotation, row, column, error)
 
 
 def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
@@ -145,30 +151,31 @@ def lost_zeros(candidate: np.ndarray, rotation: np.ndarray) -> int:
     return int(np.count_nonzero(candidate[np.abs(rotation) < TUNING.zero_noise]))
 
 
-def _rotation_with_zero(rotation: np.ndarray, row: int, column: int) -> np.ndarray:
+def _rotation_with_zero(rotation: np.ndarray, row: int, column: int, error: float) -> np.ndarray:
     """Return a rational approximation of a float64 rotation (3, 3) in which this element is zero.
 
     It is the product of a rotation about axis ``row``, a signed permutation, and a rotation about axis ``column``.
     """
-    first = _turn(row, rotation[(row + 1) % 3, column], rotation[(row + 2) % 3, column])
-    last = _turn(column, rotation[row, (column + 1) % 3], -rotation[row, (column + 2) % 3])
+    first = _turn(row, rotation[(row + 1) % 3, column], rotation[(row + 2) % 3, column], error)
+    last = _turn(column, rotation[row, (column + 1) % 3], -rotation[row, (column + 2) % 3], error)
     between = np.rint(first.T.astype(float) @ rotation @ last.T.astype(float)).astype(int)
     result: np.ndarray = first @ between @ last
     return result
 
 
-def _turn(axis: int, cosine: float, sine: float) -> np.ndarray:
+def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     """Return the rational rotation (3, 3) about a coordinate axis by the angle with this cosine and sine."""
     # Reduction to a quarter turn, so that the approximations of 45 and 135 degrees differ by exactly a right angle.
     # Common angles are inside the interval of the reduced angles, not at its ends.
-    quarter, angle = divmod(atan2(sine, cosine) + TUNING.eighth, pi / 2)
-    tangent = tan((angle - TUNING.eighth) / 2)
+    eighth = 0.7  # [rad] just below pi/4
+    quarter, angle = divmod(atan2(sine, cosine) + eighth, pi / 2)
+    tangent = tan((angle - eighth) / 2)
     t = Fraction(0)
     if abs(tangent) >= TUNING.zero_noise:
         for bound in TUNING.denominators:
             t = Fraction(tangent).limit_denominator(bound)
             # The error of the angle is twice the error of t, and two rotations share the bound.
-            if abs(float(t) - tangent) < TUNING.rotation_error / 4:
+            if abs(float(t) - tangent) < error / 4:
                 break
     norm = 1 + t * t
     c, s = (1 - t * t) / norm, 2 * t / norm
@@ -197,15 +204,3 @@ def _rotation_of(quaternion: Sequence[Fraction]) -> np.ndarray:
     # R = 1 + (2 w [v]x + 2 [v]x [v]x) / (w^2 + v.v)
     turned: np.ndarray = IDENTITY + 2 * (w * cross + cross @ cross) * Fraction(1, w * w + v @ v)
     return turned
-
-
-def as_vector(values: np.ndarray) -> Vector:
-    """Return three fractions (3,) as a hashable tuple."""
-    x, y, z = values
-    return x, y, z
-
-
-def as_matrix(rows: np.ndarray) -> Matrix:
-    """Return nine fractions (3, 3) as hashable tuples."""
-    x, y, z = map(as_vector, rows)
-    return x, y, z

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from spelgen.logs.commands import LogRows, delayed_commands
+from spelgen.logs.trajectory import LogRows, delayed_commands
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class LinearServos:
         """Return the positions per part, (K, n), of second-order responses to the delayed commands."""
         frequency, damping, result = np.array(self.frequency), np.array(self.damping), []
         for start, speed, (log, rows) in zip(q, qd, parts, strict=True):
+            # one step length: the exact response is precomputed for it
             dt = float(np.diff(log.t[rows]).mean())
             columns = [delayed_commands(log, rows, late, 1)[:, 0, k] for k, late in enumerate(self.delay)]
             u = np.stack(columns, axis=-1) + self.offset

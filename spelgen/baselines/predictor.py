@@ -12,7 +12,7 @@ from torch import Tensor
 
 from spelgen.dynamics.equations import MotionEquations, equations_of
 from spelgen.dynamics.protocol import RigidDynamics, is_stateful, memory_after, sliding_memory
-from spelgen.logs.commands import LogRows
+from spelgen.logs.trajectory import LogRows
 from spelgen.logs.windows import Windows, thinned
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
@@ -166,22 +166,19 @@ class Solver:
 
 
 def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
-    """Return the solver with the fewest steps per sample interval for which doubling the steps changes nothing."""
+    """Return the solver with the fewest steps per sample interval that suffice: twice as many change little."""
     windows = thinned(probe, TUNING.probed_windows)
     motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
     solver = Solver(dynamics, 1)
     coarse = solver(windows)[1]
     # only dynamics that diverge would need shorter steps, and cannot be predicted with them either
-    while (
-        2 * solver.substeps <= TUNING.most_substeps
-        and windows.dt.mean() / (2 * solver.substeps) >= TUNING.shortest_step
-    ):
+    max_substeps = min(TUNING.most_substeps, windows.dt.mean().item() / TUNING.shortest_step)
+    while 2 * solver.substeps <= max_substeps:
         finer = replace(solver, substeps=2 * solver.substeps)
         fine = finer(windows)[1]
         error = (fine - windows.qd[:, 1:]).square().mean().sqrt()
-        if (fine - coarse).square().mean().sqrt() < TUNING.tolerance * torch.maximum(
-            TUNING.least_error * motion, error
-        ):
+        allowed = TUNING.tolerance * torch.maximum(TUNING.least_error * motion, error)
+        if (fine - coarse).square().mean().sqrt() < allowed:
             break
         solver, coarse = finer, fine
     return solver

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import Baseline, EvaluatedArm, FittedBaselines, LinearServoRecord
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.baselines.linear_servos import DelayedCommand, LinearServos
-from spelgen.baselines.names import (
+from spelgen.baselines.predictor import CommandFollower, Predictor, States, of_dynamics
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.emission.assemble import spec_of
+from spelgen.errors import Diagnostic, LogError, in_one_line
+from spelgen.identification.identification import LeastSquares, identified_dynamics
+from spelgen.identification.identify import identify_by
+from spelgen.labels import (
     CONSTANT_VELOCITY,
     DELAYED_COMMAND,
     LEAST_SQUARES,
@@ -18,14 +26,63 @@ from spelgen.baselines.names import (
     URDF,
     URDF_WITH_DRIVES,
 )
-from spelgen.baselines.predictor import CommandFollower, Predictor, States, of_dynamics
-from spelgen.dynamics.friction import FrictionModel
-from spelgen.errors import Diagnostic, LogError, in_one_line
-from spelgen.identification.identification import LeastSquares, identified_dynamics
-from spelgen.identification.identify import identify_by
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, coverage, require_torques
 from spelgen.logs.windows import Windows
+from spelgen.spec import Options
+
+FittedBaselines = dict[str, Any]
+"""The content of least_squares.json: fitted baselines, and the coverage of the training logs."""
+LinearServoRecord = Mapping[str, Any]
+"""Parameters of `LinearServos` in the record of a fit, by name."""
+
+
+@dataclass(frozen=True)
+class EvaluatedArm:
+    """The information about an arm under torques that baselines may use.
+
+    joints: names, in the order of q. urdf: None if unknown. fitted: the baselines fitted to the training logs.
+    fitted_arm: the arm for which these were fitted; None if there are none. probe: windows for which the integrator's
+    step is chosen. notes: a baseline appends, for example, why it is absent.
+    """
+
+    joints: Sequence[str]
+    urdf: Path | None
+    fitted: FittedBaselines
+    fitted_arm: Arm | None
+    probe: Windows
+    notes: list[Diagnostic]
+
+
+class Baseline:
+    """Simple predictor of an arm under torques, under position commands, or under both.
+
+    Each baseline is listed in `registry.py`. It overrides `predictors` or `followers`, and `fit` if it has parameters.
+    """
+
+    def fit(self, arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> dict[str, object]:
+        """Return the parameters fitted to the training logs, as JSON; {} if there is nothing to fit."""
+        return {}
+
+    def predictors(self, arm: EvaluatedArm) -> list[Predictor]:
+        """Return the predictors under torques; [] if data or a package for them is absent."""
+        return []
+
+    def followers(
+        self, linear_servos: LinearServoRecord | None, notes: list[Diagnostic]
+    ) -> dict[str, CommandFollower]:
+        """Return the predictors under position commands, by name.
+
+        linear_servos: None for a model without a record.
+        """
+        return {}
+
+
+def arm_of_model(model: object, urdf: Path) -> Arm:
+    """Return the arm that a model was built from, read from its URDF. Raises UrdfError, ArmError or SettingsError."""
+    spec = spec_of(model)
+    options = Options() if spec is None else spec.options
+    return load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
 
 
 class ConstantVelocity(Baseline):
@@ -56,6 +113,7 @@ class UrdfValues(Baseline):
 
             plain = urdf_dynamics(arm.urdf, arm.joints)
             predictors = [of_dynamics(URDF, plain, arm.probe)]
+            # without drives in the URDF both predictors would be equal
             if drives_known(arm.urdf, arm.joints):
                 driven = urdf_dynamics(arm.urdf, arm.joints, drives=True)
                 predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, arm.probe))
@@ -86,6 +144,7 @@ class IdentifiedArm(Baseline):
         try:
             require_torques(logs)
             identified = identify_by(arm, logs, methods, preprocessing)
+        # a baseline that cannot be fitted must not stop the fit of the model
         except (LogError, np.linalg.LinAlgError):
             return {}
         fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
@@ -128,6 +187,7 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
 
     preprocessing: resolved by the fit of the model.
     """
+    # the coverage of the training logs is needed for the assessment of test logs
     fitted: FittedBaselines = {"coverage": coverage(logs)}
     for baseline in BASELINES:
         fitted |= baseline.fit(arm, logs, preprocessing)

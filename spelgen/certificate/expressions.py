@@ -1,23 +1,30 @@
-"""Polynomials in cosines, sines and distances as SymPy expressions in a canonical form.
+"""Expressions of SymPy: made from the polynomials of an arm in a canonical form, and printed as text, LaTeX and Python.
 
 Products of cosines and sines of consecutive joints with parallel axes become cosines and sines of sums of their angles.
 Alternatives (powers of single angles, common factors of several terms) reduce the length of long formulas by 20 %, but
-not the length of formulas that are short enough to be read.
+not the length of formulas that are short enough to be read. Printed decimals have at most twelve digits; Python for
+SymPy has exact fractions. Blanks at which a line must not be broken are no-break spaces until the text is wrapped.
 """
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 
 from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
-from sympy import Add, Expr, Integer, Rational, Symbol, cos, sin
+from sympy import Add, Expr, Float, Integer, Rational, Symbol, cos, sin
 from sympy.core.parameters import distribute
+from sympy.printing.latex import LatexPrinter
+from sympy.printing.str import StrPrinter
 
 from spelgen.arm.arm import Chain
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.structure.recursion import base_denominators
 
+FLOAT_DIGITS = 17  # decimals that determine a double
+_FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at it
 Terms = dict[Expr, fmpq]
 """A linear combination of products of distances, cosines and sines, with nonzero coefficients."""
 
@@ -48,13 +55,11 @@ class PolynomialWriter:
 
     def __init__(self, arm: Chain, context: fmpq_mpoly_ctx):
         generators = context.gens()
-        self._circles = []
-        for sine, cosine in zip(generators[::3], generators[1::3], strict=True):
-            self._circles.append(sine**2 + cosine**2 - 1)
-        self._angles: list[Expr] = []
-        for joint, denominator in enumerate(base_denominators(arm)):
-            # Angles of mimic joints are multiples of a fraction of the coordinate.
-            self._angles.append(coordinate(joint) / denominator)
+        waves = zip(generators[::3], generators[1::3], strict=True)
+        self._circles = [sine**2 + cosine**2 - 1 for sine, cosine in waves]
+        # angles of mimic joints are multiples of a fraction of the coordinate
+        fractions = enumerate(base_denominators(arm))
+        self._angles = [coordinate(joint) / denominator for joint, denominator in fractions]
         self._runs = parallel_runs(arm)
 
     def reduced(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
@@ -120,9 +125,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
             waves = products
     result: Terms = {}
     for (total, quarters), value in waves.items():
-        function = cos(total)
-        if quarters % 2:
-            function = sin(total)
+        function = sin(total) if quarters % 2 else cos(total)
         # SymPy simplifies cos(-a) to cos(a) and sin(-a) to -sin(a).
         sign, function = function.as_coeff_Mul()
         if quarters > 1:
@@ -141,10 +144,73 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
         groups.setdefault(unit, {})[symbol] = leading
     total = []
     for unit, parameters in groups.items():
-        factor = fmpq(1)
         # The function of a single parameter retains its coefficients, which are dimensions of the arm.
-        if len(parameters) == 1:
-            factor = abs(next(iter(parameters.values())))
+        factor = abs(next(iter(parameters.values()))) if len(parameters) == 1 else fmpq(1)
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))
     return Add(*total)
+
+
+def text(expression: Expr) -> str:
+    """Return an expression as plain text, with decimals of at most twelve digits."""
+    result: str = StrPrinter({"full_prec": False}).doprint(_rounded(expression, 1, 12))
+    return result
+
+
+def latex(expression: Expr) -> str:
+    r"""Return an expression in LaTeX, with \bigl( in place of \left(, which cannot span lines."""
+    names = {symbol: _latex_name(symbol.name) for symbol in expression.free_symbols}
+    printer = LatexPrinter({"full_prec": False, "mul_symbol": r" \, ", "symbol_names": names})
+    formula: str = printer.doprint(_rounded(expression, 1, 12))
+    return formula.replace(r"\left(", r"\bigl(").replace(r"\right)", r"\bigr)")
+
+
+def python(expression: Expr) -> str:
+    """Return an expression in Python for SymPy: exact, except fractions with more digits than a float."""
+    result: str = _PythonPrinter({"sympy_integers": True}).doprint(
+        _rounded(expression, 10**FLOAT_DIGITS, FLOAT_DIGITS)
+    )
+    return result
+
+
+def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
+    """Return ``start``, a formula and ``end`` as lines of at most ``width`` characters if possible."""
+    indent = " " * (len(start) - len(start.lstrip()) + 4)
+    # No line break after a sign, nor within angles and short brackets.
+    formula = re.sub(r"([+-]) ", rf"\1{_FIXED}", formula)
+    brackets = re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula)
+    angles = re.findall(r"(?:cos|sin)\b.*?\)", formula)
+    for text in dict.fromkeys([*brackets, *angles, r" \, "]):
+        if len(text) < width // 2 or text in angles:
+            formula = formula.replace(text, text.replace(" ", _FIXED))
+    wrapped = textwrap.fill(
+        start + formula + end, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
+    return wrapped.replace(_FIXED, " ").split("\n")
+
+
+class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
+    def _print_Add(self, expression: Add, order: str | None = None) -> str:
+        """Print a long sum as one call, because Python cannot nest thousands of additions."""
+        if len(expression.args) <= 20:
+            result: str = super()._print_Add(expression, order)
+            return result
+        return f"Add({', '.join(map(self._print, expression.args))})"
+
+
+def _rounded(expression: Expr, largest: int, digits: int) -> Expr:
+    """Return the expression with decimals for fractions whose numerator or denominator exceeds ``largest``."""
+    decimals = {}
+    for number in expression.atoms(Rational):
+        if not number.is_Integer and max(abs(number.p), number.q) > largest:
+            decimals[number] = Float(number, digits)
+    # Otherwise SymPy expands products.
+    with distribute(False):
+        return expression.xreplace(decimals)
+
+
+def _latex_name(name: str) -> str:
+    """Return a name such as ``Izz1R`` in LaTeX: I with the index zz,1R."""
+    letter, axes, number = re.findall(r"(.)([a-z]*)(.*)", name)[0]
+    index = ",".join(filter(None, [axes, number]))
+    return f"{letter}_{{{index}}}" if index else str(letter)

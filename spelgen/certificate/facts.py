@@ -1,22 +1,24 @@
 """A structure in words: zero, constant and equal entries of M, joints without effect on M or V, and the reasons.
 
-A reason is given only if the exact geometry of the arm proves it (``reasons``).
+A reason is given only if the exact geometry of the arm proves it. The entry of joints a and b is the integral of
+v_a . v_b over the mass that both move, with v the velocity field of a unit rate; the reasons are properties of this
+integral. Each function of a reason returns None if it knows none. ``{joints}`` and ``{axes}`` in a reason are
+placeholders for the other joints of the entries, and for their axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
 from spelgen.arm.arm import Chain
-from spelgen.certificate import reasons
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.labels import axes_in_words, entry_name, joints_in_words, listed
 from spelgen.structure.structure import MassEntry, Structure
 
 Reason = str | None
-EntryReason = Callable[[Axes, Structure, MassEntry], Reason]
+EntryReason = Callable[[Axes, MassEntry], Reason]
 
 
 @dataclass(frozen=True)
@@ -32,23 +34,19 @@ class Fact:
     reason: Reason
 
     def __str__(self) -> str:
-        if self.reason:
-            return f"{self.statement}: {self.reason}. {self.means}."
-        return f"{self.statement}. {self.means}."
+        reason = f": {self.reason}" if self.reason else ""
+        return f"{self.statement}{reason}. {self.means}."
 
 
 def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
     """Return the properties of M and V at all configurations, with simple geometric reasons if there are any."""
     # A mimic joint moves several bodies, for which the reasons about pairs of axes are not valid.
-    axes = None
-    if is_plain(arm):
-        axes = Axes(arm)
-    words = _Sentences(structure, axes)
+    words = _Sentences(structure, Axes(arm, structure.assume) if is_plain(arm) else None)
     zero = ("always zero", "Nothing is learned for it", "Nothing is learned for them")
     constant = ("constant", "It needs one parameter and no network", "They need parameters and no networks")
     return (
-        *words.entries("zero", reasons.zero_reason, *zero),
-        *words.entries("constant", reasons.constant_reason, *constant),
+        *words.entries("zero", zero_reason, *zero),
+        *words.entries("constant", constant_reason, *constant),
         *words.equalities(),
         *words.idle_joints(),
         *words.potential(),
@@ -63,14 +61,13 @@ class _Sentences:
     axes: Axes | None
 
     def _reason(self, why: Callable[..., Reason], *subject: object) -> Reason:
-        if self.axes is None:
-            return None
-        return why(self.axes, self.structure, *subject)
+        return None if self.axes is None else why(self.axes, *subject)
 
     def entries(
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
     ) -> Iterator[Fact]:
         """Yield the facts about entries of this kind; entries with the same reason share a sentence."""
+        # a table of facts would repeat one reason for every entry of a wrist
         groups: dict[Reason, list[MassEntry]] = {}
         for entry in self.structure.entries:
             if entry.kind == kind:
@@ -83,10 +80,8 @@ class _Sentences:
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
             names = listed([entry_name(entry.row, entry.column) for entry in group])
-            if len(group) == 1:
-                yield Fact(f"{names} is {statement}", means_one, reason)
-            else:
-                yield Fact(f"{names} are {statement}", means_several, reason)
+            verb, means = ("is", means_one) if len(group) == 1 else ("are", means_several)
+            yield Fact(f"{names} {verb} {statement}", means, reason)
 
     def equalities(self) -> Iterator[Fact]:
         """Yield entries that are equal or opposite at every configuration: they have the same terms."""
@@ -105,32 +100,146 @@ class _Sentences:
             if len(signs) > 1:
                 entries = list(signs)
                 names = ["-" * (signs[x] != signs[entries[0]]) + entry_name(*x) for x in entries]
-                reason = self._reason(reasons.equality_reason, entries)
+                reason = self._reason(equality_reason, entries)
                 yield Fact(f"{' = '.join(names)} always", "One of them is learned", reason)
 
     def idle_joints(self) -> Iterator[Fact]:
         """Yield joints that no entry of M depends on."""
-        inputs: set[int] = set()
-        for entry in self.structure.entries:
-            inputs.update(entry.joints)
+        inputs = {joint for entry in self.structure.entries for joint in entry.joints}
         if not inputs:
             return  # M is constant, which other facts state
         for joint in sorted(set(range(len(self.structure.joints))) - inputs):
-            reason = self._reason(reasons.idle_reason, joint)
-            yield Fact(
-                f"M does not depend on joint {joint + 1}", "It is not an input of the networks of M", reason
-            )
+            means = "It is not an input of the networks of M"
+            yield Fact(f"M does not depend on joint {joint + 1}", means, self._reason(idle_reason, joint))
 
     def potential(self) -> Iterator[Fact]:
         if not self.structure.potential:
-            yield Fact("V is zero", "It needs no network", self._reason(reasons.potential_reason))
+            yield Fact("V is zero", "It needs no network", self._reason(potential_reason))
             return
         # joints with the same reason share a sentence
         groups: dict[Reason, list[int]] = {}
         for joint in range(len(self.structure.joints)):
             if joint not in self.structure.potential:
-                groups.setdefault(self._reason(reasons.weightless_reason, joint), []).append(joint)
+                groups.setdefault(self._reason(weightless_reason, joint), []).append(joint)
         for reason, group in groups.items():
             inputs = "It is not an input" if len(group) == 1 else "They are not inputs"
             means = f"{inputs} of the network of V"
             yield Fact(f"V does not depend on {joints_in_words(group)}", means, reason)
+
+
+def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
+    """Return the reason for a zero entry."""
+    later, earlier = entry.row, entry.column
+    slider = later if axes.prismatic[later] else earlier
+    if axes.prismatic[later] != axes.prismatic[earlier] and axes.parallel(later, earlier):
+        parallel = f"prismatic joint {slider + 1} is parallel to {{axes}}"
+        return f"{parallel}, and a rotation has no velocity along its axis"
+    if axes.prismatic[later] and axes.prismatic[earlier] and axes.perpendicular(later, earlier):
+        return f"prismatic joint {earlier + 1} is orthogonal to prismatic {{joints}}"
+    return balance_reason(axes, entry)
+
+
+def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
+    """Return the reason for a constant entry."""
+    later, earlier = entry.row, entry.column
+    if later == earlier:
+        return _diagonal_reason(axes, later)
+    if axes.prismatic[later] and axes.prismatic[earlier] and axes.fixed_angle(later, earlier):
+        return "both joints are prismatic, and the angle between their axes is constant"
+    if axes.prismatic[later] and not axes.prismatic[earlier] and axes.keep_offset(later, earlier):
+        return (
+            f"the load of joint {later + 1} keeps its distance from the plane that contains "
+            f"{axes_in_words([earlier])} and is parallel to joint {later + 1}"
+        )
+    revolute = not axes.prismatic[later] and not axes.prismatic[earlier]
+    if revolute and axes.same_twist(later, earlier) and _diagonal_reason(axes, later):
+        same = entry_name(later, later)
+        if axes.opposed(later, earlier):
+            same = f"-{same}"
+        return f"{joints_in_words([earlier, later])} are coaxial, so it equals {same}"
+    return balance_reason(axes, entry)
+
+
+def _diagonal_reason(axes: Axes, joint: int) -> Reason:
+    # Joints before this one move its load as a rigid body: they do not change the inertia about its axis.
+    behind = range(joint + 1, len(axes.prismatic))
+    if axes.prismatic[joint]:
+        return "the diagonal entry of a prismatic joint is the mass that it carries"
+    if not behind:
+        return f"joint {joint + 1} is the last and carries one rigid body"
+    if all(axes.commute(joint, later) for later in behind):
+        return f"all joints after joint {joint + 1} are coaxial revolute or parallel prismatic joints"
+    if len(behind) == 1 and axes.symmetric:
+        return f"the inertia of the load of joint {joint + 2} is symmetric about its axis"
+    return None
+
+
+def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
+    """Return the reason for an entry of a balanced last body: Izz times the cosine of the angle between the axes."""
+    last, earlier = len(axes.prismatic) - 1, entry.column
+    if not axes.balanced or entry.row != last:
+        return None
+    # Rotation about a principal axis through the centre of mass has angular momentum along this axis only.
+    balanced = f"the load of joint {last + 1} is dynamically balanced"
+    if axes.without_inertia:
+        return f"{balanced}, and its inertia about the joint axis is zero"
+    if axes.prismatic[earlier]:
+        return f"{balanced}, so its rotation does not move its centre of mass"
+    if axes.perpendicular(last, earlier):
+        return f"{balanced} about its axis, which is orthogonal to {{axes}}"
+    if axes.fixed_angle(last, earlier):
+        return f"{balanced} about its axis, which has a constant angle to {{axes}}"
+    return None
+
+
+def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
+    """Return the reason for equal entries of a row: the joints of the columns move the load of the row equally."""
+    # Entries of different rows belong to different loads: there is no simple reason.
+    rows, columns = map(sorted, zip(*entries, strict=True))
+    if rows[0] != rows[-1]:
+        return None
+    if all(axes.same_twist(columns[0], column) for column in columns[1:]):
+        if axes.prismatic[columns[0]]:
+            return f"prismatic {joints_in_words(columns)} are parallel"
+        return f"{joints_in_words(columns)} are coaxial"
+    last = len(axes.prismatic) - 1
+    if entries[0][0] == last and axes.balanced:
+        revolute = not any(axes.prismatic[column] for column in columns)
+        if revolute and all(axes.parallel(columns[0], column) for column in columns[1:]):
+            balanced = f"the load of joint {last + 1} is dynamically balanced"
+            return f"{balanced}, and {joints_in_words(columns)} are parallel"
+    return None
+
+
+def idle_reason(axes: Axes, joint: int) -> Reason:
+    """Return the reason for M not to depend on ``joint``."""
+    if joint == 0:
+        return "it moves the whole arm as one rigid body"
+    # M does not depend on the pose of the base: a joint that commutes with all joints before it acts as the first.
+    nearer = list(range(joint))
+    if all(axes.commute(joint, earlier) for earlier in nearer):
+        return f"its motion commutes with {joints_in_words(nearer)}, as if it were the first joint"
+    if joint == len(axes.prismatic) - 1 and axes.symmetric:
+        return "the inertia of its load is symmetric about its axis"
+    return None
+
+
+def weightless_reason(axes: Axes, joint: int) -> Reason:
+    """Return the reason for V not to depend on ``joint``."""
+    if axes.is_weightless(joint):
+        if axes.prismatic[joint]:
+            return "gravity does no work in a translation orthogonal to it"
+        return "gravity does no work in a rotation about an axis parallel to it"
+    last = joint == len(axes.prismatic) - 1
+    if last and axes.centred:
+        return "the centre of mass of its load is on its axis"
+    return None
+
+
+def potential_reason(axes: Axes) -> Reason:
+    """Return the reason for V = 0."""
+    if not any(axes.arm.gravity):
+        return "gravity is zero"
+    if all(axes.is_weightless(joint) for joint in range(len(axes.prismatic))):
+        return "every axis is parallel to gravity if revolute, orthogonal to it if prismatic"
+    return None

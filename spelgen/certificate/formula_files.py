@@ -13,9 +13,9 @@ from collections.abc import Mapping
 
 from sympy import Expr, Symbol
 
-from spelgen.certificate import printing
-from spelgen.certificate.formulas import WRITABLE, Formula, Formulas
-from spelgen.certificate.printing import python
+from spelgen.certificate import expressions
+from spelgen.certificate.expressions import python
+from spelgen.certificate.formulas import WRITABLE, Formulas
 from spelgen.labels import printable, short_name
 
 _LATEX_WIDTH = 140
@@ -41,7 +41,7 @@ def text(formulas: Formulas, width: int = 80) -> str:
         if row.expression is None:
             lines.append(f"{row.name}: {row.omission}")
         else:
-            lines += printing.lines(printing.text(row.expression), f"{row.name} = ", width)
+            lines += expressions.lines(expressions.text(row.expression), f"{row.name} = ", width)
     for note in _notes(formulas):
         lines += ["", *textwrap.wrap(note, width)]
     if formulas.base:
@@ -51,21 +51,17 @@ def text(formulas: Formulas, width: int = 80) -> str:
 
 def to_dict(formulas: Formulas) -> dict[str, object]:
     """Return a JSON object; rows and columns are counted from 1, and an expression is null if it is too long."""
-    base, values = [], formulas.values
+    base, values, entries = [], formulas.values, []
     for symbol, definition in formulas.base_parameters.items():
         # JSON has no fractions
         value = float(values[symbol]) if symbol in values else None
-        base.append({"name": symbol.name, "definition": printing.text(definition), "value": value})
-    return {"entries": list(map(_entry, formulas.rows)), "base_parameters": base}
-
-
-def _entry(formula: Formula) -> dict[str, object]:
-    row = column = text = None
-    if formula.entry != "V":
-        row, column = formula.entry
-    if formula.expression is not None:
-        text = printing.text(formula.expression)
-    return {"name": formula.name, "row": row, "col": column, "terms": formula.terms, "expression": text}
+        base.append({"name": symbol.name, "definition": expressions.text(definition), "value": value})
+    for formula in formulas.rows:
+        row, column = (None, None) if formula.entry == "V" else formula.entry
+        indices = {"name": formula.name, "row": row, "col": column, "terms": formula.terms}
+        formula_text = None if formula.expression is None else expressions.text(formula.expression)
+        entries.append({**indices, "expression": formula_text})
+    return {"entries": entries, "base_parameters": base}
 
 
 def _notes(formulas: Formulas) -> list[str]:
@@ -83,21 +79,18 @@ def _notes(formulas: Formulas) -> list[str]:
 
 def _parameters(formulas: Formulas, width: int) -> list[str]:
     values = formulas.values
-    lines = ["Base parameters"]
-    if values:
-        lines = ["Base parameters, and the URDF's values"]
+    lines = ["Base parameters, and the URDF's values" if values else "Base parameters"]
     for symbol, definition in formulas.base_parameters.items():
         value = f" [{float(values[symbol]):.6g}]" if symbol in values else ""
         # a base parameter that equals an inertial parameter needs no equation
         name = "" if definition.is_Symbol else f"{symbol.name} = "
-        lines += printing.lines(printing.text(definition), f"  {name}", width, value)
+        lines += expressions.lines(expressions.text(definition), f"  {name}", width, value)
     return lines
 
 
 def _legend(formulas: Formulas) -> str:
-    bodies: set[int] = set()
-    for base in formulas.base:
-        bodies.update(index // 10 for index, _ in base.weights)  # ten inertial parameters a body
+    # ten inertial parameters a body
+    bodies = {index // 10 for base in formulas.base for index, _ in base.weights}
     names = [f"{body + 1} {short_name(formulas.arm.bodies[body].name)}" for body in sorted(bodies)]
     return (
         "m is the mass [kg], h = m c the first moment [kg m] and I the inertia tensor [kg m2] about the "
@@ -108,19 +101,16 @@ def _legend(formulas: Formulas) -> str:
 
 def latex(formulas: Formulas) -> str:
     """Return the formulas and the definitions of their parameters in two ``align*`` environments."""
-    rows, definitions = {}, {}
-    for row in formulas.written:
-        rows[Symbol(row.name)] = row.expression
-    for name, definition in formulas.base_parameters.items():
-        if not definition.is_Symbol:
-            definitions[name] = definition
+    rows = {Symbol(row.name): row.expression for row in formulas.written}
+    # a base parameter that equals an inertial parameter needs no definition
+    definitions = {name: x for name, x in formulas.base_parameters.items() if not x.is_Symbol}
     result = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
     result += _comments(formulas, "%")
     for equations in (rows, definitions):
         aligned = []
         for name, expression in equations.items():
-            start = f"{printing.latex(name)} &= "
-            aligned += printing.lines(printing.latex(expression), start, _LATEX_WIDTH)
+            start = f"{expressions.latex(name)} &= "
+            aligned += expressions.lines(expressions.latex(expression), start, _LATEX_WIDTH)
         if aligned:
             # continuation lines are indented
             body = " \\\\\n".join(re.sub("^ +", r"    &\\quad ", line) for line in aligned)
@@ -137,7 +127,7 @@ def sympy_source(formulas: Formulas) -> str:
         body.append(f"M = Matrix({n}, {n}, lambda i, j: entries[max(i, j) + 1, min(i, j) + 1])")
     body.append("")
     if formulas.potential is not None:
-        body += printing.lines(python(formulas.potential), "V = (", _PYTHON_WIDTH, end=")")
+        body += expressions.lines(python(formulas.potential), "V = (", _PYTHON_WIDTH, end=")")
     body += _table("base_parameters", formulas.base_parameters)
     body += _table("values", formulas.values)
     return "\n".join([_HEAD, *_beginning(formulas, "\n".join(body)), *body]) + "\n"
@@ -146,7 +136,7 @@ def sympy_source(formulas: Formulas) -> str:
 def _table(name: str, rows: Mapping[tuple[int, int], Expr] | Mapping[Symbol, Expr]) -> list[str]:
     result = [f"{name} = {{"]
     for key, expression in rows.items():
-        result += printing.lines(python(expression), f"    {key}: ", _PYTHON_WIDTH, end=",")
+        result += expressions.lines(python(expression), f"    {key}: ", _PYTHON_WIDTH, end=",")
     return [*result, "}"]
 
 
@@ -154,9 +144,7 @@ def _beginning(formulas: Formulas, body: str) -> list[str]:
     """Return the comments, the imports that ``body`` needs, and the symbols."""
     # Linters reject unused imports.
     imported = sorted({"Symbol", *re.findall(r"\b(Add|Matrix|S|cos|sin)\(", body)})
-    inertial: set[str] = set()
-    for definition in formulas.base_parameters.values():
-        inertial.update(symbol.name for symbol in definition.free_symbols)
+    inertial = {symbol.name for x in formulas.base_parameters.values() for symbol in x.free_symbols}
     positions = [symbol.name for symbol in formulas.q]
     bases = [base.name for base in formulas.base]
     lines = [*_comments(formulas, "#"), "", f"from sympy import {', '.join(imported)}", ""]

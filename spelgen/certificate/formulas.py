@@ -15,9 +15,14 @@ from flint import fmpq_mpoly
 from sympy import Expr, Integer, Matrix, Rational, Symbol
 
 from spelgen.arm.arm import Chain
-from spelgen.certificate.expressions import PolynomialWriter, coordinate, grouped, parameter, weighted_sum
-from spelgen.certificate.printing import latex
-from spelgen.certificate.tuning import TUNING
+from spelgen.certificate.expressions import (
+    PolynomialWriter,
+    coordinate,
+    grouped,
+    latex,
+    parameter,
+    weighted_sum,
+)
 from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name, parameter_name
 from spelgen.listing import Listing
@@ -26,8 +31,8 @@ from spelgen.structure.expansion import Budget, Expansion, TooLarge
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 
-READABLE = TUNING.readable_terms
-WRITABLE = TUNING.writable_terms
+WRITABLE = 3000
+"""Largest number of terms of an entry in a file for programs, or of a single requested entry."""
 
 Entry = tuple[int, int] | Literal["V"]
 """An entry of M, (row, column) from 1, or V."""
@@ -48,9 +53,7 @@ class Formula:
     @property
     def name(self) -> str:
         """``M21`` or ``V``."""
-        if self.entry == "V":
-            return "V"
-        return entry_name(self.entry[0] - 1, self.entry[1] - 1)
+        return "V" if self.entry == "V" else entry_name(self.entry[0] - 1, self.entry[1] - 1)
 
     @property
     def omission(self) -> str:
@@ -104,9 +107,7 @@ class Formulas:
         """
         definitions = {}
         for base in self.base:
-            terms = {}
-            for index, coefficient in base.weights:
-                terms[parameter(parameter_name(index))] = rational(coefficient)
+            terms = {parameter(parameter_name(index)): rational(weight) for index, weight in base.weights}
             definitions[parameter(base.name)] = weighted_sum(terms)
         return definitions
 
@@ -118,9 +119,11 @@ class Formulas:
     @property
     def trusted(self) -> str:
         """The inertial values for which the formulas are valid."""
-        if self.assume == "inertials":
-            return "the URDF's inertial zeros and symmetries"
-        return "any inertial values"
+        return (
+            "the URDF's inertial zeros and symmetries"
+            if self.assume == "inertials"
+            else "any inertial values"
+        )
 
     @property
     def written(self) -> tuple[Formula, ...]:
@@ -140,10 +143,7 @@ class Formulas:
         """A table of LaTeX, for a notebook."""
         rows = []
         for row in self.rows:
-            text = row.omission
-            if row.expression is not None:
-                text = f"${latex(row.expression)}$"
-            rows.append((row.name, text))
+            rows.append((row.name, row.omission if row.expression is None else f"${latex(row.expression)}$"))
         return Listing(f"{self.arm.name}: closed forms", ("", ""), tuple(rows), left=(0, 1)).html()
 
 
@@ -152,26 +152,23 @@ def formulas(
 ) -> Formulas:
     """Return closed forms of all entries of M and of V, or of one ``entry``.
 
-    Entries of more than ``longest`` terms (by default ``READABLE``, for one entry ``WRITABLE``) have no expression.
+    Entries of more than ``longest`` terms (by default 40, for one entry ``WRITABLE``) have no expression.
     Raises SpelgenError for an entry that M does not have.
     """
     n = len(arm.coordinates)
-    entries: list[Entry] = []
-    for row, column in triangle(n):
-        entries.append((row + 1, column + 1))
-    entries.append("V")
+    entries: list[Entry] = [*((row + 1, column + 1) for row, column in triangle(n)), "V"]
     if entry is not None:
-        lower: Entry = entry
-        if entry != "V":
-            lower = (max(entry), min(entry))
+        lower: Entry = entry if entry == "V" else (max(entry), min(entry))
+        # M is symmetric: 1,2 is written as 2,1
         if lower not in entries:
             expected = f"a row and a column from 1 to {n}, or V"
             raise SpelgenError(f"the entry {entry[0]},{entry[1]} of M", expected=expected)
         entries = [lower]
     if longest is None:
-        longest = READABLE if entry is None else WRITABLE
+        # 40 terms are three lines of a terminal
+        longest = 40 if entry is None else WRITABLE
     writer = _Writer(arm, structure)
-    budget = Budget(TUNING.budget)
+    budget = Budget(2_000_000)  # multiplications of terms, about 2 s
     # Entries close to the tip are short: they come first, before the budget is exhausted.
     rows = [writer.formula(x, longest, budget) for x in reversed(entries)]
     # For a single entry, list only its own parameters.
@@ -187,9 +184,7 @@ class _Writer:
 
     def __init__(self, arm: Chain, structure: Structure):
         self._at_urdf_values = structure.assume == "inertials"
-        self.base = base_parameters(arm)
-        if self._at_urdf_values:
-            self.base = tuple(base for base in self.base if base.value)
+        self.base = tuple(base for base in base_parameters(arm) if base.value or not self._at_urdf_values)
         self._expansion = Expansion(arm)
         self._writer = PolynomialWriter(arm, self._expansion.context)
 
@@ -199,25 +194,26 @@ class _Writer:
             polynomials = self._polynomials(entry, budget)
         except TooLarge:
             return Formula(entry, None, None)
+        # counted first: an entry that is too long is not converted to expressions
         terms = sum(map(len, polynomials.values()))
         if terms > longest:
             return Formula(entry, terms, None)
-        functions = []
-        for name, polynomial in polynomials.items():
-            if polynomial:
-                functions.append((parameter(name), self._writer.terms(polynomial)))
+        present = {name: polynomial for name, polynomial in polynomials.items() if polynomial}
+        functions = [
+            (parameter(name), self._writer.terms(polynomial)) for name, polynomial in present.items()
+        ]
         return Formula(entry, terms, grouped(functions))
 
     def _polynomials(self, entry: Entry, budget: Budget) -> dict[str, fmpq_mpoly]:
         """Return the polynomial coefficient of each base parameter, without the constant of V. Raises TooLarge."""
-        element = self._expansion.energies.potential
-        if entry != "V":
-            element = self._expansion.energies.mass[entry[0] - 1, entry[1] - 1]
+        energies = self._expansion.energies
+        element = energies.potential if entry == "V" else energies.mass[entry[0] - 1, entry[1] - 1]
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:
             # The coefficient of a base parameter is the coefficient of its first inertial parameter.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index, budget))
+            # V has an arbitrary constant: without it the formula is shorter
             if entry == "V":
                 polynomial -= polynomial[(0,) * self._expansion.context.nvars()]
             polynomials[base.name] = polynomial

@@ -15,7 +15,7 @@ from spelgen.arm.arm import Chain, Coordinate
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.certificate.facts import Fact, facts
 from spelgen.errors import Diagnostic
-from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable, short_name
+from spelgen.labels import UNITS, counted, joint_ranges, joints_in_ranges, printable, short_name
 from spelgen.listing import WIDTH, Listing
 from spelgen.structure.servo_rank import servo_rank
 from spelgen.structure.structure import MassEntry, Structure, derive
@@ -24,11 +24,6 @@ from spelgen.urdf.robot import Assume
 if TYPE_CHECKING:  # SymPy is imported for formulas only
     from spelgen.certificate.formulas import Entry as PlaceOfEntry
     from spelgen.certificate.formulas import Formulas
-
-SCHEMA = 1
-LETTERS = {"zero": "0", "constant": "C"}
-"""Symbols of entries of M that do not depend on q."""
-POSITION = "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2"
 
 
 @dataclass(frozen=True, repr=False)
@@ -55,17 +50,19 @@ class Inspection:
     def to_dict(self) -> dict[str, object]:
         """Return the documented JSON object; names are the names in the URDF, rows and columns are counted from 1."""
         structure = self.structure
-        potential = "zero"
-        if structure.potential:
-            potential = "varying"
+        entries = []
+        for entry in structure.entries:
+            indices = {"row": entry.row + 1, "col": entry.column + 1}
+            entries.append({**indices, "kind": entry.kind, "joints": self._names(entry.joints)})
+        potential = "varying" if structure.potential else "zero"
         return {
-            "schema": SCHEMA,
+            "schema": 1,
             "robot": self.arm.name,
             "assume": structure.assume,
             "joints": list(structure.joints),
             "joint_types": list(self.arm.joint_types),
             "mass_matrix": {
-                "entries": list(map(self._entry, structure.entries)),
+                "entries": entries,
                 "outputs": len(structure.outputs),
                 "constants": len(structure.constants),
                 "output_joints": [self._names(output.joints) for output in structure.outputs],
@@ -79,7 +76,10 @@ class Inspection:
 
     def text(self) -> str:
         """Return a report for a terminal."""
-        paragraphs = [self._heading(), self._joint_table(), self._matrix(), self._needs()]
+        is_fixed = self.structure.assume == "inertials"
+        trusted = "the URDF's inertial values" if is_fixed else "any inertial values"
+        heading = f"{printable(self.arm.name)}: structure for {trusted}"
+        paragraphs = [heading, self._joint_table(), self._matrix(), self._needs()]
         if self.facts:
             paragraphs.append(_indented("In words", map(str, self.facts)))
         if self.diagnostics:
@@ -106,14 +106,6 @@ class Inspection:
     def _names(self, joints: Iterable[int]) -> list[str]:
         return [self.structure.joints[joint] for joint in joints]
 
-    def _entry(self, entry: MassEntry) -> dict[str, object]:
-        return {
-            "row": entry.row + 1,
-            "col": entry.column + 1,
-            "kind": entry.kind,
-            "joints": self._names(entry.joints),
-        }
-
     def _input_matrix(self) -> dict[str, object]:
         n = len(self.structure.joints)
         # JSON contains the zero entries of G as well
@@ -122,25 +114,28 @@ class Inspection:
         for row, column in product(range(n), repeat=2):
             kind, value = values.get((row, column), ("zero", 0.0))
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
-        content: dict[str, object] = {}
-        if self.input == "position":
-            rank = servo_rank(self.arm)
-            undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
-            content = {"input": "position", "kp_in_ratio": list(map(self._names, rank.groups))}
-            content["with_inertia_only"] = undetermined
+        if self.input == "torque":
+            return {"entries": entries}
+        # logs of torques have a scale; under servos only ratios are determined, and JSON states which
+        rank = servo_rank(self.arm)
+        undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
+        ratios = list(map(self._names, rank.groups))
+        content = {"input": "position", "kp_in_ratio": ratios, "with_inertia_only": undetermined}
         return {**content, "entries": entries}
 
     def _servo_needs(self) -> str:
         """Return the parameters that logs of positions determine, in words."""
         # Logs of positions do not determine the scale of torques: kp, mass and friction may be multiplied by a factor.
         rank = servo_rank(self.arm)
-        text = f"{POSITION}; logs of positions determine inertia, weight and friction in ratio to kp only"
         # One known torque parameter determines the scale of a group of joints.
+        known = f"those of {' or of '.join(map(joints_in_ranges, rank.groups))}"
         if len(rank.groups) == 1:
-            text += ": one known kp, mass or load determines all"
-        else:
-            groups = " or of ".join(map(joints_in_ranges, rank.groups))
-            text += f": one known kp, mass or load determines those of {groups}"
+            known = "all"
+        text = (
+            "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2; logs of "
+            "positions determine inertia, weight and friction in ratio to kp only: one known kp, mass or load "
+            f"determines {known}"
+        )
         undetermined: dict[str, list[int]] = {}
         for name, joint in rank.open:
             undetermined.setdefault(name, []).append(joint)
@@ -167,36 +162,23 @@ class Inspection:
             needs.append(f"{joints_in_ranges(self.structure.passive)} without a drive")
         return ", ".join(needs)
 
-    def _heading(self) -> str:
-        trusted = "any inertial values"
-        if self.structure.assume == "inertials":
-            trusted = "the URDF's inertial values"
-        return f"{printable(self.arm.name)}: structure for {trusted}"
-
     def _joint_table(self) -> str:
         lines = ["Joints"]
-        names = [short_name(coordinate.name) for coordinate in self.arm.coordinates]
-        width = max(map(len, names))
+        width = max(len(short_name(joint.name)) for joint in self.arm.coordinates)
         for index, joint in enumerate(self.arm.coordinates):
-            line = f"  {index + 1:>2}  {names[index]:<{width}}  {joint.joint_type:<9}  {range_text(joint)}"
-            if index in self.structure.passive:
-                line += ", passive"
-            lines.append(line)
+            line = f"  {index + 1:>2}  {short_name(joint.name):<{width}}  {joint.joint_type:<9}  {range_text(joint)}"
+            lines.append(line + ", passive" * (index in self.structure.passive))
         return "\n".join(lines)
 
     def _cells(self) -> dict[tuple[int, int], str]:
-        cells = {}
-        for entry in self.structure.entries:
-            cells[entry.row, entry.column] = LETTERS.get(entry.kind, joint_ranges(entry.joints))
-        return cells
+        return {(entry.row, entry.column): cell_text(entry) for entry in self.structure.entries}
 
     def _matrix(self) -> str:
         """Return the lower triangle of M as aligned text: the joints that each entry depends on."""
         cells, n = self._cells(), len(self.structure.joints)
         lines = ["Mass matrix: joints each entry depends on; C constant, 0 always zero"]
-        widths = [0] * n
-        for (_, column), cell in cells.items():
-            widths[column] = max(widths[column], len(cell))
+        # each column as narrow as possible: seven joints must fit into 80 characters
+        widths = [max(len(cells[row, column]) for row in range(column, n)) for column in range(n)]
         for row in range(n):
             line = f"  {row + 1:>2}"
             for column in range(row + 1):
@@ -209,9 +191,10 @@ class Inspection:
         structure = self.structure
         # outputs that depend on the same joints are one network
         counts = Counter(output.joints for output in structure.outputs)
-        outputs = counted(len(structure.outputs), "output")
-        mass = f"{outputs} and {counted(len(structure.constants), 'constant')}"
+        outputs, constants = len(structure.outputs), len(structure.constants)
+        mass = f"{counted(outputs, 'output')} and {counted(constants, 'constant')}"
         mass += f" make all {len(structure.entries)} entries"
+        # an arm whose M is constant needs no networks
         if counts:
             groups = [f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items()]
             mass += f": {'; '.join(groups)}"
@@ -245,9 +228,7 @@ def _indented(title: str, paragraphs: Iterable[str]) -> str:
 
 
 def _remark(diagnostic: Diagnostic) -> str:
-    line = ""
-    if diagnostic.line is not None:
-        line = f"line {diagnostic.line}: "
+    line = "" if diagnostic.line is None else f"line {diagnostic.line}: "
     return printable(f"{diagnostic.severity}: {line}{diagnostic.where}: {diagnostic.message}")
 
 
@@ -257,10 +238,12 @@ def range_text(coordinate: Coordinate) -> str:
         return "continuous"
     if coordinate.lower is None or coordinate.upper is None:
         return "no limits"
-    unit = "m"
-    if coordinate.joint_type == "revolute":
-        unit = "rad"
-    return f"{coordinate.lower:g} .. {coordinate.upper:g} {unit}"
+    return f"{coordinate.lower:g} .. {coordinate.upper:g} {UNITS[coordinate.joint_type].position}"
+
+
+def cell_text(entry: MassEntry) -> str:
+    """Return the joints that an entry of M depends on; C: constant, 0: always zero."""
+    return {"zero": "0", "constant": "C"}.get(entry.kind, joint_ranges(entry.joints))
 
 
 def inspect(
@@ -279,6 +262,7 @@ def inspect(
 
     Raises the errors of ``load_arm``, and ArmError for ``inertials`` if the URDF has none.
     """
+    # an arm that is loaded keeps its own options
     if not isinstance(arm, Arm):
         arm = load_arm(arm, joints, tip, angle_tolerance)
     structure = derive(arm.chain, assume)

@@ -2,35 +2,102 @@
 
 With ``kinematics`` every sample has its own random inertial parameters; with ``inertials`` all samples have the
 parameters of the URDF. The verification shares only the chain with the derivation; the chain is compared with the
-reading of the file by Pinocchio (``urdf_cross_check``).
+reading of the file by Pinocchio (``numeric_samples``).
 """
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Literal
 
 import numpy as np
 
 from spelgen.arm.arm import Chain
-from spelgen.certificate.numeric_samples import ENGINE, NumericSamples, draw, regressor
-from spelgen.certificate.tuning import TUNING
-from spelgen.certificate.urdf_cross_check import urdf_cross_check
-from spelgen.certificate.verification import FactCheck, Verdict, Verification, size_text
+from spelgen.certificate.numeric_samples import (
+    ENGINE,
+    NumericSamples,
+    differences_of_reading,
+    draw,
+    regressor,
+)
 from spelgen.errors import shortened
 from spelgen.labels import entry_name, joints_in_ranges
+from spelgen.listing import WIDTH, Listing
 from spelgen.structure.basis import row_of
 from spelgen.structure.structure import Structure
 from spelgen.urdf.robot import Robot
 
+Verdict = Literal["agrees", "differs", "undecided"]
+_MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
+
 
 @dataclass(frozen=True)
-class _Magnitude:
-    """A number relative to its scale; is_nonzero: whether the derivation states that it differs from zero."""
+class FactCheck:
+    """A derived fact, the result of an independent computation, and whether the two agree.
 
-    name: str
-    value: float
-    is_nonzero: bool
+    ``undecided``: neither confirmed nor refuted in double precision, or by the other program.
+    """
+
+    fact: str
+    derived: str
+    found: str
+    verdict: Verdict
+
+    def __str__(self) -> str:
+        return f"{self.fact}: {self.derived}; {self.found}"
+
+
+@dataclass(frozen=True, repr=False)
+class Verification:
+    """The checks of an arm at ``samples`` random configurations from ``seed``."""
+
+    means: str
+    samples: int
+    seed: int
+    checks: tuple[FactCheck, ...]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether no result contradicts the derivation."""
+        return not self.differences
+
+    @property
+    def differences(self) -> tuple[FactCheck, ...]:
+        """The checks that contradict the derivation, or the reading of the file."""
+        return tuple(check for check in self.checks if check.verdict == "differs")
+
+    def __repr__(self) -> str:
+        return f"<Verification: {len(self.checks)} checks, {len(self.differences)} of them differ>"
+
+    def _repr_html_(self) -> str:
+        rows = [(check.fact, check.derived, check.found, check.verdict) for check in self.checks]
+        head = ("fact", "derived", "found", "")
+        return Listing(f"Verified by {self.means}", head, tuple(rows), left=(0, 1, 2, 3)).html()
+
+    def to_dict(self) -> dict[str, object]:
+        """Return a JSON object."""
+        return {"agrees": self.agrees} | asdict(self)
+
+    def text(self) -> str:
+        """Return a paragraph for a terminal, with one or more lines per check."""
+        lines = textwrap.wrap(f"Verified by {self.means}", WIDTH)
+        for check in self.checks:
+            mark = f"  {_MARKS[check.verdict]:<7} "
+            lines += textwrap.wrap(
+                str(check), WIDTH, initial_indent=mark, subsequent_indent=" " * 12, break_on_hyphens=False
+            )
+        return "\n".join(lines)
+
+
+def size_text(size: float) -> str:
+    """Return the order of magnitude of an error: ``3e-12``, or ``0``."""
+    return f"{size:.0e}" if size else "0"
+
+
+Magnitude = tuple[str, float, bool]
+"""Name and value of a number relative to its scale, and whether the derivation states that it differs from zero."""
 
 
 @dataclass(frozen=True)
@@ -39,73 +106,92 @@ class _DerivedFact:
 
     fact: str
     derived: str
-    magnitudes: list[_Magnitude]
-    rounding: float = TUNING.rounding
+    magnitudes: list[Magnitude]
+    # numbers below this fraction of their scale are rounding; measured differences are reported
+    rounding: float = 1e-12
 
     def check(self, is_fine: bool) -> FactCheck:
         """Return the result of the check.
 
         is_fine: whether products of small dimensions may be below rounding errors.
         """
-        unexpected, unseen = [], []
-        for number in self.magnitudes:
-            if number.is_nonzero and number.value <= self.rounding:
-                unseen.append(f"{number.name} is not seen")
-            if not number.is_nonzero and number.value > self.rounding:
-                unexpected.append(f"{number.name} is {size_text(number.value)} of its scale")
-        if unexpected or unseen:
-            verdict: Verdict = "differs"
-            if is_fine and not unexpected:
-                verdict = "undecided"
-            return FactCheck(self.fact, self.derived, shortened([*unexpected, *unseen], 4), verdict)
-        nonzero = [number.value for number in self.magnitudes if number.is_nonzero]
-        largest = max((number.value for number in self.magnitudes if not number.is_nonzero), default=0.0)
+        zeros = [(name, value) for name, value, is_nonzero in self.magnitudes if not is_nonzero]
+        nonzeros = [(name, value) for name, value, is_nonzero in self.magnitudes if is_nonzero]
+        differences = [
+            f"{name} is {size_text(value)} of its scale" for name, value in zeros if value > self.rounding
+        ]
+        verdict: Verdict = "undecided" if is_fine and not differences else "differs"
+        differences += [f"{name} is not seen" for name, value in nonzeros if value <= self.rounding]
+        if differences:
+            return FactCheck(self.fact, self.derived, shortened(differences, 4), verdict)
+        largest = max((value for _, value in zeros), default=0.0)
         result = f"what should be zero is at most {size_text(largest)} of its scale"
-        if nonzero:
-            result = f"what should not be zero is at least {size_text(min(nonzero))} of its scale, {result}"
+        if nonzeros:
+            smallest = min(value for _, value in nonzeros)
+            result = f"what should not be zero is at least {size_text(smallest)} of its scale, {result}"
         return FactCheck(self.fact, self.derived, result, "agrees")
 
 
 def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> Verification:
     """Verify the structure of ``arm``, and the arm against the file of ``robot``, at random configurations."""
-    # r samples have the rank r of a space; additional samples would reveal a larger rank
-    count = len(structure.entries) + TUNING.spare_samples
+    # r samples have the rank r of a space; six additional samples would reveal a larger rank
+    count = len(structure.entries) + 6
     rng = np.random.default_rng(seed)
-    inertials = "the URDF's inertial values"
-    if structure.assume == "kinematics":
-        inertials = "inertial values of its own"
-    samples = draw(arm, count, rng, random_inertials=structure.assume == "kinematics")
-    base_parameters = structure.base_parameter_count
+    is_random = structure.assume == "kinematics"
+    # one set of samples for all facts: a fact that needed samples of its own could pass by chance
+    samples = draw(arm, count, rng, random_inertials=is_random)
     facts = [
         *_entries(structure, samples),
         _smallest_form(structure, samples),
         *_ranks(structure, samples),
         _potential(structure, samples),
-        _rank("base parameters", regressor(arm, rng), base_parameters),
+        _rank("base parameters", regressor(arm, rng), structure.base_parameter_count),
     ]
     is_fine = _is_fine(arm, structure)
     checks = [fact.check(is_fine) for fact in facts]
+    inertials = "inertial values of its own" if is_random else "the URDF's inertial values"
     means = f"{ENGINE} at {count} random configurations, each with {inertials}"
-    return Verification(means, count, seed, (*checks, *urdf_cross_check(robot, arm, seed)))
+    return Verification(means, count, seed, (*checks, *_reading_checks(robot, arm, seed)))
+
+
+def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
+    """Yield the comparison of the chain with the reading of the URDF by Pinocchio."""
+    try:
+        differences = differences_of_reading(robot, arm, seed)
+    except Exception as problem:  # a failure of Pinocchio is no evidence about the chain
+        text = " ".join(str(problem).split())[:120]
+        result = f"Pinocchio cannot read it ({type(problem).__name__}: {text})"
+        yield FactCheck("reading of the file", "the moving bodies", result, "undecided")
+        return
+    is_rounded = any(remark.code.startswith("snapped-") for remark in arm.diagnostics)
+    # per joint [rad, m]: dropped offsets, and composed rotations of 1e-11 each
+    allowed = 1e-9 * len(robot.joints)
+    for difference in differences:
+        verdict: Verdict = "agrees"
+        if difference.difference > allowed or (difference.rounding > allowed and not is_rounded):
+            verdict = "differs"
+        result = f"at most {size_text(difference.difference)} of their size apart"
+        if is_rounded:
+            result += f"; the reported roundings move them by {size_text(difference.rounding)}"
+        yield FactCheck(f"{difference.quantity} in the file", "as Pinocchio reads them", result, verdict)
 
 
 def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
     """Yield the zero entries, and the dependence of each entry on each joint."""
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()  # (entries, n)
-    zeros, pairs = [], []
+    zeros: list[Magnitude] = []
+    pairs: list[Magnitude] = []
     dependent = 0
     for entry, size, changes in zip(structure.entries, largest, largest_changes, strict=True):
         name = entry_name(entry.row, entry.column)
         dependent += len(entry.joints)
         if entry.kind == "zero":
-            zeros.append(_Magnitude(name, size, False))
+            zeros.append((name, size, False))
         for joint, change in enumerate(changes):
-            pairs.append(
-                _Magnitude(f"change of {name} with joint {joint + 1}", change, joint in entry.joints)
-            )
+            pairs.append((f"change of {name} with joint {joint + 1}", change, joint in entry.joints))
     if zeros:
-        yield _DerivedFact("zero entries", shortened([zero.name for zero in zeros], 8), zeros)
+        yield _DerivedFact("zero entries", shortened([name for name, *_ in zeros], 8), zeros)
     derived = f"{dependent} of the {len(pairs)} pairs of an entry and a joint"
     yield _DerivedFact("dependence on joints", derived, pairs)
 
@@ -121,14 +207,14 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFac
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
         # relative to the sum of the absolute values of the terms
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
+        # its own joints may change the term: only changes by other joints contradict the fact
         changes[list(term.joints)] = 0.0
-        name = "change of a constant"
-        if term.joints:
-            name = f"change of an output of {joints_in_ranges(term.joints)} with others"
-        magnitudes.append(_Magnitude(name, float(changes.max()), False))
-    magnitudes.append(_Magnitude("remainder of M", float(np.abs(remainder).max(initial=0.0)), False))
+        name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
+        magnitudes.append((f"change of {name}", float(changes.max()), False))
+    magnitudes.append(("remainder of M", float(np.abs(remainder).max(initial=0.0)), False))
+    # long fractions are evaluated in double precision: rounding is larger than in the other facts
     derived = f"{len(structure.outputs)} outputs and {len(structure.constants)} constants give M"
-    return _DerivedFact("smallest form", derived, magnitudes, TUNING.form_rounding)
+    return _DerivedFact("smallest form", derived, magnitudes, rounding=1e-6)
 
 
 def _ranks(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
@@ -154,10 +240,8 @@ def _potential(structure: Structure, samples: NumericSamples) -> _DerivedFact:
     magnitudes = []
     for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):
         name = f"torque of gravity at joint {joint + 1}"
-        magnitudes.append(_Magnitude(name, size, joint in structure.potential))
-    derived = "no joint"
-    if structure.potential:
-        derived = joints_in_ranges(structure.potential)
+        magnitudes.append((name, size, joint in structure.potential))
+    derived = joints_in_ranges(structure.potential) if structure.potential else "no joint"
     return _DerivedFact("potential energy", derived, magnitudes)
 
 
@@ -167,11 +251,12 @@ def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
         # The triangular factor has the same singular values and fewer rows.
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
     values = np.linalg.svd(rows, compute_uv=False)
+    # relative, as the rows have no common unit
     values = values / (values.max(initial=0.0) or 1.0)
     values = np.pad(values, (0, max(0, rank - len(values))))
     magnitudes = []
     for number, value in enumerate(values.tolist(), start=1):
-        magnitudes.append(_Magnitude(f"singular value {number} of {fact}", value, number <= rank))
+        magnitudes.append((f"singular value {number} of {fact}", value, number <= rank))
     return _DerivedFact(fact, str(rank), magnitudes)
 
 
@@ -184,4 +269,4 @@ def _is_fine(arm: Chain, structure: Structure) -> bool:
                 tensor = np.array(body.inertia[4:], dtype=float)
                 numbers.append(tensor / (np.abs(tensor).max() or 1.0))
     magnitudes = np.abs(np.concatenate(numbers))
-    return bool(magnitudes[magnitudes > 0].min() < TUNING.fine)
+    return bool(magnitudes[magnitudes > 0].min() < 1e-3)

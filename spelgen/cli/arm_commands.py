@@ -10,47 +10,37 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, deliver, note, refuse_warnings
-from spelgen.cli.options import (
-    Accept,
-    AngleTolerance,
-    Assumption,
-    Data,
-    Entry,
-    Filter,
-    Joints,
-    MappingFile,
-    MoreData,
-    Output,
-    Robot,
-    Strict,
-    Tip,
-)
+from spelgen.cli.options import flag, option
 
 if TYPE_CHECKING:
     from spelgen.certificate.formulas import Formulas
     from spelgen.certificate.inspection import Inspection
-    from spelgen.certificate.verification import Verification
+    from spelgen.certificate.verify import Verification
 
 InspectionFormat = Literal["text", "json", "html", "latex", "sympy"]
 IdentificationFormat = Literal["text", "json", "html"]
 EFFECTS = ("stribeck", "polynomial", "memory")
+FRICTION_HELP = (
+    "Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; bristles "
+    "(hysteresis)."
+)
 
 
 def inspect(
-    robot: Robot,
-    joints: Joints = None,
-    tip: Tip = None,
-    assume: Assumption = "kinematics",
-    angle_tolerance: AngleTolerance = 2e-3,
+    robot: options.Robot,
+    joints: options.Joints = None,
+    tip: options.Tip = None,
+    assume: options.Assumption = "kinematics",
+    angle_tolerance: options.AngleTolerance = 2e-3,
     formulas: Annotated[
-        bool, typer.Option("--formulas", help="Write M and V as expressions in q and base parameters.")
+        bool, flag("--formulas", "Write M and V as expressions in q and base parameters.")
     ] = False,
-    entry: Entry = None,
+    entry: options.Entry = None,
     format: Annotated[InspectionFormat | None, options.result_format()] = None,
-    output: Output = None,
-    strict: Strict = False,
+    output: options.Output = None,
+    strict: options.Strict = False,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Verify the structure by Pinocchio, SymPy and numeric samples.")
+        bool, flag("--verify", "Verify the structure by Pinocchio, SymPy and numeric samples.")
     ] = False,
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
@@ -70,6 +60,7 @@ def inspect(
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE
 
+        # a program reads formulas of any length, a person does not
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
     # the result comes first; --strict and a failed proof only decide the exit code
@@ -100,15 +91,12 @@ def _text(
         if proof:
             data["verification"] = proof.to_dict()
         return json.dumps(data, indent=2) + "\n"
+    paragraphs = [] if proof is None else [proof.text()]
     if closed is None:
-        result = inspection.text()
-    else:
-        from spelgen.certificate import formula_files
+        return "\n\n".join([inspection.text(), *paragraphs]) + "\n"
+    from spelgen.certificate import formula_files
 
-        result = formula_files.text(closed)
-    if proof:
-        result += f"\n\n{proof.text()}"
-    return result + "\n"
+    return "\n\n".join([formula_files.text(closed), *paragraphs]) + "\n"
 
 
 def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> str:
@@ -120,35 +108,26 @@ def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> 
         note(f"too long to be written: {', '.join(names)}")
     if proof:
         note(proof.text())
-    if format == "latex":
-        return formula_files.latex(closed)
-    return formula_files.sympy_source(closed)
+    return formula_files.latex(closed) if format == "latex" else formula_files.sympy_source(closed)
 
 
 def identify(
-    robot: Robot,
-    extra_logs: MoreData = None,
-    data: Data = None,
-    mapping: MappingFile = None,
-    joints: Joints = None,
-    tip: Tip = None,
-    angle_tolerance: AngleTolerance = 2e-3,
-    filter: Filter = None,
+    robot: options.Robot,
+    extra_logs: options.MoreData = None,
+    data: options.Data = None,
+    mapping: options.MappingFile = None,
+    joints: options.Joints = None,
+    tip: options.Tip = None,
+    angle_tolerance: options.AngleTolerance = 2e-3,
+    filter: options.Filter = None,
     weights: Annotated[
         Literal["equal", "range", "noise"],
-        typer.Option(help="Weights of the joints: equal, by torque range, or by torque noise."),
+        option("", "Weights of the joints: equal, by torque range, or by torque noise."),
     ] = "noise",
-    friction: Annotated[
-        str | None,
-        typer.Option(
-            metavar="stribeck,polynomial,memory",
-            help="Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; "
-            "bristles (hysteresis).",
-        ),
-    ] = None,
-    accept: Accept = None,
+    friction: Annotated[str | None, option(",".join(EFFECTS), FRICTION_HELP)] = None,
+    accept: options.Accept = None,
     format: Annotated[IdentificationFormat | None, options.result_format()] = None,
-    output: Output = None,
+    output: options.Output = None,
 ) -> None:
     """Identify base parameters and friction by least squares."""
     paths = options.logs(data, extra_logs)
@@ -159,6 +138,7 @@ def identify(
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
+    # an option of names and not one flag per effect: new effects need no new option
     effects = options.names(friction) or []
     for name in effects:
         if name not in EFFECTS:

@@ -27,15 +27,8 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells count
 BROKEN_PIPE = 141  # 128 + SIGPIPE
 
 # top-level module -> the extra that installs it
-EXTRAS = {
-    "pinocchio": "simulate",
-    "casadi": "deploy",
-    "mujoco": "deploy",
-    "onnxruntime": "deploy",
-    "onnxscript": "deploy",
-    "safetensors": "deploy",
-    "ray": "parallel",
-}
+EXTRAS = {"pinocchio": "simulate", "ray": "parallel"}
+EXTRAS |= dict.fromkeys(("casadi", "mujoco", "onnxruntime", "onnxscript", "safetensors"), "deploy")
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 
@@ -70,9 +63,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
 
 def _name_values(annotation: object, *metadata: object) -> None:
     """Set the name of an option's values in the help: N, X, FILE, or the choices."""
-    value_type = annotation
-    if NoneType in get_args(annotation):
-        value_type = get_args(annotation)[0]
+    value_type = get_args(annotation)[0] if NoneType in get_args(annotation) else annotation
     for info in metadata:
         if isinstance(info, OptionInfo) and info.metavar is None and value_type is not bool:
             info.metavar = METAVARS.get(value_type) or "|".join(map(str, get_args(value_type)))
@@ -82,9 +73,7 @@ def _local(value: object) -> object:
     """Return the local copies of paths that are addresses; other values are unchanged."""
     if isinstance(value, list):
         return [_local(element) for element in value]
-    if isinstance(value, Path):
-        return local(value)
-    return value
+    return local(value) if isinstance(value, Path) else value
 
 
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
@@ -95,6 +84,7 @@ def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
         raise typer.Exit(BROKEN_PIPE)
     if debug:
         traceback.print_exception(error)
+    # no traceback: the user knows the reason
     if isinstance(error, KeyboardInterrupt):
         note("interrupted")
         raise typer.Exit(INTERRUPTED)
@@ -105,17 +95,14 @@ def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
 def _message(error: BaseException, debug: bool) -> str:
     if isinstance(error, SpelgenError):
         return str(error)
-    if isinstance(error, ModuleNotFoundError):
-        extra = EXTRAS.get((error.name or "").split(".")[0])
-        if extra is not None:
-            return (
-                f"this needs the package {error.name}, which is not installed; pip install 'spelgen[{extra}]'"
-            )
+    package = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+    extra = EXTRAS.get(package.split(".")[0])
+    if extra is not None:
+        return f"this needs the package {package}, which is not installed; pip install 'spelgen[{extra}]'"
     # a full disk or a missing permission is not a defect of spelgen
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{os.fsdecode(error.filename)}: {(error.strerror or type(error).__name__).lower()}"
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror.lower()
+    if isinstance(error, OSError) and (error.filename is not None or error.strerror):
+        file = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return f"{file}{(error.strerror or type(error).__name__).lower()}"
     hint = "" if debug else "; --debug shows where"
     return f"spelgen: unexpected {in_one_line(error)}{hint}"
 
@@ -129,6 +116,7 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
     from rich.console import Console
     from rich.progress import Progress
 
+    # on stderr: stdout has the result only
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, total, now=title: bar.update(task, completed=done, total=total, description=now)
@@ -146,6 +134,7 @@ def note(text: object) -> None:
 
 def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
     """Print the result of a command: its lines as text, or its record as one line of JSON."""
+    # one line: logs of a pipeline have one record per line
     if form == "json":
         print(json.dumps(record, default=str))
         return

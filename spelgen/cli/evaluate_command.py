@@ -1,44 +1,41 @@
-"""Commands about trained runs: `evaluate` on test logs, and `report`, a page about the results."""
+"""Commands about trained runs: `evaluate` and `estimate` along logs, `report`, and `compare` of many runs."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import note, progress_bar, say
-from spelgen.cli.options import Data, Filter, MappingFile, MoreData, Output, Run
-from spelgen.errors import RunError
+from spelgen.cli.console import FAILED, answer, note, progress_bar, say
+from spelgen.cli.options import argument, flag, option, output_option
+from spelgen.cli.train_settings import UsageError
 from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
-from spelgen.files import read_json
+
+if TYPE_CHECKING:
+    from spelgen.comparison.arms import Comparison
+
 
 Format = Literal["text", "json", "csv"]
 LIMIT_EXCEEDED = 3  # exit code; usage errors have 2
+LIMIT_HELP = f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each."
 
 
 def evaluate(
-    run: Run,
-    extra_logs: MoreData = None,
-    data: Data = None,
-    mapping: MappingFile = None,
-    filter: Filter = None,
+    run: options.Run,
+    extra_logs: options.MoreData = None,
+    data: options.Data = None,
+    mapping: options.MappingFile = None,
+    filter: options.Filter = None,
     format: Annotated[Format | None, options.result_format()] = None,
-    output: Output = None,
-    limit: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="FIGURE=MAX",
-            help=f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each.",
-        ),
-    ] = None,
+    output: options.Output = None,
+    limit: Annotated[list[str] | None, option("FIGURE=MAX", LIMIT_HELP)] = None,
     truth: Annotated[
-        Path | None,
-        typer.Option(metavar="URDF", help="The true arm of simulated logs: state the error of M(q)."),
+        Path | None, option("URDF", "The true arm of simulated logs: state the error of M(q).")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Torque errors only, without rollouts.")] = False,
+    quick: Annotated[bool, flag("--quick", "Torque errors only, without rollouts.")] = False,
 ) -> None:
     """Evaluate a trained run and its baselines on test logs.
 
@@ -56,6 +53,7 @@ def evaluate(
     from spelgen.logs.preprocessing import Preprocessing
 
     logs = read_test_logs(run, paths, mapping)
+    # after the logs, whose errors are more frequent and reported sooner
     model = load_run(run)
     with progress_bar("evaluating") as progress:
         results = evaluate_model(
@@ -70,6 +68,7 @@ def evaluate(
     record = results.to_dict()
     # before anything is printed: a closed pipe must not lose the result
     write_json(RunFolder(run).evaluation, record)
+    # on stderr: stdout has the result only, which scripts read
     for diagnostic in results.diagnostics:
         note(diagnostic)
     forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
@@ -95,42 +94,174 @@ def _limit(text: str) -> tuple[str, float]:
             return name, float(value)
     except ValueError:
         pass
-    raise typer.BadParameter(
-        f"{text!r} is not FIGURE=MAX with one of {', '.join(LIMITS)}", param_hint="'--limit'"
-    )
+    message = f"{text!r} is not FIGURE=MAX with one of {', '.join(LIMITS)}"
+    raise typer.BadParameter(message, param_hint="'--limit'")
+
+
+def estimate(
+    run: options.Run,
+    extra_logs: options.MoreData = None,
+    data: options.Data = None,
+    mapping: options.MappingFile = None,
+    accept: options.Accept = None,
+    alarms: Annotated[
+        float | None, option("RATE", "False alarms of contact per minute; default: 1.", min=1e-6)
+    ] = None,
+    output: Annotated[
+        Path | None, output_option("FILE", "HTML page; default: estimate.html in the run folder.")
+    ] = None,
+    format: options.TextOrJson = "text",
+) -> None:
+    """Run the estimator along logs: payload, contacts, friction drift.
+
+    It prints mass and centre of mass with 95 % intervals, contacts with times and torques, and the friction of each
+    joint relative to the model, and writes a page with their curves.
+    """
+    paths = options.logs(data, extra_logs)
+    from spelgen.fitting.fitted import load_run
+    from spelgen.live.estimator import torque_model
+    from spelgen.live.levels import noise_levels
+    from spelgen.live.replay import replay
+    from spelgen.logs.read import read_logs
+    from spelgen.render.estimate_page import write_estimate
+
+    fit = load_run(run)
+    # reported before logs are read
+    torque_model(fit)
+    levels = noise_levels(fit)
+    joints = list(fit.model.joint_names)
+    log_mapping = options.log_mapping(joints, mapping or fit.record.mapping, accept)
+    results = replay(fit, read_logs(paths, joints, mapping=log_mapping), alarms)
+    page = write_estimate(fit, levels, results, output or Path(run) / "estimate.html")
+    record: dict[str, object] = {"run": str(run), "page": str(page)}
+    record["supported_alarms_per_minute"] = rate = levels.supported_alarms
+    record["logs"] = [result.to_dict() for result in results]
+    supported = f"thresholds of contact are supported down to {rate:.2g} false alarms per minute"
+    answer(format, record, *(result.text() for result in results), supported, f"wrote {page}")
 
 
 def report(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN", help="Run folders; several are compared on one page.")
-    ],
+    runs: Annotated[list[Path], argument("RUN", "Run folders; several are compared on one page.")],
     output: Annotated[
         Path | None,
-        options.output_option(
+        output_option(
             "FILE",
             "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
         ),
     ] = None,
     robot: Annotated[
-        Path | None,
-        typer.Option(metavar="ROBOT.urdf", help="URDF with its meshes, for the picture of the arm."),
+        Path | None, option("ROBOT.urdf", "URDF with its meshes, for the picture of the arm.")
     ] = None,
 ) -> None:
     """Write an HTML page about one run or several."""
     if robot is not None and len(runs) > 1:
         raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
-    if len(runs) == 1:
-        from spelgen.evaluation.results import Results
-        from spelgen.fitting.run_folder import RunFolder
-        from spelgen.render.report_page import write_report
+    from spelgen.evaluation.results import Results
+    from spelgen.fitting.run_folder import RunFolder
+    from spelgen.render.report_page import write_report, write_runs
 
-        path, evaluation = write_report(runs[0], output, robot), RunFolder(runs[0]).evaluation
-        if evaluation.exists():
-            listing = summary(Results.from_dict(read_json(evaluation, RunError)))
-            if listing is not None:
-                say(listing.text() + "\n")
-        say(f"wrote {path}: the report, for any browser")
-    else:
-        from spelgen.render.runs_page import write_runs
-
+    if len(runs) > 1:
         say(f"wrote {write_runs(runs, output or Path('runs.html'))}")
+        return
+    path, folder = write_report(runs[0], output, robot), RunFolder(runs[0])
+    listing = None
+    if folder.evaluation.exists():
+        listing = summary(Results.from_dict(folder.read_json(folder.evaluation)))
+    if listing is not None:
+        say(listing.text() + "\n")
+    say(f"wrote {path}: the report, for any browser")
+
+
+Jobs = Annotated[
+    int | None,
+    option(
+        "", "Number of parallel runs, one core each, by Ray; default: all cores if Ray is installed.", min=1
+    ),
+]
+
+
+def compare(
+    target: Annotated[
+        Path, argument("TARGET", "URDF of an arm, or YAML file that lists arms and their logs.")
+    ],
+    data: options.Data = None,
+    mapping: options.MappingFile = None,
+    output: Annotated[
+        Path | None, output_option("FOLDER", "Output folder; default: comparisons/TARGET.")
+    ] = None,
+    presets: Annotated[
+        str | None,
+        option(
+            "A,B,C",
+            "Presets or YAML files of designs; default: closed-form,hybrid on logs, else all presets.",
+        ),
+    ] = None,
+    seeds: Annotated[int | None, option("", "Number of runs of each preset.", min=1)] = None,
+    splits: Annotated[
+        int | None, option("", "Folds of a cross-validation over trajectories; default: 1.", min=1)
+    ] = None,
+    steps: Annotated[int | None, option("", "Training steps of each run on a simulated arm.", min=1)] = None,
+    ablation: Annotated[
+        bool, flag("--ablation", "Compare designs from phnode to hybrid that differ by one change each.")
+    ] = False,
+    jobs: Jobs = None,
+    address: options.Address = None,
+) -> None:
+    """Train presets on the same logs and rank them.
+
+    An arm without logs is simulated by the protocol of its settings. The same command resumes an interrupted
+    comparison, and reruns only changed runs.
+    """
+    from spelgen.comparison.arms import ablation_designs
+    from spelgen.comparison.study import prepare_study, run_study
+    from spelgen.comparison.tables import arm_sections
+    from spelgen.fitting.process import locked, termination_as_interrupt
+    from spelgen.render.comparison_page import write_comparison
+    from spelgen.tasks import default_jobs, workers
+
+    if ablation and presets is not None:
+        raise UsageError("--ablation: names the presets itself, omit --presets")
+    names = options.names(presets)
+    values = {
+        "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
+        "seeds": seeds, "splits": splits, "steps": steps,
+    }  # fmt: skip
+    # options of the command line take precedence over the file
+    changes = {name: value for name, value in values.items() if value is not None}
+    comparison = _comparison(target, data, mapping).model_copy(update=changes)
+    name = target.stem + ("-logs" if data else "") + ("-ablation" if ablation else "")
+    # the working folders of workers differ, so paths must be absolute
+    folder = (output or Path("comparisons") / name).absolute()
+    # all cores: a comparison takes hours on one
+    parallel = jobs or default_jobs()
+    # two simultaneous comparisons in one folder would overwrite each other's runs
+    with locked(folder), termination_as_interrupt():
+        with progress_bar("simulating") as progress:
+            study = prepare_study(comparison, folder, progress)
+        note(study.announcement(parallel))
+        # the inputs exist before workers start, and each worker reads the same files
+        with workers(parallel, address) as run_tasks:
+            study = run_study(study, run_tasks, note)
+        sections = arm_sections(study)
+        # the tables are printed as well, since a page cannot be read in a terminal
+        for section in sections:
+            say(f"{section.name}: {section.sentence}\n")
+            for table in section.tables:
+                say(f"{table.text()}\n")
+        say(f"wrote {write_comparison(study, sections)}")
+    # the page is written in any case, with the runs that failed
+    if study.failures:
+        raise typer.Exit(FAILED)
+
+
+def _comparison(target: Path, data: list[Path] | None, mapping: Path | None) -> Comparison:
+    """Return the comparison of a URDF with these logs, or the comparison in a YAML file."""
+    from spelgen.comparison.arms import YAML, ComparedArm, Comparison, load_comparison
+
+    if target.suffix not in YAML:
+        paths = tuple(path.absolute() for path in data or ())
+        arm = ComparedArm(urdf=target.absolute(), data=paths, mapping=mapping and mapping.absolute())
+        return Comparison.model_construct(arms={target.stem: arm})
+    if data or mapping:
+        raise UsageError("--data and --mapping: belong to a URDF; in a YAML file each arm has its own")
+    return load_comparison(target.absolute())

@@ -11,17 +11,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, refuse_warnings, say
-from spelgen.cli.options import (
-    Accept,
-    AngleTolerance,
-    Force,
-    Joints,
-    MappingFile,
-    Robot,
-    Strict,
-    TextOrJson,
-    Tip,
-)
+from spelgen.cli.options import argument, option, output_option
 from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
 from spelgen.labels import counted
@@ -34,38 +24,29 @@ if TYPE_CHECKING:
 class MotionOptions:
     """The arguments of `spelgen.excite`, as options of a command."""
 
-    duration: Annotated[float, typer.Option(min=2.0, max=600.0, help="Duration [s].")] = 30.0
-    sample_rate: Annotated[float, typer.Option(min=1.0, max=10000.0, help="Sample rate [Hz].")] = 100.0
+    duration: Annotated[float, option("", "Duration [s].", min=2.0, max=600.0)] = 30.0
+    sample_rate: Annotated[float, option("", "Sample rate [Hz].", min=1.0, max=10000.0)] = 100.0
     harmonics: Annotated[
-        int | None,
-        typer.Option(min=2, max=100, help="Number of harmonics; default: 0.4 per second, at least 5."),
+        int | None, option("", "Number of harmonics; default: 0.4 per second, at least 5.", min=2, max=100)
     ] = None
-    reach: Annotated[
-        float, typer.Option(min=0.05, max=1.0, help="Fraction of the position range to use.")
-    ] = 0.9
-    speed: Annotated[
-        float, typer.Option(min=0.05, max=1.0, help="Fraction of the velocity limits to use.")
-    ] = 0.7
+    reach: Annotated[float, option("", "Fraction of the position range to use.", min=0.05, max=1.0)] = 0.9
+    speed: Annotated[float, option("", "Fraction of the velocity limits to use.", min=0.05, max=1.0)] = 0.7
     acceleration: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X|X,X,X", help="Largest acceleration, of all joints or per joint [rad/s^2, m/s^2]."
-        ),
+        str | None, option("X|X,X,X", "Largest acceleration, of all joints or per joint [rad/s^2, m/s^2].")
     ] = None
     start: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "X,X,X",
+            "Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
             "--from",
-            metavar="X,X,X",
-            help="Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
         ),
     ] = None
     surroundings: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.yaml", help="Floor, boxes and clearance, which the motion respects."),
+        Path | None, option("FILE.yaml", "Floor, boxes and clearance, which the motion respects.")
     ] = None
-    trials: Annotated[int, typer.Option(min=1, help="Candidates of the search, after random ones.")] = 100
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0
+    trials: Annotated[int, option("", "Candidates of the search, after random ones.", min=1)] = 100
+    seed: Annotated[int, option("", "Seed of the search.", min=0)] = 0
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments, with numbers in place of text."""
@@ -75,24 +56,19 @@ class MotionOptions:
 
 @options.grouped
 def excite(
-    robot: Robot,
-    output: Annotated[Path, options.output_option("FILE.csv", "Output file of the motion.")],
+    robot: options.Robot,
+    output: Annotated[Path, output_option("FILE.csv", "Output file of the motion.")],
     design: MotionOptions,
-    joints: Joints = None,
-    tip: Tip = None,
-    angle_tolerance: AngleTolerance = 2e-3,
+    joints: options.Joints = None,
+    tip: options.Tip = None,
+    angle_tolerance: options.AngleTolerance = 2e-3,
     trajectory: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML.",
-        ),
+        option("FILE", "Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML."),
     ] = None,
-    html: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also write a page that shows the motion.")
-    ] = None,
-    force: Force = False,
-    format: TextOrJson = "text",
+    html: Annotated[Path | None, option("FILE", "Also write a page that shows the motion.")] = None,
+    force: options.Force = False,
+    format: options.TextOrJson = "text",
 ) -> None:
     """Propose an excitation trajectory for identification.
 
@@ -107,40 +83,37 @@ def excite(
     with progress_bar("searching") as progress:
         motion = design_motion(arm, progress=progress, **design.arguments())
     written = [str(write_text(output, motion.csv()))]
+    # the CSV remains the main output: `simulate` and logs use it
     if trajectory is not None:
         written.append(str(write_text(trajectory, motion.joint_trajectory())))
     if html is not None:
         # imported here: pages need packages that take long to import
-        from spelgen.render.motion_page import page
+        from spelgen.render.arm_pages import motion_page
 
-        written.append(str(write_text(html, page(motion, arm))))
+        written.append(str(write_text(html, motion_page(motion, arm))))
     lines = [f"wrote {path}" for path in written]
     answer(format, {"files": written} | motion.to_dict(), motion.text(), *lines)
 
 
 def simulate(
-    robot: Robot,
-    output: Annotated[Path, options.output_option("LOGS", "Folder for train and test logs.")],
-    joints: Joints = None,
-    tip: Tip = None,
-    angle_tolerance: AngleTolerance = 2e-3,
+    robot: options.Robot,
+    output: Annotated[Path, output_option("LOGS", "Folder for train and test logs.")],
+    joints: options.Joints = None,
+    tip: options.Tip = None,
+    angle_tolerance: options.AngleTolerance = 2e-3,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Random seed; default: the seed in the robot's settings.")
+        int | None, option("", "Random seed; default: the seed in the robot's settings.", min=0)
     ] = None,
     as_built: Annotated[
-        int | None,
-        typer.Option(
-            min=0, metavar="SEED", help="Simulate an arm that differs from its URDF, drawn from this seed."
-        ),
+        int | None, option("SEED", "Simulate an arm that differs from its URDF, drawn from this seed.", min=0)
     ] = None,
     motion: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="FILE.csv",
-            help="A motion of `spelgen excite` to perform; repeatable. The last half is for testing.",
+        option(
+            "FILE.csv", "A motion of `spelgen excite` to perform; repeatable. The last half is for testing."
         ),
     ] = None,
-    force: Force = False,
+    force: options.Force = False,
 ) -> None:
     """Simulate training and test logs with Pinocchio.
 
@@ -153,6 +126,7 @@ def simulate(
     from spelgen.simulation.simulate import simulate as simulate_arm
 
     arm = options.load(robot, joints, tip, angle_tolerance)
+    # the URDF's names, so that the logs need no mapping
     names = arm.chain.joint_names
     motions = [read_motion(file, names) for file in motion or ()]
     truth = output / "as_built.urdf"
@@ -173,22 +147,20 @@ def simulate(
 
 
 def logs(
-    paths: Annotated[list[Path], typer.Argument(metavar="LOGS", help="Log files or folders.")],
-    robot: Annotated[Path, typer.Option(metavar="ROBOT.urdf", help="URDF of the logged arm.")],
-    joints: Joints = None,
-    tip: Tip = None,
-    angle_tolerance: AngleTolerance = 2e-3,
-    mapping: MappingFile = None,
-    format: TextOrJson = "text",
-    html: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with plots.")
-    ] = None,
+    paths: Annotated[list[Path], argument("LOGS", "Log files or folders.")],
+    robot: Annotated[Path, option("ROBOT.urdf", "URDF of the logged arm.")],
+    joints: options.Joints = None,
+    tip: options.Tip = None,
+    angle_tolerance: options.AngleTolerance = 2e-3,
+    mapping: options.MappingFile = None,
+    format: options.TextOrJson = "text",
+    html: Annotated[Path | None, option("FILE", "Also write an HTML page with plots.")] = None,
     suggest: Annotated[
-        Path | None, typer.Option(help="Write a mapping drafted from the column names of the first log.")
+        Path | None, option("", "Write a mapping drafted from the column names of the first log.")
     ] = None,
-    force: Force = False,
-    accept: Accept = None,
-    strict: Strict = False,
+    force: options.Force = False,
+    accept: options.Accept = None,
+    strict: options.Strict = False,
 ) -> None:
     """Check logs against the robot, and report their contents.
 
@@ -196,10 +168,10 @@ def logs(
     """
     from spelgen.log_checks.check_logs import check_logs
     from spelgen.logs.read import read_bounded_logs
-    from spelgen.render.logs_page import page
 
     # a mapping must name the joints of the URDF
     arm = options.load(robot, joints, tip, angle_tolerance)
+    # before the logs are read: they may be readable only with the suggested mapping
     if suggest is not None:
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
@@ -213,7 +185,10 @@ def logs(
         say(json.dumps(result.to_dict(), indent=2))
     # also for logs with errors, whose charts may show the cause
     if html is not None:
-        note(f"wrote {write_text(html, page(result, arm.chain, arm.actuation.matrix()))}")
+        from spelgen.render.arm_pages import logs_page
+
+        text = logs_page(result, arm.chain, arm.actuation.matrix())
+        note(f"wrote {write_text(html, text)}")
     if result.errors:
         note(SpelgenErrors(result.errors))
     # errors before warnings
@@ -229,6 +204,7 @@ def _suggested(paths: list[Path], arm: Arm, file: Path) -> Path:
     from spelgen.logs.formats import log_files
     from spelgen.logs.suggest import suggest_mapping
 
+    # the first log only: a mapping applies to all, which have the same columns
     logs, errors = log_files(paths)
     collect(errors)
     suggestion = suggest_mapping(logs[0], arm.chain.joint_names, commands=arm.settings.input == "position")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Annotated, Any
@@ -16,16 +16,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
-from spelgen.cli import (
-    arm_commands,
-    compare_command,
-    estimate_command,
-    evaluate_command,
-    log_commands,
-    model_commands,
-    train_command,
-)
+from spelgen.cli.arm_commands import identify, inspect
 from spelgen.cli.console import handle_errors, say
+from spelgen.cli.evaluate_command import compare, estimate, evaluate, report
+from spelgen.cli.log_commands import excite, logs, simulate
+from spelgen.cli.model_commands import build, check, export, init
+from spelgen.cli.train_command import train
 from spelgen.version import __version__
 
 BaseUsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -38,6 +34,7 @@ class Command(TyperCommand):
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""
+        # typer adds `PATH` to the name of each argument, which its metavar states already
         for parameter in self.params:
             if isinstance(parameter, TyperArgument):
                 vars(parameter)["display_type"] = lambda ctx: ""
@@ -97,22 +94,10 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-for command in (
-    arm_commands.inspect,
-    model_commands.init,
-    model_commands.build,
-    log_commands.simulate,
-    arm_commands.identify,
-    log_commands.excite,
-    log_commands.logs,
-    train_command.train,
-    evaluate_command.evaluate,
-    estimate_command.estimate,
-    evaluate_command.report,
-    model_commands.export,
-    compare_command.compare,
-    model_commands.check,
-):
+# in the order of a first project, which is the order of `spelgen --help`
+COMMANDS: list[Callable[..., None]] = [inspect, init, build, simulate, identify, excite, logs]
+COMMANDS += [train, evaluate, estimate, report, export, compare, check]
+for command in COMMANDS:
     app.command(cls=Command, context_settings=CONTEXT)(handle_errors(command))
 
 
@@ -130,6 +115,7 @@ def common(
     ] = False,
 ) -> None:
     """Derive, train and export dynamics models of robot arms from URDF files and logs."""
+    # help and exit code 0, as git and cargo do; typer would exit with an error
     if ctx.invoked_subcommand is None:
         say(ctx.get_help())
 

@@ -10,30 +10,20 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, say
-from spelgen.cli.options import (
-    AngleTolerance,
-    Assumption,
-    Force,
-    Joints,
-    Module,
-    Robot,
-    RobotOption,
-    TextOrJson,
-    Tip,
-)
+from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.design import PRESET_NAMES
 from spelgen.exporting.exported import Format
 from spelgen.files import write_text
 
 
 def init(
-    robot: Robot,
-    joints: Joints = None,
-    tip: Tip = None,
+    robot: options.Robot,
+    joints: options.Joints = None,
+    tip: options.Tip = None,
     output: Annotated[
-        Path | None, options.output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF.")
+        Path | None, output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF.")
     ] = None,
-    force: Force = False,
+    force: options.Force = False,
 ) -> None:
     """Write a commented file of settings for an arm."""
     from spelgen.arm.arm import make_arm
@@ -44,33 +34,30 @@ def init(
     options.require_free(path, force=force)
     # the settings file is not read: this command writes it
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
+    # damping and friction of the URDF become the first values, which a user then edits
     drives = [StarterJoint(x.name, x.joint_type, x.damping, x.friction) for x in arm.coordinates]
     say(f"wrote {write_text(path, starter(robot.name, drives, arm.bodies[-1].link))}")
 
 
 def build(
-    robot: Robot,
-    joints: Joints = None,
-    tip: Tip = None,
-    assume: Assumption = "kinematics",
-    angle_tolerance: AngleTolerance = 2e-3,
+    robot: options.Robot,
+    joints: options.Joints = None,
+    tip: options.Tip = None,
+    assume: options.Assumption = "kinematics",
+    angle_tolerance: options.AngleTolerance = 2e-3,
     preset: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME|FILE.yaml", help=f"Preset of the model: {', '.join(PRESET_NAMES)}, or a YAML file."
-        ),
+        str, option("NAME|FILE.yaml", f"Preset of the model: {', '.join(PRESET_NAMES)}, or a YAML file.")
     ] = "hybrid",
-    width: Annotated[int, typer.Option(min=1, max=4096, help="Hidden units per layer.")] = 64,
-    depth: Annotated[int, typer.Option(min=1, max=16, help="Number of hidden layers.")] = 2,
+    width: Annotated[int, option("", "Hidden units per layer.", min=1, max=4096)] = 64,
+    depth: Annotated[int, option("", "Number of hidden layers.", min=1, max=16)] = 2,
     standalone: Annotated[
-        bool, typer.Option("--standalone", help="Include the runtime: the module then needs PyTorch only.")
+        bool, flag("--standalone", "Include the runtime: the module then needs PyTorch only.")
     ] = False,
     output: Annotated[
-        Path | None,
-        options.output_option("MODULE.py", "Output file; default: <robot>_spel.py in this folder."),
+        Path | None, output_option("MODULE.py", "Output file; default: <robot>_spel.py in this folder.")
     ] = None,
-    force: Force = False,
-    format: TextOrJson = "text",
+    force: options.Force = False,
+    format: options.TextOrJson = "text",
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
     # checked before the URDF is read, which takes time
@@ -96,7 +83,7 @@ def build(
     answer(format, record, line)
 
 
-def check(module: Module, robot: RobotOption = None) -> None:
+def check(module: options.Module, robot: options.RobotOption = None) -> None:
     """Check whether a module is up to date with its URDF."""
     from spelgen.certificate.module_check import check as check_module
 
@@ -111,23 +98,23 @@ def check(module: Module, robot: RobotOption = None) -> None:
 
 
 def export(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="A folder that `spelgen train` wrote.")],
-    output: Annotated[Path, options.output_option("FILE|FOLDER", "Output file or folder.")],
+    run: Annotated[Path, argument("RUN", "A folder that `spelgen train` wrote.")],
+    output: Annotated[Path, output_option("FILE|FOLDER", "Output file or folder.")],
     to: Annotated[
-        Format | None, typer.Option(help="Export format. Default: by the extension of the output.")
+        Format | None, option("", "Export format. Default: by the extension of the output.")
     ] = None,
     entry: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
+        option(
+            "NAME",
+            "A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
         ),
     ] = None,
     float32: Annotated[
-        bool, typer.Option("--float32", help="Numbers of onnx and torch programs; otherwise float64.")
+        bool, flag("--float32", "Numbers of onnx and torch programs; otherwise float64.")
     ] = False,
-    force: Force = False,
-    format: TextOrJson = "text",
+    force: options.Force = False,
+    format: options.TextOrJson = "text",
 ) -> None:
     """Export a trained model to other tools. Each export is compared with the model before it is written.
 
@@ -139,6 +126,7 @@ def export(
     from spelgen.exporting.exported import format_by_extension, require_fitting
     from spelgen.fitting.fitted import load_run
 
+    # a format is seldom written: the name of the output states it
     if to is None:
         to = format_by_extension(output)
     # names and free places are checked before the model is loaded, which takes seconds

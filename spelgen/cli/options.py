@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args, get_type_hints
 
 import typer
-from typer.models import OptionInfo
+from typer.models import ArgumentInfo, OptionInfo
 
 from spelgen.cli.console import deliver
 from spelgen.errors import SpelgenError, suggestion
@@ -24,99 +24,68 @@ if TYPE_CHECKING:
     from spelgen.logs.arm_mapping import LoggedArm
     from spelgen.settings.log_mapping import LogMapping
 
-SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
 
-Robot = Annotated[
-    Path,
-    typer.Argument(
-        metavar="ROBOT.urdf", help="URDF of the arm; settings are read from ROBOT.yaml beside it."
-    ),
-]
-RobotOption = Annotated[
-    Path | None,
-    typer.Option("--robot", metavar="ROBOT.urdf", help="URDF of the module, if it is not found by name."),
-]
-Module = Annotated[Path, typer.Argument(metavar="MODULE.py", help="A module written by `spelgen build`.")]
-Run = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder of `spelgen train`.")]
-Joints = Annotated[
-    str | None,
-    typer.Option("--joints", metavar="A,B,C", help="Moving joints; all others are locked at zero."),
-]
-Tip = Annotated[
-    str | None,
-    typer.Option("--tip", metavar="LINK", help="Last link of the chain, which starts at the root."),
-]
-Assumption = Annotated[
-    Assume,
-    typer.Option(
-        "--assume",
-        help="URDF values the structure may use: kinematics, or also zeros and symmetries of inertials.",
-    ),
-]
-AngleTolerance = Annotated[
-    float,
-    typer.Option(
-        "--angle-tolerance",
-        metavar="RAD",
-        min=0.0,
-        max=0.1,
-        help="Tolerance for rounding angles to special values such as pi/2.",
-    ),
-]
-Entry = Annotated[
-    str | None,
-    typer.Option("--entry", metavar="ROW,COLUMN|V", help="Write this entry of M, or V, as an expression."),
-]
-Data = Annotated[
-    list[Path] | None,
-    typer.Option("--data", metavar="LOGS...", help="Log files or folders.", show_default=False),
-]
-MoreData = Annotated[
-    list[Path] | None,
-    typer.Argument(
-        metavar="LOGS", help="More log files or folders; several may follow --data.", show_default=False
-    ),
-]
-MappingFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--mapping",
-        metavar="FILE",
-        help="YAML file with column names and units of the logs; see docs/logs.md.",
-    ),
-]
-Accept = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--accept", metavar="CODE", help="Use logs with this error, which names its code; once for each."
-    ),
-]
-TextOrJson = Annotated[
-    Literal["text", "json"], typer.Option("--format", help="Format of the result on stdout.")
-]
-Filter = Annotated[
-    float | None,
-    typer.Option(
-        "--filter",
-        metavar="HZ",
-        min=0.0,
-        help="Cutoff frequency of the zero-phase low-pass filter; 0: no filter.",
-    ),
-]
-Address = Annotated[
-    str | None,
-    typer.Option(
-        metavar="HOST:PORT", help="Address of a running Ray cluster; default: a new one on this machine."
-    ),
-]
-Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite existing output.")]
+def option(
+    metavar: str, text: str, *names: str, min: float | None = None, max: float | None = None
+) -> OptionInfo:
+    """Return an option. metavar: name of its value; "": by its type. names: default: the name of the parameter."""
+    info: OptionInfo = typer.Option(*names, metavar=metavar or None, help=text, min=min, max=max)
+    return info
+
+
+def flag(name: str, text: str) -> OptionInfo:
+    """Return an option without a value, and without the negation `--no-...` that typer would add."""
+    return option("", text, name)
+
+
+def argument(metavar: str, text: str) -> ArgumentInfo:
+    """Return a positional argument."""
+    info: ArgumentInfo = typer.Argument(metavar=metavar, help=text)
+    return info
 
 
 def output_option(metavar: str, text: str) -> OptionInfo:
     """Return the option `-o` of a command."""
-    option: OptionInfo = typer.Option("-o", "--output", metavar=metavar, help=text)
-    return option
+    return option(metavar, text, "-o", "--output")
+
+
+SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
+
+Robot = Annotated[
+    Path, argument("ROBOT.urdf", "URDF of the arm; settings are read from ROBOT.yaml beside it.")
+]
+RobotOption = Annotated[Path | None, option("ROBOT.urdf", "URDF of the module, if it is not found by name.")]
+Module = Annotated[Path, argument("MODULE.py", "A module written by `spelgen build`.")]
+Run = Annotated[Path, argument("RUN", "A run folder of `spelgen train`.")]
+Joints = Annotated[str | None, option("A,B,C", "Moving joints; all others are locked at zero.")]
+Tip = Annotated[str | None, option("LINK", "Last link of the chain, which starts at the root.")]
+Assumption = Annotated[
+    Assume,
+    option("", "URDF values the structure may use: kinematics, or also zeros and symmetries of inertials."),
+]
+AngleTolerance = Annotated[
+    float, option("RAD", "Tolerance for rounding angles to special values such as pi/2.", min=0.0, max=0.1)
+]
+Entry = Annotated[str | None, option("ROW,COLUMN|V", "Write this entry of M, or V, as an expression.")]
+Data = Annotated[list[Path] | None, option("LOGS...", "Log files or folders.")]
+MoreData = Annotated[
+    list[Path] | None, argument("LOGS", "More log files or folders; several may follow --data.")
+]
+MappingFile = Annotated[
+    Path | None, option("FILE", "YAML file with column names and units of the logs; see docs/logs.md.")
+]
+Accept = Annotated[
+    list[str] | None, option("CODE", "Use logs with this error, which names its code; once for each.")
+]
+TextOrJson = Annotated[Literal["text", "json"], option("", "Format of the result on stdout.")]
+Filter = Annotated[
+    float | None, option("HZ", "Cutoff frequency of the zero-phase low-pass filter; 0: no filter.", min=0.0)
+]
+Address = Annotated[
+    str | None, option("HOST:PORT", "Address of a running Ray cluster; default: a new one on this machine.")
+]
+Strict = Annotated[bool, flag("--strict", "Exit with 1 if there is any warning.")]
+Force = Annotated[bool, flag("--force", "Overwrite existing output.")]
 
 
 Output = Annotated[Path | None, output_option("FILE", "Write the result to a file.")]
@@ -124,14 +93,12 @@ Output = Annotated[Path | None, output_option("FILE", "Write the result to a fil
 
 def result_format() -> OptionInfo:
     """Return the option `--format` of a command; the formats depend on the command."""
-    option: OptionInfo = typer.Option(
-        help="Format of the result; default: that of the suffix of -o, else text.", show_default=False
-    )
-    return option
+    return option("", "Format of the result; default: that of the suffix of -o, else text.")
 
 
 def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
     """Return the format, by default the format of the output's suffix if the command has it, else text."""
+    # a suffix that the command has no format for is the user's choice of a name
     by_suffix = SUFFIXES.get(output.suffix.lower(), "text") if output else "text"
     return format or (by_suffix if by_suffix in formats else "text")
 
@@ -193,6 +160,7 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
         return None
     if text == "V":
         return "V"
+    # at most four digits: Python refuses to convert thousands of them, and no arm has as many joints
     match = re.fullmatch(r"\s*(\d{1,4})\s*,\s*(\d{1,4})\s*", text, re.ASCII)
     if match is None:
         raise typer.BadParameter("name it as ROW,COLUMN or V", param_hint="'--entry'")
@@ -201,6 +169,7 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
 
 def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
     """Return the paths of all options --data. Raises a usage error if there are none."""
+    # an option and not an argument: logs and a module cannot be confused
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
     return [*data, *(extra_logs or [])]
@@ -234,6 +203,5 @@ def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: floa
 def require_free(path: Path, *, force: bool) -> None:
     """Raise SpelgenError if an output exists already, unless `force` allows to replace it."""
     if path.exists() and not force:
-        raise SpelgenError(
-            "this output exists already", file=path, do="--force replaces it, -o names another"
-        )
+        do = "--force replaces it, -o names another"
+        raise SpelgenError("this output exists already", file=path, do=do)

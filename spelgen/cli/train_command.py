@@ -13,7 +13,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
-from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson
+from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, new_run, read_assignments, resumed_run
 from spelgen.errors import LogError, ModuleError, OptionError
 from spelgen.labels import counted
@@ -26,46 +26,35 @@ if TYPE_CHECKING:
 
 
 TrainModule = Annotated[
-    Path | None,
-    typer.Argument(
-        metavar="MODULE.py",
-        help="Module of `spelgen build`; with --resume, a run folder.",
-        show_default=False,
-    ),
+    Path | None, argument("MODULE.py", "Module of `spelgen build`; with --resume, a run folder.")
 ]
-NewRun = Annotated[Path | None, options.output_option("RUN", "Run folder; default: runs/<module>.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the run folder.")]
-Source = Annotated[
-    Path | None, typer.Option("--from", metavar="RUN", help="Adapt the model of this run; replaces MODULE.")
-]
+NewRun = Annotated[Path | None, output_option("RUN", "Run folder; default: runs/<module>.")]
+Resume = Annotated[bool, flag("--resume", "Resume the run in the run folder.")]
+Source = Annotated[Path | None, option("RUN", "Adapt the model of this run; replaces MODULE.", "--from")]
 ObjectiveName = Annotated[
     Objective | None,
-    typer.Option(help="Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."),
+    option("", "Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."),
 ]
 Assignments = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Set an option of the fit, e.g. epochs=50; repeat it for more options.",
-    ),
+    option("KEY=VALUE", "Set an option of the fit, e.g. epochs=50; repeat it for more options.", "--set"),
 ]
 
 
 def train(
     module: TrainModule = None,
-    extra_logs: MoreData = None,
-    data: Data = None,
+    extra_logs: options.MoreData = None,
+    data: options.Data = None,
     output: NewRun = None,
-    robot: RobotOption = None,
-    mapping: MappingFile = None,
+    robot: options.RobotOption = None,
+    mapping: options.MappingFile = None,
     resume: Resume = False,
-    force: Force = False,
+    force: options.Force = False,
     source: Source = None,
     objective: ObjectiveName = None,
     assignments: Assignments = None,
-    accept: Accept = None,
-    format: TextOrJson = "text",
+    accept: options.Accept = None,
+    format: options.TextOrJson = "text",
 ) -> None:
     """Fit a module to logs.
 
@@ -92,6 +81,7 @@ def train(
     # with --resume, the argument may be the run folder
     folder = output or _default_folder(module, source, resume=resume)
     spec = _specification(module, source, folder if resume else None)
+    # a resumed run keeps the settings of its record: the file of the robot may have changed
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
     start = resumed_run(folder, request) if resume else new_run(urdf, request)
     from spelgen.emission.specify import arm_of_spec
@@ -122,8 +112,9 @@ def train(
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
+    # the option that does not apply is known only after the logs chose the objective
     except OptionError as error:
-        option = "--objective" if error.option == "objective" else f"--set {error.option}"
+        option = "--objective" if error.element == "objective" else f"--set {error.element}"
         raise UsageError(f"{option}: {error.got}") from error
     _report(fit, request, folder, format, _payload(fit, source))
 
@@ -146,6 +137,7 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
 
     original = load_run(source)
     levels = stored_levels(original)
+    # a run of an earlier version, or one whose logs were too short for the noise levels
     if levels is None:
         return None
     keep_levels(fit, levels)
@@ -158,27 +150,23 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
     if TIME_LIMIT in request.values and TIME_LIMIT not in type(fit.config).model_fields:
         objective = fit.config.objective
         note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {objective}")
-    record = {
-        "run": str(folder),
-        "status": fit.status,
-        "objective": fit.config.objective,
-        "steps": fit.steps,
-        "epochs": fit.epochs,
-        "seconds": fit.seconds,
-        # JSON has no infinity, the loss of a rollout that diverged
-        "validation_loss": fit.best_validation if math.isfinite(fit.best_validation) else None,
-        "torque_nmse": fit.torque_nmse,
-        "posterior": fit.posterior.to_dict() if fit.checkpoint.posterior else None,
-        "findings": [finding.to_dict() for finding in fit.diagnostics],
-    }
+    posterior = fit.posterior if fit.checkpoint.posterior else None
+    record: dict[str, object] = {"run": str(folder), "status": fit.status, "objective": fit.config.objective}
+    record |= {"steps": fit.steps, "epochs": fit.epochs, "seconds": fit.seconds}
+    # JSON has no infinity, the loss of a rollout that diverged
+    record["validation_loss"] = fit.best_validation if math.isfinite(fit.best_validation) else None
+    record["torque_nmse"] = fit.torque_nmse
+    record["posterior"] = None if posterior is None else posterior.to_dict()
+    record["findings"] = [finding.to_dict() for finding in fit.diagnostics]
     outcome: list[str] = [*_outcome(fit)]
     if payload is not None:
         from spelgen.live.replay import payload_content, payload_sentence
 
         record["payload"] = payload_content(payload)
         outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
-    outcome += [table.text() for table in fit.posterior.listings] if fit.checkpoint.posterior else []
+    outcome += [] if posterior is None else [table.text() for table in posterior.listings]
     answer(format, record, *outcome, f"run folder: {folder}")
+    # as a shell does: a script must distinguish an interrupted fit from a finished one
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)
@@ -221,14 +209,13 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
     """Return the run folder: with --resume the argument may be the folder itself."""
     if resume and module is not None and module.is_dir():
         return module
-    if module is not None:
-        return Path("runs") / module.stem
-    return Path("runs") / f"{(source or Path()).resolve().name}_adapted"
+    name = f"{(source or Path()).resolve().name}_adapted" if module is None else module.stem
+    return Path("runs") / name
 
 
 def _specification(module: Path | None, source: Path | None, resumed: Path | None) -> ModelSpec:
     """Return the specification of the model: of a run that is resumed or adapted, or of a module."""
-    from spelgen.emission.module_file import read_spec
+    from spelgen.emission.text import read_spec
     from spelgen.fitting.run_folder import RunFolder
 
     folder = resumed or source

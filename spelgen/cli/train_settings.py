@@ -12,9 +12,9 @@ from pydantic import ValidationError
 
 from spelgen.errors import RunError, suggestion
 from spelgen.settings.fits import OWNERS, Adaptation
-from spelgen.settings.messages import explain
 from spelgen.settings.training import PREPROCESSING, TrainingSettings
 from spelgen.settings.values import Count
+from spelgen.settings.yaml_document import explain
 
 if TYPE_CHECKING:
     from spelgen.fitting.fit import FitOptions
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 TIME_LIMIT = "max_minutes"
 OF_LOGS = PREPROCESSING | {"validation_fraction", "seed"}
-FIELD_SEPARATOR = "."
 
 
 class UsageError(typer.BadParameter):
@@ -84,7 +83,8 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
-        name, _, field = key.strip().replace("-", "_").partition(FIELD_SEPARATOR)
+        name, _, field = key.strip().replace("-", "_").partition(".")
+        # checked before the keys: the user may have written a blank in place of `=`
         if not equals:
             raise UsageError(f"--set: got {assignment!r}, expected KEY=VALUE")
         if name not in keys:

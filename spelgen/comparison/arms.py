@@ -1,20 +1,36 @@
-"""The arms and models of a comparison: one URDF with options, or a YAML file that lists arms."""
+"""The arms and models of a comparison: one URDF with options, or a YAML file that lists arms; and their logs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+import json
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
+import yaml
+from lxml import etree
 from pydantic import Field, StringConstraints
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESET_NAMES, Design, load_design
-from spelgen.errors import SettingsError, collect, suggestion
-from spelgen.settings.messages import dotted, validated
+from spelgen.errors import LogError, RunError, SettingsError, collect, suggestion
+from spelgen.files import read_json, remove, write_bytes, write_json, write_text
+from spelgen.logs.arm_mapping import log_source
+from spelgen.logs.formats import log_files
+from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.trajectory import Trajectory, set_aside
+from spelgen.logs.windows import split_validation
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group
-from spelgen.settings.yaml_document import Location, YamlDocument, read_document
+from spelgen.settings.yaml_document import Location, dotted, read_document, validated
+
+if TYPE_CHECKING:
+    from spelgen.arm.configured_arm import Arm
+
 
 YAML = (".yaml", ".yml")
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,60}$")]
@@ -36,8 +52,7 @@ class ComparedArm(Group):
     def files(self) -> Iterator[tuple[str, Path]]:
         """Yield each path with its key."""
         yield "urdf", self.urdf
-        for path in self.data:
-            yield "data", path
+        yield from (("data", path) for path in self.data)
         if self.mapping is not None:
             yield "mapping", self.mapping
 
@@ -89,8 +104,13 @@ def load_comparison(path: Path) -> Comparison:
     """
     document = read_document(path)
     comparison = validated(Comparison, document.value(), document)
-    collect([*_unknown_presets(comparison, document), *_missing_files(comparison, document)])
+    errors = []
+    for location, got, do in _contradictions(comparison, path.parent):
+        element, line = dotted(location), document.line(location)
+        errors.append(SettingsError(got, file=path, line=line, element=element, do=do))
+    collect(errors)
     arms = {name: arm.in_folder(path.parent) for name, arm in comparison.arms.items()}
+    # names of presets are no paths
     presets = comparison.presets
     if presets is not None:
         presets = tuple(str(path.parent / name) if _is_file(name) else name for name in presets)
@@ -101,19 +121,128 @@ def _is_file(preset: str) -> bool:
     return Path(preset).suffix in YAML
 
 
-def _unknown_presets(comparison: Comparison, document: YamlDocument) -> Iterator[SettingsError]:
+def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Location, str, str]]:
+    """Yield location, error and advice for each unknown preset and for each file that the folder does not have."""
     for number, preset in enumerate(comparison.presets or ()):
         if preset not in (*PRESET_NAMES, *ablation_designs()) and not _is_file(preset):
-            hint = suggestion(preset, PRESET_NAMES)
-            yield _error(document, ("presets", number), f"unknown preset {preset!r}", hint)
-
-
-def _missing_files(comparison: Comparison, document: YamlDocument) -> Iterator[SettingsError]:
+            yield ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
     for name, arm in comparison.arms.items():
         for key, file in arm.files():
-            if not (document.path.parent / file).exists():
-                yield _error(document, ("arms", name, key), f"no such file: {file}", "check the path")
+            if not (folder / file).exists():
+                yield ("arms", name, key), f"no such file: {file}", "check the path"
 
 
-def _error(document: YamlDocument, place: Location, got: str, do: str) -> SettingsError:
-    return SettingsError(got, file=document.path, line=document.line(place), element=dotted(place), do=do)
+Progress = Callable[[int, int], None]
+
+
+class ArmInputs(ComparedArm):
+    """Files that the runs of an arm read.
+
+    urdf: URDF that models are built from. truth: URDF of the simulated arm; None if the logs are the user's. digest: of
+    the URDF, settings and logs.
+    """
+
+    truth: Path | None = None
+    digest: str
+
+    def load(self) -> Arm:
+        """Return the arm that models are built from."""
+        return load_arm(self.urdf, self.joints, self.tip)
+
+    def log_mapping(self) -> LogMapping:
+        """Return the columns and units of the logs."""
+        return log_source(self.load(), self.mapping).mapping
+
+    def split(self, number: int, splits: int) -> tuple[list[Trajectory], list[Trajectory]]:
+        """Return training and test trajectories of one of `splits` splits. Raises LogError.
+
+        The test trajectories are test.* of the logs or a quarter of all; of several splits, one fold of a k-fold
+        cross-validation. They are chosen by a fixed seed, so all models have the same.
+        """
+        # loaded again in each worker: paths are sent to it instead of arms
+        arm = self.load()
+        train = read_logs(self.data, arm, self.mapping, "train")
+        test = []
+        if log_files(self.data, "train") != log_files(self.data):
+            test = read_logs(self.data, arm, self.mapping, "test")
+        if splits == 1 and test:
+            return train, test
+        logs = [*train, *test]
+        if splits == 1:
+            # a quarter for testing, as the logs have no test.* files
+            held_out = split_validation(logs, 0.25, 0)
+            return list(held_out.training), list(held_out.validation)
+        if len(logs) < splits:
+            expected = f"{splits} or more, for as many splits"
+            raise LogError(f"{len(logs)} trajectories", element="data", expected=expected)
+        # whole trajectories: samples of one trajectory are correlated, and a split within it would leak
+        folds = np.array_split(np.random.default_rng(0).permutation(len(logs)), splits)
+        return set_aside(logs, folds[number])
+
+
+def arm_inputs(
+    arm: ComparedArm, folder: Path, splits: int = 1, progress: Progress | None = None
+) -> ArmInputs:
+    """Return the inputs of an arm's runs; the logs of an arm without logs are simulated into the folder.
+
+    Raises the errors of `load_arm`, `load_mapping`, `read_logs` and `simulate`, before anything is trained.
+    """
+    loaded = load_arm(arm.urdf, arm.joints, arm.tip)
+    mapping = log_source(loaded, arm.mapping).mapping
+    files, errors = log_files(arm.data)
+    collect(errors)
+    # these keys of the settings change no run
+    apart: dict[str, bool | set[str]] = {"about": True, "comparison": {"seeds", "published"}}
+    settings = [loaded.settings.model_dump_json(exclude_unset=True, exclude=apart)]
+    settings.append(mapping.model_dump_json(exclude_unset=True))
+    # size and time in place of the content: logs may have gigabytes
+    versions = [(file, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    sources = json.dumps((loaded.robot.digest, arm.joints, arm.tip, settings, versions), default=str)
+    inputs = ArmInputs(**dict(arm), digest=hashlib.sha256(sources.encode()).hexdigest()[:16])
+    if not arm.data:
+        changes = {"urdf": folder / "known.urdf", "truth": arm.urdf, "data": (folder,)}
+        inputs = inputs.model_copy(update=changes | {"joints": loaded.joints, "tip": loaded.tip})
+        _simulate(inputs, loaded, folder, progress)
+    # too few logs are an error now and not after hours of training
+    inputs.split(0, splits)
+    return inputs
+
+
+def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress | None) -> None:
+    """Simulate logs by the protocol of the arm's settings, unless they are in the folder.
+
+    Models know only a copy of the URDF without inertials, drives and friction, so that no model starts from the truth.
+    """
+    # Pinocchio is an extra, not needed for the user's own logs
+    from spelgen.simulation.simulate import simulate
+
+    if loaded.settings.input == "position":
+        raise SettingsError(
+            "position servos", file=loaded.robot.path.with_suffix(".yaml"), element="input",
+            expected="torques: the simulated protocol has no commands",
+            do="give logs of the arm with --data",
+        )  # fmt: skip
+    # written last: without it the other files may be incomplete
+    complete = folder / "inputs.json"
+    if complete.exists() and read_json(complete, RunError) == {"digest": inputs.digest}:
+        return
+    remove(complete)
+    logs = simulate(loaded, progress=progress)
+    training, first = list(logs.train), loaded.settings.comparison.first
+    if first is not None:
+        training = [log[: int((log.t - log.t[0] < first - 1e-9).sum())] for log in training]
+    write_logs(folder / "train.parquet", training, loaded.chain.joint_names)
+    write_logs(folder / "test.parquet", logs.test, loaded.chain.joint_names)
+    write_bytes(inputs.urdf, _kinematics(loaded.robot.path))
+    write_text(inputs.urdf.with_suffix(".yaml"), yaml.safe_dump({"gravity": list(loaded.settings.gravity)}))
+    write_json(complete, {"digest": inputs.digest})
+
+
+def _kinematics(urdf: Path) -> bytes:
+    """Return a URDF without inertials, friction, visuals and collision bodies."""
+    # `load_arm` has read this file, so its size and entities have been checked
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
+    tree = etree.ElementTree(etree.fromstring(urdf.read_bytes(), parser))
+    for element in list(tree.iter("dynamics", "visual", "collision", "inertial")):
+        element.getparent().remove(element)
+    return bytes(etree.tostring(tree, xml_declaration=True, encoding="utf-8"))

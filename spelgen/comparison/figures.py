@@ -1,4 +1,4 @@
-"""Figures of a model trained on the paper's simulated protocol: losses, sizes, and the error of M.
+"""Figures of a model trained on the paper's simulated protocol: losses, sizes, invariants, and the error of M.
 
 Source: Wang, Chen and Ding, Sci Rep 15:33179 (2025).
 """
@@ -16,12 +16,10 @@ import torch
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import Predictor, of_dynamics
-from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
 from spelgen.evaluation.plain import Curve, finite
-from spelgen.evaluation.rollout import Invariants, invariants
-from spelgen.evaluation.truth import mass_error, true_mass
+from spelgen.evaluation.rollout import Invariants, invariants, mass_error, true_mass
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
@@ -31,6 +29,26 @@ from spelgen.structure.nominal import working_range
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
     from spelgen.fitting.fitted import Fit
+
+
+@dataclass(frozen=True)
+class ComparisonTuning:
+    """Constants of `spelgen compare`."""
+
+    # Largest number of windows that a loss is measured on; more windows are subsampled evenly.
+    windows: int = 512
+    # Number of timed training steps. Their median is used, because other programs run at the same time.
+    timed_steps: int = 5
+    # Time over which motions are predicted [s], as in Wang et al., Sci Rep 15:33179 (2025).
+    horizon: float = 1.0
+    # The other constants are used only to estimate the time of a comparison; measured with robots/two_link.urdf.
+    # Time of the measurements of a run after training [s].
+    measuring: float = 10.0
+    # Time of a momentum step, which solves no differential equation, relative to a step on predicted windows.
+    momentum_cost: float = 0.5
+    # Time of a run on logs [s] as long as no run of this arm and preset is finished.
+    run_on_logs: float = 60.0
+
 
 TUNING = ComparisonTuning()
 

@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, cast
 import torch
 from pydantic import TypeAdapter, ValidationError
 
-from spelgen.baselines.names import MODEL, observed
-from spelgen.comparison.arms import ablation_designs
+from spelgen.comparison.arms import ArmInputs, ablation_designs
 from spelgen.comparison.figures import SimulatedFigures, simulated_figures
-from spelgen.comparison.inputs import ArmInputs
 from spelgen.design import Design, load_design
 from spelgen.emission.build import build
 from spelgen.errors import RunError
@@ -24,7 +22,7 @@ from spelgen.files import read_json, write_json
 from spelgen.fitting.fit import FitOptions, RunOptions, fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.tuning import TUNING as WINDOWS
-from spelgen.labels import thousandths
+from spelgen.labels import MODEL, observed, thousandths
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import Rollout, fit_config
@@ -103,6 +101,7 @@ class Job(Group):
         protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
         options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
         # The content of the design, not its name: a YAML file may have changed.
+        # another version of spelgen may have other results
         sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
         return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
 
@@ -145,6 +144,7 @@ class Job(Group):
 
     def preprocessing(self) -> Preprocessing:
         """Return the preprocessing of the logs; simulated states have no noise and are not filtered."""
+        # a filter would only add delay to exact states
         unfiltered = {} if self.inputs.truth is None else {"cutoff": 0.0}
         return Preprocessing(**(self.training.preprocessing | unfiltered))
 
@@ -168,9 +168,11 @@ def run_job(job: Job) -> RunResult:
         validation=job.training.validation_fraction, seed=job.seed, arm=job.inputs.urdf, folder=job.folder,
         options=RunOptions(mapping=job.inputs.log_mapping(), resume=resume, force=not resume),
     )  # fmt: skip
+    # no result is written: the same command resumes the run
     if trained.status == "interrupted":
         raise KeyboardInterrupt
     seconds = time.monotonic() - start
+    # figures are measured without gradients, which would take memory
     model.requires_grad_(False).eval()
     simulated = None
     if job.inputs.truth is None:
@@ -204,10 +206,11 @@ def _errors(results: Results) -> Errors:
     for replay in results.replays:
         measure = f"position RMS, {replay.name} [{thousandths(results.joint_types)}]"
         errors[measure] = {name: 1000 * error.mean for name, error in replay.errors.items()}
+    # the first measure ranks the models: the longest horizon is the hardest
     for horizon in reversed(results.horizons):
-        open_loop = {name: error for name, error in horizon.errors.items() if not name.endswith(observed(""))}
-        measure = f"relative RMS, {horizon.name}"
-        errors[measure] = {name: error.mean_relative_rms for name, error in open_loop.items()}
+        open_loop = [name for name in horizon.errors if not name.endswith(observed(""))]
+        relative = {name: horizon.errors[name].mean_relative_rms for name in open_loop}
+        errors[f"relative RMS, {horizon.name}"] = relative
     if results.torque:
         errors["torque nMSE"] = {name: error.mean_nmse for name, error in results.torque.items()}
     return errors

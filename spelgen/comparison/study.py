@@ -11,23 +11,18 @@ from pathlib import Path
 
 import torch
 
-from spelgen.baselines.names import MODEL
-from spelgen.comparison.arms import Comparison, ablation_designs
-from spelgen.comparison.figures import step_seconds
-from spelgen.comparison.inputs import ArmInputs, Progress, arm_inputs
+from spelgen.comparison.arms import ArmInputs, Comparison, Progress, ablation_designs, arm_inputs
+from spelgen.comparison.figures import TUNING, step_seconds
 from spelgen.comparison.jobs import Job, RunResult, run_job
-from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.design import load_design
 from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.evaluation.plain import record
 from spelgen.files import write_json
-from spelgen.labels import counted
+from spelgen.labels import MODEL, counted
 from spelgen.listing import number
 from spelgen.settings.settings import load_settings
 from spelgen.tasks import RunTasks
 
-TUNING = ComparisonTuning()
-SCHEMA = 1
 PRESETS_ON_LOGS: tuple[str, ...] = ("closed-form", "hybrid")
 # the paper's models are first
 SIMULATED_PRESETS: tuple[str, ...] = ("phnode", "spel", "spel-kan", "minimal", "hybrid", "closed-form")
@@ -58,12 +53,9 @@ class Study:
 
     def announcement(self, parallel: int) -> str:
         """Return the number of runs, and an estimate of the time of the unfinished ones."""
-        counts = [
-            counted(len({job.arm for job in self.jobs}), "arm"),
-            counted(len({job.design for job in self.jobs}), "preset"),
-            counted(len({job.seed for job in self.jobs}), "seed"),
-            counted(len({job.split for job in self.jobs}), "split"),
-        ]
+        dimensions = zip(*((job.arm, job.design, job.seed, job.split) for job in self.jobs), strict=True)
+        nouns = ("arm", "preset", "seed", "split")
+        counts = [counted(len(set(values)), noun) for values, noun in zip(dimensions, nouns, strict=True)]
         text = f"{counted(len(self.jobs), 'run')} ({', '.join(counts)})"
         if self.results:
             text += f", {len(self.results)} finished before"
@@ -99,15 +91,11 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     # A result counts only if its key is equal: other options or sources mean another run.
     finished = {job.name: job.result() for job in jobs}
     results = {name: result for name, result in finished.items() if result is not None}
-    estimates: dict[str, float] = {}
-    by_preset: dict[tuple[str, str], float] = {}
-    for job in jobs:
-        if job.name not in results:
-            # runs that differ only by seed or split take about the same time
-            key = (job.arm, job.preset)
-            if key not in by_preset:
-                by_preset[key] = _estimate(job, results)
-            estimates[job.name] = by_preset[key]
+    waiting = [job for job in jobs if job.name not in results]
+    # runs that differ only by seed or split take about the same time
+    models = {(job.arm, job.preset): job for job in reversed(waiting)}
+    seconds = {model: _estimate(job, results) for model, job in models.items()}
+    estimates = {job.name: seconds[job.arm, job.preset] for job in waiting}
     return Study(folder, tuple(jobs), results, failures, estimates)
 
 
@@ -135,7 +123,7 @@ def run_study(study: Study, run_tasks: RunTasks, note: Callable[[str], None]) ->
     finished = replace(study, results=results, failures=failures, estimates={})
     # curves are only in result.json of each run
     figures = [record(replace(result, simulated=None)) for result in results.values()]
-    write_json(study.folder / "comparison.json", {"schema": SCHEMA, "failures": failures, "results": figures})
+    write_json(study.folder / "comparison.json", {"schema": 1, "failures": failures, "results": figures})
     return finished
 
 
@@ -163,10 +151,9 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
     }  # fmt: skip
     jobs = []
     for seed, split, design in product(range(seeds), range(comparison.splits), presets):
-        run = folder / f"{Path(design).stem}-seed{seed}-split{split}"
-        jobs.append(
-            Job.model_validate({**shared, "design": design, "seed": seed, "split": split, "folder": run})
-        )
+        run = {"design": design, "seed": seed, "split": split}
+        run["folder"] = folder / f"{Path(design).stem}-seed{seed}-split{split}"
+        jobs.append(Job.model_validate(shared | run))
     return jobs
 
 
@@ -184,6 +171,5 @@ def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
 
 
 def _reason(error: Exception) -> str:
-    if isinstance(error, SpelgenError):
-        return " ".join(str(error).split())
-    return f"unexpected {in_one_line(error)}"
+    is_known = isinstance(error, SpelgenError)
+    return " ".join(str(error).split()) if is_known else f"unexpected {in_one_line(error)}"

@@ -7,12 +7,11 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from spelgen.baselines.names import MODEL
 from spelgen.comparison.figures import SimulatedFigures
 from spelgen.comparison.jobs import RunResult
 from spelgen.comparison.study import Study
 from spelgen.evaluation.tables import Row, Table, table
-from spelgen.labels import counted, listed
+from spelgen.labels import MODEL, counted, listed
 from spelgen.listing import number
 from spelgen.settings.training import PublishedFigures
 
@@ -67,9 +66,7 @@ def arm_sections(study: Study) -> list[ArmResults]:
 def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFigures]) -> list[Table]:
     """Return the tables of an arm, the one with the result first. published: figures of a publication, by preset."""
     runs = _by_preset(results)
-    figures = {
-        name: [run.simulated for run in of_preset if run.simulated] for name, of_preset in runs.items()
-    }
+    figures = {name: [run.simulated for run in x if run.simulated] for name, x in runs.items()}
     # Logs of the user have no truth: only errors on test logs can be ranked.
     if not all(figures.values()):
         return [_ranking(runs)]
@@ -78,20 +75,17 @@ def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFi
         split = f", split {result.split}" if any(x.split for x in results) else ""
         loss = next(iter(result.errors.values()))[MODEL]
         losses.setdefault(f"seed {result.seed}{split}", {})[result.preset] = loss
-    sizes = {label: _summary(figures, figure, min) for label, figure in SIZES.items()}
+    rows = []
+    for label, figure in SIZES.items():
+        is_ranked = label in ("parameters", "training step [ms]")
+        rows.append(Row(label, _summary(figures, figure, min), is_ranked))
     rise = _summary(figures, lambda run: run.invariants.energy_rise, max)
-    rows = [
-        Row(label, values, label in ("parameters", "training step [ms]")) for label, values in sizes.items()
-    ]
     rows.append(Row("rise of energy, no input", rise, ranked=False))
     title = (
         "Sizes, time of a training step, and invariants, the worst over seeds; a negative rise is a decrease"
     )
-    return [
-        _losses(figures, published),
-        Table(title, tuple(rows)),
-        table("Prediction loss over 1 s of every run", losses),
-    ]
+    of_runs = table("Prediction loss over 1 s of every run", losses)
+    return [_losses(figures, published), Table(title, tuple(rows)), of_runs]
 
 
 def arm_sentence(results: Sequence[RunResult]) -> str:
@@ -101,6 +95,7 @@ def arm_sentence(results: Sequence[RunResult]) -> str:
     models = [name for name in errors if name in runs]
     if not models:
         return f"No model has a finite {measure}."
+    # medians are sorted, the smallest first
     best = errors[models[0]]
     # equal to three digits: in effect the same model, as closed-form and hybrid without residual terms
     equal = [name for name in models if number(errors[name]) == number(best)]
@@ -109,6 +104,7 @@ def arm_sentence(results: Sequence[RunResult]) -> str:
     for name, error in errors.items():
         if name not in equal and error < best:
             smaller.append(f"{name} ({number(error)})")
+        # a factor to an error of zero is not defined
         elif name not in equal and best:
             larger.append(f"{number(error / best)} times smaller than with {name}")
     if larger:
@@ -145,13 +141,10 @@ def _by_preset(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:
 def _ranking(runs: Runs) -> Table:
     """Return the errors of models and baselines on the user's logs, the best one first."""
     rows = [Row(measure, _medians(runs, measure)) for measure in next(iter(runs.values()))[0].errors]
-    figures: dict[str, Callable[[Sequence[RunResult]], float]] = {
-        "parameters": lambda of_preset: of_preset[0].parameters,
-        "runs": len,
-        "training time [s]": lambda of_preset: statistics.median(run.seconds for run in of_preset),
-    }
-    for label, figure in figures.items():
-        rows.append(Row(label, {name: figure(of_preset) for name, of_preset in runs.items()}, ranked=False))
+    seconds = {name: statistics.median(run.seconds for run in x) for name, x in runs.items()}
+    rows.append(Row("parameters", {name: x[0].parameters for name, x in runs.items()}, ranked=False))
+    rows.append(Row("runs", {name: len(x) for name, x in runs.items()}, ranked=False))
+    rows.append(Row("training time [s]", seconds, ranked=False))
     title = "Errors on the test logs, best first; medians over seeds and splits"
     note = "relative RMS: 0: no error, 1: as if the arm had stood still; columns without parameters are baselines"
     return Table(title, tuple(rows), note)
@@ -176,9 +169,11 @@ def _losses(
         medians = _summary(figures, figure, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
+        # the paper compares ratios: absolute losses depend on its units and sampling
         if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))
+    # only presets that a paper has figures of
     records = {name: published[name].model_dump(exclude_none=True) for name in figures if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}

@@ -32,10 +32,6 @@ class BristleReach:
         return int(self.values.shape[1])
 
 
-# Samples that are computed at a time: several arrays of this size are in memory.
-BLOCK = 2**14
-
-
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
     """Return the typical break-away displacements, (n, K) [rad, m], of joints of these types; motors: C, (n, n)."""
     return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
@@ -47,6 +43,7 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
     tensors = (model.friction.reach, motors_of(model), width)
+    # paths are computed by NumPy in double precision, for a model on any device
     arrays = [x.detach().cpu().double().numpy() for x in tensors]
     return BristleReach(*arrays)
 
@@ -79,8 +76,9 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
         at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
-    for start in range(0, len(q), BLOCK):
-        block = slice(start, start + BLOCK)
+    size = 2**14  # samples that are computed at a time: several arrays of this size are in memory
+    for start in range(0, len(q), size):
+        block = slice(start, start + size)
         corner = latest[block], drives
         moved = torch.from_numpy(path[block] - turned_at[corner])
         z[block] = moved_bristles(turned_with[corner], moved[..., None], reach).numpy()
@@ -95,6 +93,7 @@ def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     steps = np.diff(path, axis=0, prepend=path[:1])
     # at rest, the direction of the last motion remains
     moving = np.where(steps != 0, np.arange(len(path))[:, None], 0)
+    # a running maximum of indices is the latest sample that moved
     direction = np.sign(np.take_along_axis(steps, np.maximum.accumulate(moving, axis=0), axis=0))
     turns = np.zeros(path.shape, dtype=bool)
     turns[1:] = direction[1:] * direction[:-1] < 0
@@ -110,6 +109,7 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
     """Return the direction (T, n) of dry friction without bristles at qd (T, n); None: its smoothing is unknown."""
     if bristles.smoothing_velocity is None:
         return None
+    # the same smooth sign as in `runtime.friction_laws`: another would be an error of friction
     speed = qd if bristles.motors is None else qd @ bristles.motors.T
     return np.asarray(speed / np.hypot(speed, bristles.smoothing_velocity))
 

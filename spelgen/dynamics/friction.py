@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from spelgen.design import BREAKAWAY
-from spelgen.settings.joint import JointSettings
+from spelgen.settings.settings import JointSettings
 
 
 class DampedJoint(Protocol):
@@ -71,6 +71,7 @@ def joint_friction(
 
     joints: of a URDF, or the coordinates of an arm. speeds: C, (n, n), see ``DriveFriction``.
     """
+    # settings replace <dynamics> as a whole: both describe the same losses
     losses = []
     for joint in joints:
         if joint.name in drives:
@@ -86,9 +87,6 @@ def joint_friction(
 
 
 BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolute"])))
-
-# [rad/s, m/s] Velocity at which the additional dry friction of slow motion has fallen to 1/e.
-STRIBECK_VELOCITY = 0.1
 
 
 @dataclass(frozen=True)
@@ -132,7 +130,7 @@ class FrictionModel:
         """
         motors = np.eye(qd.shape[-1]) if motors is None else motors
         effects = self._effects(qd @ motors.T, qdd @ motors.T, bent)
-        # The torque of drive j acts on joint i by C_ji.
+        # The torque of drive j acts on joint i by C_ji, as power is equal on both sides of the gears.
         columns: np.ndarray = effects[..., None, :, :] * motors.T[:, None]
         return columns.reshape(*qd.shape, -1)
 
@@ -155,7 +153,9 @@ class FrictionModel:
             dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
         effects = [rise, speed, *dry, np.ones_like(speed)]
         if self.stribeck:
-            effects.append(sign * np.exp(-((speed / STRIBECK_VELOCITY) ** 2)))
+            # falls to 1/e at 0.1 rad/s or m/s
+            effects.append(sign * np.exp(-((speed / 0.1) ** 2)))
         if self.polynomial:
             effects += [speed * np.abs(speed), speed**3]
+        # the order of `effects`
         return np.stack(effects, axis=-2)

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from spelgen.dynamics.protocol import residual_terms
-from spelgen.runtime.masked_mlp import MaskedMLP
-from spelgen.runtime.parts import Network
-from spelgen.runtime.residual_dynamics import ResidualDynamics
+from spelgen.runtime.networks import MaskedMLP, MaskedNetwork
+from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.residual_terms import ResidualDynamics
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,9 @@ class ParameterInfo:
 
     kind: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of friction), effects (friction that
     varies with velocity), velocities, load_dependence, fractions (of bristles), torque_splines, torque_ripple,
-    friction_splines, mass_constants, mass_residuals, stiffness, damping,
-    dead_zone, delay, or network. unit: of the quantity that the parameter represents, of revolute and of prismatic
-    joints;
-    most parameters are logarithms of it, relative to a nominal value.
+    friction_splines, mass_constants, mass_residuals, stiffness, damping, dead_zone, delay, or network. unit: of the
+    quantity that the parameter represents, of revolute and of prismatic joints; most parameters are logarithms of it,
+    relative to a nominal value.
     """
 
     kind: str
@@ -75,6 +74,7 @@ def idle_residuals(model: object) -> list[str]:
     terms = residual_terms(model)
     if terms is None:
         return []
+    # of single joints; hidden layers of networks are never zero
     idle = [name for name, weights in terms.named_parameters(recurse=False) if not weights.any()]
     for prefix, network in (("mass", terms.mass), ("potential", terms.potential)):
         if _is_idle(network):
@@ -102,14 +102,17 @@ def without_idle_residuals(model: Model) -> Model:
     reduced = copy.deepcopy(model)
     if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:
         terms = reduced.residuals
-        terms.mass = None if _is_idle(terms.mass) else terms.mass
-        terms.potential = None if _is_idle(terms.potential) else terms.potential
+        if _is_idle(terms.mass):
+            terms.mass = None
+        if _is_idle(terms.potential):
+            terms.potential = None
+        # without any term, the factor on friction is one and needs no evaluation either
         if not any(bool(weights.any()) for weights in terms.parameters()):
             reduced.residuals = None
     return reduced
 
 
-def _is_idle(network: Network | None) -> bool:
+def _is_idle(network: MaskedNetwork | None) -> bool:
     """Return True if a network is zero for all inputs; a network that does not exist is."""
     if not isinstance(network, MaskedMLP):
         return network is None
@@ -123,16 +126,14 @@ def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
         return torch.zeros_like(q)
     terms = model.residuals
     pose = terms.at(q, model.prepare().residual)
-    torque: Tensor = (pose.mass @ qdd.unsqueeze(-1)).squeeze(-1) + terms.nonlinear(pose, qd)
-    return torque
+    return applied(pose.mass, qdd) + terms.nonlinear(pose, qd)
 
 
 def friction_factor(model: object, q: Tensor) -> Tensor:
     """Return the factor of the residual terms on friction, (..., n), at q (..., n)."""
     if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.ones_like(q)
-    factor: Tensor = model.residuals.at(q, model.prepare().residual).friction
-    return factor
+    return model.residuals.at(q, model.prepare().residual).friction
 
 
 class _Caller(nn.Module):

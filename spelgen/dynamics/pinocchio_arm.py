@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -38,17 +39,15 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
 
     The rotor inertia on the joint side is the armature of the model. Raises ArmError if a body has no inertial.
     """
-    errors = []
-    for body in arm.bodies:
-        if body.inertia is None:
-            got, do = (
-                "a link without <inertial>",
-                "write estimates into the URDF; a model that is trained on logs needs none",
-            )
-            expected = "mass, center of mass and inertia of each moving body"
-            errors.append(ArmError(got, element=f"joint {body.name!r}", expected=expected, do=do))
-    collect(errors)
+    error = partial(
+        ArmError,
+        "a link without <inertial>",
+        expected="mass, center of mass and inertia of each moving body",
+        do="write estimates into the URDF; a model that is trained on logs needs none",
+    )
+    collect([error(element=f"joint {body.name!r}") for body in arm.bodies if body.inertia is None])
     model = kinematic_model(arm)
+    # index 0 is Pinocchio's universe
     for index, body in enumerate(arm.bodies, start=1):
         model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
     # a mimic joint has no motor of its own
@@ -63,6 +62,7 @@ def kinematic_model(arm: Chain) -> pin.Model:
     model.name = arm.name
     model.gravity.linear = np.array(arm.gravity, dtype=float)
     for body in arm.bodies:
+        # frames of bodies have their joint's axis as z, so that two types of joints are enough
         joint = pin.JointModelPZ() if body.joint_type == "prismatic" else pin.JointModelRZ()
         placement = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
         model.addJoint(body.parent + 1, joint, placement, body.name)

@@ -24,11 +24,12 @@ from spelgen.urdf.read import read_urdf
 
 
 def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
-    """Return the method for states (..., n) that are arrays or tensors; their batches are broadcast."""
+    """Decorate a method of arrays so that states (..., n) may be tensors, and their batches are broadcast."""
 
     @wraps(method)
     def on_arrays(self: PinocchioDynamics, *states: Any) -> object:
         first = states[0]
+        # a single state is a call of an integrator: broadcasting would take longer than the dynamics
         if isinstance(first, np.ndarray) and first.ndim == 1:
             return method(self, *states)
         result = method(self, *np.broadcast_arrays(*map(np.asarray, states)))
@@ -107,6 +108,7 @@ class PinocchioDynamics:
         speeds, rates = qd @ self.jacobian.T, qdd @ self.jacobian.T
         torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
         torque = torque + self.friction(qd)
+        # the zero row of a passive joint would make G singular
         passive = np.diag(~self.inputs.any(axis=1))
         return np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
 
@@ -135,10 +137,6 @@ class PinocchioDynamics:
         return result.reshape(*batch, *result.shape[1:])
 
 
-# Width of the tanh in place of the sign of the velocity, for Coulomb friction of a URDF [rad/s, m/s].
-COULOMB_SMOOTHING_VELOCITY = 0.05
-
-
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
     """Return the dynamics of these joints of a URDF and of their mimic joints; all other joints are locked at zero.
 
@@ -147,6 +145,7 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     cannot read the file.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
+    # Pinocchio's own reading of the file is an independent reference for the chain of spelgen
     model = pin.buildModelFromXML(urdf_bytes(urdf).decode(errors="replace"))
     model.gravity.linear = np.array(settings.gravity)
     constraint = mimic_constraint(robot, joints)
@@ -160,7 +159,8 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
         if name in by_joint:
             model.armature[model.joints[model.getJointId(name)].idx_v] = by_joint[name].armature
     moving = [robot.joint[name] for name in joints]
-    friction = joint_friction(moving, by_joint, COULOMB_SMOOTHING_VELOCITY, speeds)
+    # width of the tanh in place of the sign of the velocity [rad/s, m/s]
+    friction = joint_friction(moving, by_joint, 0.05, speeds)
     return PinocchioDynamics(model, constraint, friction, motors.inputs)
 
 

@@ -102,6 +102,7 @@ class PreparedModel:
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
+            # velocities in place of momenta: control loops measure velocities
             q, qd, z, _ = runge_kutta(self._model, rhs, q, qd, z, dt / substeps)
         return State(q, qd, z)
 
@@ -127,7 +128,8 @@ class PreparedModel:
     ) -> tuple[Tensor, Tensor]:
         """Return A, (..., 2 n, 2 n), and B, (..., 2 n, n): derivatives with respect to (q, qd) and tau.
 
-        Without dt of the rate (qd, qdd) for constant z; with dt [s] of the result of ``step``.
+        Without dt: derivatives of the rate (qd, qdd) at constant z. With dt [s]: derivatives of the result of
+        ``step``.
         """
         n = self.n
         z = self.memory(qd) if z is None else z
@@ -182,5 +184,6 @@ def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: 
     # torch 2.13: vmap of a derivative of linalg.solve is wrong in forward mode, or without autograd
     with torch.inference_mode(False), torch.enable_grad():
         jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
+        # clones: tensors of inference mode cannot be differentiated
         derivatives: tuple[Tensor, ...] = jacobian(*(x.clone() for x in states))
     return derivatives

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
 
 import torch
 
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
-from spelgen.runtime.residual_dynamics import ResidualDynamics
-from spelgen.runtime.residual_terms import ResidualTerms
+from spelgen.runtime.residual_terms import ResidualDynamics, ResidualTerms
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
@@ -74,11 +73,6 @@ def motors_of(model: Any) -> Tensor:
     return torch.eye(model.n).to(model.friction.nominal) if model.motors is None else model.motors
 
 
-def input_of(model: object) -> Literal["torque", "position"]:
-    """Return the quantity of the inputs of a model: torques, or commands of position servos."""
-    return "position" if isinstance(model, RigidBodyDynamics) and model.servo is not None else "torque"
-
-
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
     """Return z, (..., n, K), of joints that have moved at qd for a long time; K = 0 for friction without a state."""
     if not is_stateful(dynamics):
@@ -99,6 +93,7 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
     z: initial state, (W, n, elements); None: of joints that have moved at the first qd for a long time.
     """
     states = [sliding_memory(dynamics, qd[:, 0]) if z is None else z]
+    # the state after a sample depends on the state before it: no batch over samples
     for moved in q.diff(dim=1).unbind(1):
         states.append(memory_after(dynamics, states[-1], moved))
     return torch.stack(states, dim=1)
@@ -122,6 +117,7 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
+        # the friction state is passed through: rollouts read it from these dynamics
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements

@@ -16,12 +16,9 @@ from torch import Tensor
 
 from spelgen.dynamics.bristles import moved_bristles
 from spelgen.runtime.friction_laws import FrictionConstants
+from spelgen.runtime.motors import ServoConstants, beyond
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
-from spelgen.runtime.position_servo import ServoConstants, beyond
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-
-# Passes over the joints, which influence one another through M, to find which bristles slide.
-COUPLED_PASSES = 2
 
 
 class ServoDrives(NamedTuple):
@@ -106,8 +103,8 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     velocity = slipped(inertia * qd + impulse, inertia + damping, bristle_stiffness, bent, reach)
     if load.coupled:
         momentum = applied(load.inertia, qd) + impulse
-        # the displacement of bristles depends on the other joints
-        for _ in range(COUPLED_PASSES):
+        # the displacement of bristles depends on the other joints: two passes find the bristles that slide
+        for _ in range(2):
             rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
             secant = rise / torch.where(velocity == 0, 1.0, velocity)
             effective = load.inertia + torch.diag_embed(damping + secant)
@@ -142,6 +139,7 @@ def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt
         state, previous_bias = None, None
         for now, interval in zip(commands.unbind(1), dt.unbind(1), strict=True):
             pose = model.configuration(q, prepared)
+            # once per interval: M and gravity change slowly between samples, springs and friction do not
             bias = middle_bias = model.nonlinear_effects(pose, qd)
             # extrapolated to the middle of the interval: the bias is known at its start only
             if previous_bias is not None:

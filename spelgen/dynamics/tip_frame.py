@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Body, make_arm
+from spelgen.arm.arm import Body, lump_links, make_arm
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.tip import last_link
 
 
@@ -31,6 +30,7 @@ def tip_frame(loaded: Arm) -> Tip:
     """Return the frame of the tip link, with the unrounded angles of the URDF."""
     names = loaded.chain.joint_names
     link = loaded.tip or last_link(loaded.robot, names)
+    # rounded angles would move the tip by up to the tolerance times the extent of the arm
     bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
     return Tip(link, *link_poses(loaded)[link], bodies)
 

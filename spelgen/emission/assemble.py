@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -13,10 +14,9 @@ from torch import Tensor
 from spelgen import runtime
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.dynamics.prepared import PreparedModel
-from spelgen.emission.entry_sums import Sums, entry_sums
-from spelgen.emission.parts import base_class, model_parts
+from spelgen.emission.parts import Sums, base_class, entry_sums, model_parts
 from spelgen.emission.source import Call, Code
-from spelgen.emission.text import header
+from spelgen.emission.text import header, read_source, require_unedited
 from spelgen.errors import ModuleError
 from spelgen.labels import printable
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
@@ -57,8 +57,9 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
     assembly = model_parts(spec)
     names: dict[str, object] = {"generator": torch.Generator().manual_seed(seed)}
     # In place of the function that the text of a module defines: the same operations in the same order.
-    names["mass_entries"] = MassEntries(entry_sums(spec))
+    names["mass_entries"] = partial(_mass_entries, entry_sums(spec))
     try:
+        # the rows first: calls refer to them by name
         for name, rows in assembly.rows.items():
             names[name] = tuple(_value(row, names) for row in rows)
         arguments = {str(name): _value(item, names) for name, item in assembly.model.arguments}
@@ -71,24 +72,33 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
     return model
 
 
+def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
+    """Return the model of a module that `spelgen build` wrote, with the initial weights of ``seed``.
+
+    module: the file, or its text. Raises ModuleError for a file that was edited or is no such module.
+    """
+    is_text = isinstance(module, str) and "\n" in module
+    file = None if is_text else Path(module)
+    text = str(module) if file is None else read_source(file)
+    return assemble(require_unedited(text, file), seed)
+
+
 def spec_of(model: object) -> ModelSpec | None:
     """Return the specification that a model was assembled from; None of another model."""
     return model.spec if isinstance(model, ArmModel) else None
 
 
-class MassEntries:
-    """M (..., n, n) from its functions of q and constants, equal to the function ``mass_entries`` of a module."""
+def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
+    """Return M, (..., n, n), linear in the terms (...,), equal to the function ``mass_entries`` of a module.
 
-    def __init__(self, rows: list[list[Sums]]) -> None:
-        self.rows = rows
-
-    def __call__(self, *terms: Tensor) -> Tensor:
-        """Return M, (..., n, n): its entries are linear in the terms, functions of q and constants of shape (...,)."""
-        return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in self.rows))
+    rows: of the lower triangle. terms: functions of q, then constants.
+    """
+    return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in rows))
 
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
     """Return the linear combination of terms (...,) in the order of the module, with the same rounding errors."""
+    # subtractions, not sums of negative products: the module is written so
     total: Tensor | float = 0
     for position, (factor, index) in enumerate(sums):
         term = terms[index] if abs(factor) == 1 else abs(factor) * terms[index]
@@ -116,4 +126,4 @@ def _value(item: object, names: dict[str, object]) -> object:
         return item
     positional = [_value(value, names) for name, value in item.arguments if name is None]
     keywords = {name: _value(value, names) for name, value in item.arguments if name is not None}
-    return dict(**keywords) if item.callee == "dict" else vars(runtime)[item.callee](*positional, **keywords)
+    return vars(runtime)[item.callee](*positional, **keywords)

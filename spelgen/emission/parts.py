@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from spelgen.design import BREAKAWAY, SERVO_STRIBECK_ROUNDING
-from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.source import Call, Code, call
 from spelgen.emission.tuning import TUNING
-from spelgen.spec import JointSpec, LinkSpec, ModelSpec
+from spelgen.spec import ConstantSpec, JointSpec, LinkSpec, ModelSpec, OutputSpec
 
 GENERATOR, JOINTS, LINKS = Code("generator"), Code("JOINTS"), Code("LINKS")
 FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code("mass_entries")
-_FRICTION_AXES = {"dense-n": 1, "dense-3n": 3}
-_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,9 @@ class ModelParts:
     rows: dict[str, tuple[Call, ...]]
     model: Call
 
-    @property
-    def uses_networks(self) -> bool:
-        """Whether the model has networks with random initial weights."""
-        return _names(self.model, GENERATOR)
-
-    @property
-    def uses_mass_entries(self) -> bool:
-        """Whether M is a linear combination of functions and constants."""
-        return _names(self.model, MASS_ENTRIES)
+    def uses(self, name: Code) -> bool:
+        """Return True if the call refers to a name, for example to ``generator`` if the model has networks."""
+        return _names(self.model, name)
 
 
 def model_parts(spec: ModelSpec) -> ModelParts:
@@ -44,20 +38,15 @@ def model_parts(spec: ModelSpec) -> ModelParts:
     rows = {"JOINTS": tuple(map(_joint, spec.joints))}
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
-    is_residual = bool(spec.links)
-    # Rigid bodies have functions of M only for their residual, which starts at zero and needs no mean.
-    if spec.design.mass == "derived" or (is_residual and spec.design.net != "none"):
-        if spec.outputs:
-            rows["FUNCTIONS"] = tuple(
-                call("Function", _joint_names(spec, x.joints))
-                if is_residual
-                else call("Function", _joint_names(spec, x.joints), mean=x.mean, scale=x.scale)
-                for x in spec.outputs
-            )
-        if spec.constants and not is_residual:
-            rows["CONSTANTS"] = tuple(
-                call("Constant", initial=x.start, scale=x.scale) for x in spec.constants
-            )
+    if spec.outputs and spec.links and spec.design.net != "none":
+        # Residual terms of rigid bodies start at zero: their functions need no mean.
+        rows["FUNCTIONS"] = tuple(call("Function", _joint_names(spec, x.joints)) for x in spec.outputs)
+    elif spec.design.mass == "derived":
+        functions = [
+            call("Function", _joint_names(spec, x.joints), mean=x.mean, scale=x.scale) for x in spec.outputs
+        ]
+        constants = [call("Constant", initial=x.start, scale=x.scale) for x in spec.constants]
+        rows |= {k: tuple(v) for k, v in (("FUNCTIONS", functions), ("CONSTANTS", constants)) if v}
     arguments = _rigid_bodies(spec) if spec.links else _networks(spec)
     if spec.inputs:
         arguments["inputs"] = _inputs(spec)
@@ -67,14 +56,11 @@ def model_parts(spec: ModelSpec) -> ModelParts:
 def _inputs(spec: ModelSpec) -> Call:
     n = range(len(spec.joints))
     values = {(x.joint, x.motor): x.value for x in spec.inputs}
+    matrix = tuple(tuple(values.get((joint, motor), 0.0) for motor in n) for joint in n)
     # Trained gains are a mask, so that the values of known gears are constants.
     trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
-    matrix = tuple(tuple(values.get((joint, motor), 0.0) for motor in n) for joint in n)
-    if not trained:
-        return call("MotorInputs", matrix)
-    return call(
-        "MotorInputs", matrix, trained=tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
-    )
+    mask = tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
+    return call("MotorInputs", matrix, **_unless({"trained": mask}, trained=not trained))
 
 
 def base_class(spec: ModelSpec) -> str:
@@ -93,23 +79,22 @@ def _names(value: object, name: Code) -> bool:
     return value == name
 
 
+def _unless(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
+    """Return the fields that are not at their default value: a row shows in which respect it is special."""
+    return {name: value for name, value in fields.items() if not is_default.get(name)}
+
+
 def _joint(joint: JointSpec) -> Call:
-    fields: dict[str, object] = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed}
-    fields |= {"friction": joint.friction, "armature": joint.armature}
-    # Default values are omitted: a row shows in which respect its joint is special.
-    if joint.gear != 1:
-        fields["gear"] = joint.gear
-    if (joint.center, joint.half_range) != _range_of_limits(joint):
-        fields["typical_range"] = (joint.center, joint.half_range)
-    return call("Joint", joint.name, joint.joint_type, **fields)
-
-
-def _range_of_limits(joint: JointSpec) -> tuple[float, float] | None:
-    """Return center and half range of the limits, as `runtime.rows.Joint` rounds them; None without limits."""
-    if joint.lower is None or joint.upper is None:
-        return None
-    middle, half = (joint.lower + joint.upper) / 2, (joint.upper - joint.lower) / 2
-    return float(f"{middle:.6g}"), float(f"{half:.6g}")
+    typical, limits = (joint.center, joint.half_range), None
+    if joint.lower is not None and joint.upper is not None:
+        # as `runtime.rows.Joint` rounds them
+        limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
+    fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
+    fields |= {"armature": joint.armature, "gear": joint.gear}
+    shown = _unless(
+        fields | {"typical_range": typical}, gear=joint.gear == 1, typical_range=typical == limits
+    )
+    return call("Joint", joint.name, joint.joint_type, **shown)
 
 
 def _link(spec: ModelSpec, link: LinkSpec) -> Call:
@@ -118,17 +103,22 @@ def _link(spec: ModelSpec, link: LinkSpec) -> Call:
         "parent": None if link.parent < 0 else spec.links[link.parent].name,
         "joint": joint.name,
         "position": link.position,
+        "rotation": link.rotation,
+        "mass": link.mass,
+        "center_of_mass": link.center_of_mass,
+        "inertia": link.inertia,
+        "ratio": link.ratio,
+        "offset": link.offset,
+        "joint_type": link.joint_type,
     }
-    if link.rotation != _IDENTITY:
-        fields["rotation"] = link.rotation
-    fields |= {"mass": link.mass, "center_of_mass": link.center_of_mass, "inertia": link.inertia}
-    if link.ratio != 1:
-        fields["ratio"] = link.ratio
-    if link.offset != 0:
-        fields["offset"] = link.offset
-    if link.joint_type != joint.joint_type:
-        fields["joint_type"] = link.joint_type
-    return call("Link", link.name, **fields)
+    shown = _unless(
+        fields,
+        rotation=np.array_equal(link.rotation, np.eye(3)),
+        ratio=link.ratio == 1,
+        offset=link.offset == 0,
+        joint_type=link.joint_type == joint.joint_type,
+    )
+    return call("Link", link.name, **shown)
 
 
 def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
@@ -137,29 +127,18 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
     if spec.motor_speeds:
         arguments["motor_speeds"] = spec.motor_speeds
     if spec.servos:
-        arguments["servo"] = call(
-            "PositionServo",
-            kp=tuple(servo.kp for servo in spec.servos),
-            kd=tuple(servo.kd for servo in spec.servos),
-            limit=tuple(servo.limit for servo in spec.servos),
-            known=tuple(servo.known for servo in spec.servos),
-        )
+        columns = {name: tuple(vars(x)[name] for x in spec.servos) for name in ("kp", "kd", "limit", "known")}
+        arguments["servo"] = call("PositionServo", **columns)
     if spec.design.net != "none":
-        networks: dict[str, object] = {}
-        if spec.outputs:
-            networks["network"] = _mass_network(spec)
+        terms: dict[str, object] = {"functions": len(spec.outputs), "constants": len(spec.constants)}
+        # the random generator is used in the order of the calls
         if spec.potential:
-            networks["potential"] = _potential(spec)
-        scale = {"potential_scale": spec.potential_scale} if spec.potential else {}
-        arguments["residuals"] = call(
-            "ResidualTerms",
-            JOINTS,
-            MASS_ENTRIES,
-            functions=len(spec.outputs),
-            constants=len(spec.constants),
-            **scale,
-            **networks,
-        )
+            terms["potential_scale"] = spec.potential_scale
+        if spec.outputs:
+            terms["network"] = _mass_network(spec)
+        if spec.potential:
+            terms["potential"] = _potential(spec)
+        arguments["residuals"] = call("ResidualTerms", JOINTS, MASS_ENTRIES, **terms)
     return arguments
 
 
@@ -167,8 +146,7 @@ def _friction_laws(spec: ModelSpec) -> Call:
     if spec.design.memory == "none":
         return call("SlidingFriction", JOINTS)
     # of the types of the arm's joints, in the order of the table
-    types = [name for name in BREAKAWAY if name in spec.joint_types]
-    breakaway = call("dict", **{name: BREAKAWAY[name] for name in types})
+    breakaway = {name: row for name, row in BREAKAWAY.items() if name in spec.joint_types}
     rounding = {"stribeck_rounding": SERVO_STRIBECK_ROUNDING} if spec.servos else {}
     return call("FrictionLaws", JOINTS, breakaway=breakaway, **rounding)
 
@@ -177,13 +155,11 @@ def _networks(spec: ModelSpec) -> dict[str, object]:
     """Return the arguments of a model of networks, in the order of their random initial weights."""
     n = len(spec.joints)
     ones = (1.0,) * n
-    arguments: dict[str, object] = {"mass": _mass(spec)}
-    if spec.potential:
-        arguments |= {"potential": _potential(spec), "potential_scale": spec.potential_scale}
-    else:
-        # one output that depends on no joint
-        constant = _network(spec, ((),), (ones, ones), width=1, depth=0)
-        arguments |= {"potential": constant, "potential_scale": 1.0}
+    mass = _mass(spec)
+    # without gravity, one output that depends on no joint
+    potential = _potential(spec) if spec.potential else _network(spec, ((),), (ones, ones), width=1, depth=0)
+    scale = spec.potential_scale if spec.potential else 1.0
+    arguments: dict[str, object] = {"mass": mass, "potential": potential, "potential_scale": scale}
     arguments["friction"] = _friction(spec)
     if spec.design.input == "dense-3n":
         arguments["input_network"] = _network(spec, (spec.joint_names,) * (3 * n), (ones, ones))
@@ -201,15 +177,8 @@ def _mass(spec: ModelSpec) -> Call:
     constants = CONSTANTS if spec.constants else ()
     if not spec.outputs:
         return call("ConstantMass", JOINTS, MASS_ENTRIES, constants=constants)
-    return call(
-        "DerivedMass",
-        JOINTS,
-        MASS_ENTRIES,
-        functions=FUNCTIONS,
-        constants=constants,
-        margin=spec.margin,
-        network=_mass_network(spec),
-    )
+    options: dict[str, object] = {"functions": FUNCTIONS, "constants": constants, "margin": spec.margin}
+    return call("DerivedMass", JOINTS, MASS_ENTRIES, **options, network=_mass_network(spec))
 
 
 def _mass_network(spec: ModelSpec) -> Call:
@@ -225,6 +194,7 @@ def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
 
 
 def _potential(spec: ModelSpec) -> Call:
+    # cos q and sin q of a joint have the same scale
     scales = (tuple(joint.potential_sensitivity for joint in spec.joints),) * 2
     # V is one output, M has many: a part of the units is enough.
     width = max(TUNING.min_units, round(TUNING.potential_fraction * units(spec)))
@@ -237,11 +207,12 @@ def _friction(spec: ModelSpec) -> Call:
     if spec.design.dissipation == "per-joint":
         outputs = tuple((name,) for name in spec.joint_names)
         # Velocities in units of the typical speed; qd / |qd| is scaled already.
-        speeds = tuple(float(f"{1 / joint.speed:.4g}") for joint in spec.joints)
+        speeds = tuple(rounded(1 / joint.speed, 4) for joint in spec.joints)
         width = TUNING.friction_units * n
         network = _network(spec, outputs, (scale, scale, speeds, ones), width=width, depth=1)
         return call("JointFriction", JOINTS, network=network)
-    axes = _FRICTION_AXES[spec.design.dissipation]
+    # only one of the three axes of a joint moves, the others are part of the published model
+    axes = 3 if spec.design.dissipation == "dense-3n" else 1
     rows = axes * n
     network = _network(spec, (spec.joint_names,) * (rows * (rows + 1) // 2), (scale, scale, ones))
     return call("DenseFriction", JOINTS, axes=axes, network=network)
@@ -257,16 +228,15 @@ def _network(
     min_units: int = 1,
 ) -> Call:
     """Return a network with these outputs: for each, the names of the joints that it depends on."""
-    return call(
-        "MaskedKAN" if spec.design.net == "kan" else "MaskedMLP",
-        GENERATOR,
-        JOINTS,
-        scales=scales,
-        outputs=outputs,
-        width=units(spec) if width is None else width,
-        depth=spec.options.depth if depth is None else depth,
-        **({} if min_units == 1 else {"min_units": min_units}),
-    )
+    options = {
+        "scales": scales,
+        "outputs": outputs,
+        "width": units(spec) if width is None else width,
+        "depth": spec.options.depth if depth is None else depth,
+        "min_units": min_units,
+    }
+    kind = "MaskedKAN" if spec.design.net == "kan" else "MaskedMLP"
+    return call(kind, GENERATOR, JOINTS, **_unless(options, min_units=min_units == 1))
 
 
 def units(spec: ModelSpec) -> int:
@@ -277,3 +247,41 @@ def units(spec: ModelSpec) -> int:
 
 def _joint_names(spec: ModelSpec, joints: Sequence[int]) -> tuple[str, ...]:
     return tuple(spec.joints[joint].name for joint in joints)
+
+
+def rounded(value: float, digits: int = 6) -> float:
+    """Return a value to significant digits."""
+    return float(f"{value:.{digits}g}")
+
+
+Sums = list[tuple[float, int]]
+"""Factors and indices of the terms of an entry: functions first, then constants; positive factors first."""
+
+
+def entry_sums(spec: ModelSpec) -> list[list[Sums]]:
+    """Return the terms of each entry of the lower triangle of M, row after row."""
+    cells: defaultdict[tuple[int, int], Sums] = defaultdict(list)
+    terms: Sequence[OutputSpec | ConstantSpec] = (*spec.outputs, *spec.constants)
+    for index, term in enumerate(terms):
+        for row, column, factor in term.basis:
+            cells[row, column].append((factor, index))
+    # no entry starts with a minus where another order has none
+    ordered = {entry: sorted(sums, key=lambda term: term[0] < 0) for entry, sums in cells.items()}
+    return [[ordered.get((row, column), []) for column in range(row + 1)] for row in range(len(spec.joints))]
+
+
+def term_names(spec: ModelSpec) -> list[str]:
+    """Return the names of the terms: f1, f2, ... of functions and c1, c2, ... of constants."""
+    return [f"f{k + 1}" for k in range(len(spec.outputs))] + [f"c{k + 1}" for k in range(len(spec.constants))]
+
+
+def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
+    """Return the lower triangle of the nominal mean of M without armature, (n, n), to six digits."""
+    mean = np.zeros((n, n))
+    for constant in constants:
+        for row, column, value in constant.basis:
+            mean[row, column] += constant.start * value
+    for output in outputs:
+        for row, column, value in output.basis:
+            mean[row, column] += output.mean * value
+    return np.array([[rounded(value) for value in row] for row in mean])

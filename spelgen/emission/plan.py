@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from math import isfinite
 
 import numpy as np
 
 from spelgen.arm.actuation import Actuation
-from spelgen.arm.arm import Coordinate
+from spelgen.arm.arm import Chain, Coordinate
 from spelgen.arm.configured_arm import Arm
+from spelgen.arm.rational import Vector
 from spelgen.design import Design, load_design
-from spelgen.emission.entry_sums import mean_mass
-from spelgen.emission.links import link_specs
+from spelgen.emission.parts import mean_mass, rounded
 from spelgen.emission.tuning import TUNING
 from spelgen.errors import SettingsError
-from spelgen.settings.joint import JointSettings
+from spelgen.settings.settings import JointSettings
 from spelgen.spec import (
     ConstantSpec,
     Entries,
@@ -27,9 +28,17 @@ from spelgen.spec import (
     Options,
     OutputSpec,
     ServoSpec,
+    Triple,
 )
 from spelgen.structure.basis import Weights
-from spelgen.structure.nominal import Nominal, exact_inertias, nominal, working_range
+from spelgen.structure.nominal import (
+    Nominal,
+    exact_inertias,
+    nominal,
+    parameters_of,
+    reference_factor,
+    working_range,
+)
 from spelgen.structure.structure import Structure, derive
 
 
@@ -48,17 +57,14 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
     structure = derive(arm.chain, options.assume)
     # Magnitudes of M, V and torques for the URDF's inertials, or for nominal ones: scales of networks and friction.
     sizes = nominal(arm.chain, structure)
-    joints, servos = [], []
-    for index, coordinate in enumerate(arm.chain.coordinates):
-        drive = arm.settings.joint(coordinate.name)
-        joints.append(_joint(coordinate, sizes, index, drive))
-        if has_servos:
-            servos.append(_servo(coordinate, drive))
+    coordinates = arm.chain.coordinates
+    drives = [arm.settings.joint(x.name) for x in coordinates]
+    joints = [_joint(x, sizes, index, drives[index]) for index, x in enumerate(coordinates)]
     links: tuple[LinkSpec, ...] = ()
     outputs, constants = _outputs(structure, sizes, design), _constants(structure, sizes)
     if design.mass == "closed-form":
         # Links need physically consistent inertials, which a URDF may not have.
-        links = link_specs(arm.chain, exact_inertias(arm.chain, sizes.from_urdf))
+        links = _links(arm.chain, exact_inertias(arm.chain, sizes.from_urdf))
         joints = _with_armature(joints, np.diagonal(mean_mass(len(joints), outputs, constants)))
     x, y, z = map(float, arm.chain.gravity)
     return ModelSpec(
@@ -80,7 +86,7 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
         links=links,
         inputs=_inputs(arm.actuation, design),
         motor_speeds=_motor_speeds(arm.actuation),
-        servos=tuple(servos),
+        servos=tuple(map(_servo, coordinates, drives)) if has_servos else (),
     )
 
 
@@ -100,14 +106,16 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
         # The paper's encoding has all joints as inputs of every function.
         if design.encoding == "lie-group":
             joints = tuple(range(len(sizes.mass_sensitivities)))
-        outputs.append(OutputSpec(joints, _floats(output.basis), mean, scale))
+        outputs.append(OutputSpec(joints, _entries(output.basis), mean, scale))
     return tuple(outputs)
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
     """Return the constants of M, each with its initial value and its scale."""
     values = zip(structure.constants, sizes.constants, sizes.constant_scales, strict=True)
-    return tuple(ConstantSpec(_floats(constant.basis), initial, scale) for constant, initial, scale in values)
+    return tuple(
+        ConstantSpec(_entries(constant.basis), initial, scale) for constant, initial, scale in values
+    )
 
 
 def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
@@ -120,24 +128,28 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
 
 
 def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings) -> JointSpec:
+    # networks see the range in which the joint works, also if the file has no limits
     low, high = working_range(coordinate)
-    lower, upper, speed = coordinate.lower, coordinate.upper, coordinate.velocity
-    if coordinate.continuous:
-        lower = upper = None
-    lower, upper = (None if x is None or not isfinite(x) else float(f"{x:.6g}") for x in (lower, upper))
-    # Exporters write 0 or 1e16 for an unknown speed.
-    if not speed or speed > TUNING.largest_speed:
-        speed = TUNING.angular_speed if coordinate.joint_type == "revolute" else TUNING.linear_speed
+    limits = (None, None) if coordinate.continuous else (coordinate.lower, coordinate.upper)
+    lower, upper = (None if x is None or not isfinite(x) else rounded(x) for x in limits)
+    effort = _plausible(coordinate.effort, TUNING.largest_effort)
+    speed = _plausible(coordinate.velocity, TUNING.largest_speed)
+    # Without data, the full effort accelerates the armature to full speed in ``rise`` seconds.
+    armature = TUNING.rise * effort / speed if effort and speed else 0.0
+    # The torque of a wrist may be negligible, but the friction of its gear is similar to the friction of other gears.
+    torque = max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
+    friction = TUNING.friction_of_effort * effort if effort else TUNING.friction_of_torque * torque
+    default_speed = TUNING.angular_speed if coordinate.joint_type == "revolute" else TUNING.linear_speed
     return JointSpec(
         name=coordinate.name,
         joint_type=coordinate.joint_type,
         lower=lower,
         upper=upper,
-        center=float(f"{(low + high) / 2:.6g}"),
-        half_range=float(f"{(high - low) / 2:.6g}"),
-        speed=speed,
-        friction=float(f"{_friction(coordinate, sizes, index):.3g}"),
-        armature=float(f"{drive.armature or _guessed_armature(coordinate):.3g}"),
+        center=rounded((low + high) / 2),
+        half_range=rounded((high - low) / 2),
+        speed=speed or default_speed,
+        friction=rounded(friction, 3),
+        armature=rounded(drive.armature or armature, 3),
         gear=drive.gear,
         mass_sensitivity=sizes.mass_sensitivities[index],
         potential_sensitivity=sizes.potential_sensitivities[index],
@@ -146,37 +158,103 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
 
 def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
     """Return the servo of a joint; an unknown servo has its full effort at half a unit from its command."""
-    effort = coordinate.effort
-    if not effort or effort > TUNING.largest_effort:
-        effort = None
-    kp = drive.kp or float(f"{(effort or TUNING.servo_effort) / TUNING.full_effort_at:.3g}")
-    return ServoSpec(kp, drive.kp is not None, float(f"{TUNING.servo_lag * kp:.3g}"), effort)
+    effort = _plausible(coordinate.effort, TUNING.largest_effort)
+    # a known gain is constant, a guessed one is trained
+    kp = drive.kp or rounded((effort or TUNING.servo_effort) / TUNING.full_effort_at, 3)
+    return ServoSpec(kp, drive.kp is not None, rounded(TUNING.servo_lag * kp, 3), effort)
 
 
-def _guessed_armature(coordinate: Coordinate) -> float:
-    """Return an estimate of the armature: the full effort accelerates it to full speed in ``rise`` seconds."""
-    effort, speed = coordinate.effort, coordinate.velocity
-    if not effort or not speed or effort > TUNING.largest_effort or speed > TUNING.largest_speed:
-        return 0.0
-    return TUNING.rise * effort / speed
-
-
-def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
-    """Return the initial friction torque [Nm, N].
-
-    It is a fraction of the effort in the URDF if plausible, else of the torque of the nominal arm.
-    """
-    if coordinate.effort and coordinate.effort <= TUNING.largest_effort:
-        return TUNING.friction_of_effort * coordinate.effort
-    # The torque of a wrist may be negligible, but the friction of its gear is similar to the friction of other gears.
-    return TUNING.friction_of_torque * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
+def _plausible(limit: float | None, largest: float) -> float | None:
+    """Return a limit of the URDF; None for a placeholder: exporters write 0 or 1e16 for an unknown limit."""
+    return limit if limit and limit <= largest else None
 
 
 def _with_armature(joints: Sequence[JointSpec], mass: np.ndarray) -> list[JointSpec]:
     """Return the joints with a small armature for drives without data, from the diagonal of M (n,)."""
-    initial = [float(f"{TUNING.min_armature * value:.3g}") for value in mass]
+    initial = [rounded(TUNING.min_armature * value, 3) for value in mass]
     return [replace(x, armature=x.armature or value) for x, value in zip(joints, initial, strict=True)]
 
 
-def _floats(weights: Weights) -> Entries:
+def _entries(weights: Weights) -> Entries:
     return tuple((row, column, float(value)) for row, column, value in weights)
+
+
+def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
+    """Return the links of ``arm`` with these inertial parameters, made physically consistent if necessary.
+
+    Args:
+        arm: the arm.
+        inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (10,).
+    """
+    # Missing masses are small relative to the heaviest link, so that they do not dominate M.
+    heaviest = max(float(ten[0]) for ten in inertias)
+    names = [body.link for body in arm.bodies]
+    specs = []
+    for index, (body, ten) in enumerate(zip(arm.bodies, inertias, strict=True)):
+        mass, center, inertia = _about_center(_consistent(arm, index, ten, heaviest))
+        first, second, third = map(_triple, body.rotation)
+        spec = LinkSpec(
+            # repeated names get a number
+            name=body.link if body.link not in names[:index] else f"{body.link} ({index})",
+            parent=body.parent,
+            joint=body.coordinate,
+            joint_type=body.joint_type,
+            ratio=float(body.multiplier),
+            offset=body.offset,
+            position=_triple(body.translation),
+            rotation=(first, second, third),
+            mass=mass,
+            center_of_mass=center,
+            inertia=inertia,
+        )
+        specs.append(spec)
+    return tuple(specs)
+
+
+def _consistent(
+    arm: Chain, index: int, ten: Sequence[Fraction | float], heaviest: float
+) -> Sequence[Fraction | float]:
+    """Return physically consistent inertial parameters, (10,)."""
+    # A link without mass needs one, since its log-Cholesky parameters are logarithms: a ball up to the next joint.
+    if ten[0] <= 0:
+        distances = [float(np.linalg.norm(_triple(x.translation))) for x in arm.bodies if x.parent == index]
+        mass = TUNING.default_mass * heaviest
+        moment = 0.4 * mass * max([0.1, *distances]) ** 2
+        ten = [mass, 0, 0, 0, moment, 0, 0, moment, 0, moment]
+    factor, is_consistent = reference_factor(np.array(ten, dtype=float))
+    pseudo = factor @ factor.T
+    mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
+    moments = pseudo[:3, :3] - mass * np.outer(center, center)
+    # With smaller moments, rounding of the digits could make the body inconsistent.
+    values, vectors = np.linalg.eigh(moments)
+    if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
+        return ten
+    # The principal directions are kept; only moments below the bound are raised.
+    raised = np.maximum(values, 2 * TUNING.min_second_moment * values[-1])
+    pseudo[:3, :3] += (vectors * (raised - values)) @ vectors.T
+    return _significant(parameters_of(pseudo))
+
+
+def _about_center(
+    ten: Sequence[Fraction | float],
+) -> tuple[float, Triple, tuple[float, float, float, float, float, float]]:
+    """Return mass, center of mass, and inertia about the center of mass: computed exactly, then rounded."""
+    m, hx, hy, hz, *tensor = [Fraction(value) for value in ten]
+    x, y, z = hx / m, hy / m, hz / m
+    steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
+    inertia = [value - m * square for value, square in zip(tensor, steiner, strict=True)]
+    # rounding errors of an inertia that was made consistent
+    noise = max(map(abs, inertia)) / 10 ** (TUNING.inertia_digits + 3)
+    inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]
+    mass, cx, cy, cz, xx, xy, xz, yy, yz, zz = _significant([m, x, y, z, *inertia])
+    return mass, (cx, cy, cz), (xx, xy, xz, yy, yz, zz)
+
+
+def _significant(values: Iterable[Fraction | float]) -> list[float]:
+    """Return values with the significant digits of inertial parameters."""
+    return [rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values]  # no -0.0
+
+
+def _triple(values: Vector) -> Triple:
+    x, y, z = map(float, values)
+    return x, y, z

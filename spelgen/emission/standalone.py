@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -13,8 +14,7 @@ from typing import NamedTuple
 _OURS = "spelgen.runtime."
 
 
-@dataclass(frozen=True)
-class Definition:
+class Definition(NamedTuple):
     """A class, function or constant of the runtime: its text with comments, and the names that it uses."""
 
     text: str
@@ -26,12 +26,12 @@ class Definition:
 class Runtime:
     """The source of the runtime.
 
-    definitions: by name, each after the definitions that its execution needs. imports: statements by the name that they
-    bind. rows: names of the definitions that the rows of an arm need. public: names that a module imports.
+    definitions: by name, each after the definitions that its execution needs. imports: statements from outside. rows:
+    names of the definitions that the rows of an arm need. public: names that a module imports.
     """
 
     definitions: dict[str, Definition]
-    imports: dict[str, str]
+    imports: tuple[ast.Import | ast.ImportFrom, ...]
     rows: frozenset[str]
     public: frozenset[str]
 
@@ -56,20 +56,18 @@ def bundle(arm: str, model: str) -> Bundle:
             new = runtime.definitions[name].uses - used
             used |= new
             pending += new
-    names = [name for name in runtime.definitions if name in used]
+    needed = {name: definition for name, definition in runtime.definitions.items() if name in used}
     # classes of the rows are defined before the rows, all other definitions after the arm
-    row_names = [name for name in names if name in runtime.rows]
-    model_names = [name for name in names if name not in runtime.rows]
-    blocks = tuple(name for name in model_names if runtime.definitions[name].is_block)
-    rows, definitions = _joined(runtime, row_names), _joined(runtime, model_names)
-    return Bundle(_imports(used, runtime.imports), rows, definitions, blocks)
+    rows = [definition for name, definition in needed.items() if name in runtime.rows]
+    others = {name: definition for name, definition in needed.items() if name not in runtime.rows}
+    blocks = tuple(name for name, definition in others.items() if definition.is_block)
+    return Bundle(_imports(used, runtime), _joined(rows), _joined(others.values()), blocks)
 
 
-def _joined(runtime: Runtime, names: Iterable[str]) -> str:
+def _joined(definitions: Iterable[Definition]) -> str:
     """Return these definitions, constants on consecutive lines."""
     text, previous_is_block = "", True
-    for name in names:
-        definition = runtime.definitions[name]
+    for definition in definitions:
         separate = definition.is_block or previous_is_block
         text += ("\n\n\n" if separate else "\n") + definition.text
         previous_is_block = definition.is_block
@@ -79,34 +77,32 @@ def _joined(runtime: Runtime, names: Iterable[str]) -> str:
 @cache
 def load_runtime() -> Runtime:
     """Read the source of the runtime."""
-    texts: dict[str, str] = {}
-    trees: dict[str, ast.Module] = {}
+    texts = {
+        path.name.removesuffix(".py"): path.read_text(encoding="utf-8")
+        for path in (files("spelgen") / "runtime").iterdir()
+        if path.name.endswith(".py")
+    }
+    # sorted: the order of files differs between file systems, and the text of a module must not
+    trees = {name: ast.parse(texts[name]) for name in sorted(texts)}
+    public = [alias.name for node in _imported(trees.pop("__init__")) for alias in node.names]
     order: TopologicalSorter[str] = TopologicalSorter()
-    public: set[str] = set()
-    for path in sorted((files("spelgen") / "runtime").iterdir(), key=lambda path: path.name):
-        name = path.name.removesuffix(".py")
-        if not path.name.endswith(".py"):
-            continue
-        texts[name] = path.read_text(encoding="utf-8")
-        if name == "__init__":
-            imported = [node for node in ast.parse(texts[name]).body if isinstance(node, ast.ImportFrom)]
-            public = {alias.name for node in imported for alias in node.names}
-            continue
-        trees[name] = ast.parse(texts[name])
-        order.add(name, *_needs(trees[name]))
+    imports: list[ast.Import | ast.ImportFrom] = []
+    for name, tree in trees.items():
+        order.add(name)
+        for node in _imported(tree):
+            module = (node.module or "") if isinstance(node, ast.ImportFrom) else ""
+            if module.startswith(_OURS):
+                order.add(name, module.removeprefix(_OURS))
+            elif module != "__future__":
+                imports.append(node)
     definitions: dict[str, Definition] = {}
-    imports: dict[str, str] = {}
     for name in order.static_order():
-        for node in trees[name].body:
-            if isinstance(node, ast.Import | ast.ImportFrom):
-                imports.update(_bound(node))
-            elif (defined := _defined(node)) is not None:
-                uses = frozenset(names_in(node))
-                definitions[defined] = Definition(
-                    _text(node, texts[name]), uses, not isinstance(node, ast.Assign)
-                )
+        for statement in trees[name].body:
+            if (defined := _defined(statement)) is not None:
+                text, is_block = _text(statement, texts[name]), not isinstance(statement, ast.Assign)
+                definitions[defined] = Definition(text, frozenset(names_in(statement)), is_block)
     rows = frozenset(filter(None, map(_defined, trees["rows"].body)))
-    return Runtime(definitions, imports, rows, frozenset(public))
+    return Runtime(definitions, tuple(imports), rows, frozenset(public))
 
 
 def names_in(tree: ast.AST) -> set[str]:
@@ -114,30 +110,9 @@ def names_in(tree: ast.AST) -> set[str]:
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
 
 
-def _needs(tree: ast.Module) -> list[str]:
-    """Return the runtime files that a file imports from, sorted."""
-    needs = []
-    for node in tree.body:
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(_OURS):
-            needs.append((node.module or "").removeprefix(_OURS))
-    return sorted(needs)
-
-
-def _bound(node: ast.Import | ast.ImportFrom) -> dict[str, str]:
-    """Return the names that an import from outside the runtime binds, with their statements."""
-    start = ""
-    if isinstance(node, ast.ImportFrom):
-        module = node.module or ""
-        if module.startswith(_OURS) or module == "__future__":
-            return {}
-        start = f"from {module} "
-    bound = {}
-    for alias in node.names:
-        statement = f"{start}import {alias.name}"
-        if alias.asname:
-            statement += f" as {alias.asname}"
-        bound[alias.asname or alias.name] = statement
-    return bound
+def _imported(tree: ast.Module) -> list[ast.Import | ast.ImportFrom]:
+    """Return the imports at the top of a file."""
+    return [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
 
 
 def _defined(node: ast.stmt) -> str | None:
@@ -158,19 +133,18 @@ def _text(node: ast.stmt, source: str) -> str:
     return "\n".join(lines[first : node.end_lineno])
 
 
-def _imports(used: Iterable[str], imports: dict[str, str]) -> str:
+def _imports(used: set[str], runtime: Runtime) -> str:
     """Return the imports of the used names, from the standard library and then torch, sorted as ruff sorts them."""
     plain: set[str] = set()
-    members: dict[str, str] = {}
-    for name in sorted(set(imports).intersection(used)):
-        module, _, imported = imports[name].partition(" import ")
-        if not imported:
-            plain.add(imports[name])
-        elif module in members:
-            members[module] += f", {imported}"
+    members: defaultdict[str, set[str]] = defaultdict(set)
+    for node in runtime.imports:
+        aliases = [alias for alias in node.names if (alias.asname or alias.name) in used]
+        texts = set(map(ast.unparse, aliases))
+        if isinstance(node, ast.ImportFrom):
+            members[f"from {node.module}"] |= texts
         else:
-            members[module] = f"{module} import {imported}"
-    groups: dict[bool, list[str]] = {False: [], True: []}
-    for statement in [*sorted(plain), *sorted(members.values())]:
-        groups["torch" in statement].append(statement)
-    return "\n\n".join("\n".join(group) for group in groups.values() if group)
+            plain |= texts
+    statements = [f"import {text}" for text in sorted(plain)]
+    statements += [f"{start} import {', '.join(sorted(x))}" for start, x in sorted(members.items()) if x]
+    groups = [[text for text in statements if ("torch" in text) == is_torch] for is_torch in (False, True)]
+    return "\n\n".join("\n".join(group) for group in groups if group)

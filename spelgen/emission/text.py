@@ -1,23 +1,34 @@
-"""ModelSpec -> the text of a module. Pure: the same specification gives the same bytes.
+"""ModelSpec -> the text of a module, and back. Pure: the same specification gives the same bytes.
 
-Text from a URDF becomes string literals and JSON strings in docstrings, never code.
+Text from a URDF becomes string literals and JSON strings in docstrings, never code. Nothing of a module's file is
+executed.
 """
 
 from __future__ import annotations
 
+import ast
 import json
 import re
+from pathlib import Path
 from textwrap import fill, wrap
 
-from spelgen.emission.entry_sums import Sums, entry_sums, term_names
-from spelgen.emission.parts import ModelParts, model_parts
+from spelgen.emission.parts import (
+    GENERATOR,
+    MASS_ENTRIES,
+    ModelParts,
+    Sums,
+    entry_sums,
+    model_parts,
+    term_names,
+)
 from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call
 from spelgen.emission.standalone import bundle, load_runtime
-from spelgen.labels import counted, entry_name, joint_ranges, joints_in_ranges
-from spelgen.spec import ModelSpec
+from spelgen.errors import ModuleError
+from spelgen.files import read_bytes
+from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
+from spelgen.spec import ModelSpec, spec_from_json
 from spelgen.templates import render
 
-_UNITS = {"revolute": ("rad", "Nm"), "prismatic": ("m", "N")}
 _COMMENTS = {
     "JOINTS": ["Positions [rad, m], speed [rad/s, m/s], friction [Nm, N], armature [kg m^2, kg]."],
     "LINKS": [
@@ -38,6 +49,9 @@ _EXAMPLE = """\
     tau = model.inverse_dynamics(q, qd, qdd)
     V = model.potential_energy(q)  # (100,) [J]
     H = model.hamiltonian(q, model.momentum(q, qd))"""
+# Largest module that is read [bytes]: the largest that `spelgen build` writes has a tenth.
+MAX_MODULE = 2**22
+_EXPECTED = "a module written by this version of `spelgen build`"
 
 
 def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
@@ -51,7 +65,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
         "model.py.jinja",
         base=assembly.model.callee,
         summary=class_summary(spec),
-        has_networks=assembly.uses_networks,
+        has_networks=assembly.uses(GENERATOR),
         call=listed_call("super().__init__", Call("", assembly.model.arguments), 8) + SKIP,
     )
     title = f"Port-Hamiltonian model of an arm with {counted(len(spec.joints), 'joint')}, by `spelgen build`."
@@ -62,7 +76,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     used = set(re.findall(r"\w+", f"{arm}\n{model}")) & load_runtime().public
     # As ruff sorts members: classes first.
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
-    return render("module.py.jinja", names=ordered, has_tensor=assembly.uses_mass_entries, **context)
+    return render("module.py.jinja", names=ordered, has_tensor=assembly.uses(MASS_ENTRIES), **context)
 
 
 def class_summary(spec: ModelSpec) -> str:
@@ -137,8 +151,9 @@ def _joint_table(spec: ModelSpec) -> str:
         limits = "unlimited"
         if joint.lower is not None and joint.upper is not None:
             limits = f"{joint.lower:g} .. {joint.upper:g}"
-        unit, torque = _UNITS[joint.joint_type]
-        lines.append(f"    {number:2}  {name.ljust(width)}  {joint.joint_type:9}  {limits} {unit}, {torque}")
+        units = UNITS[joint.joint_type]
+        quantities = f"{limits} {units.position}, {units.torque}"
+        lines.append(f"    {number:2}  {name.ljust(width)}  {joint.joint_type:9}  {quantities}")
     return "\n".join(lines)
 
 
@@ -177,7 +192,7 @@ def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
 
 def _mass_entries(spec: ModelSpec, assembly: ModelParts) -> str:
     """Return the function that makes M from its functions and constants; empty if M is made in another way."""
-    if not assembly.uses_mass_entries:
+    if not assembly.uses(MASS_ENTRIES):
         return ""
     names = term_names(spec)
     arguments = ", ".join(f"{name}: Tensor" for name in names)
@@ -198,8 +213,7 @@ def _mass_entries(spec: ModelSpec, assembly: ModelParts) -> str:
         rows.append(f"[{', '.join(texts)}]")
     end = f"    return symmetric({', '.join(rows)})"
     if len(end) > WIDTH:
-        lines = [f"        {row}," for row in rows]
-        end = "\n".join(["    return symmetric(", *lines, f"    ){SKIP}"])
+        end = "\n".join(["    return symmetric(", *(f"        {row}," for row in rows), f"    ){SKIP}"])
     return "\n".join([start, about, *body, end])
 
 
@@ -220,3 +234,60 @@ def _number(value: float) -> str:
     # Six digits if they are exact: URDFs have few digits.
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
+
+
+def read_source(path: Path) -> str:
+    """Return the text of the module at ``path``. Raises ModuleError."""
+    if not path.exists():
+        raise ModuleError("no such file", file=path, do="build it with `spelgen build`")
+    content = read_bytes(path, ModuleError, _EXPECTED, MAX_MODULE)
+    try:
+        return content.decode("utf-8").replace("\r\n", "\n")
+    except ValueError as problem:
+        raise _no_module(problem, path) from None
+
+
+def read_spec(path: Path | str) -> ModelSpec:
+    """Return the specification in the module at ``path``. Raises ModuleError."""
+    return parse_spec(read_source(Path(path)), Path(path))
+
+
+def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
+    """Return the specification in the text of a module, which may be edited. Raises ModuleError."""
+    values = {}
+    try:
+        for node in ast.parse(text).body:
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
+                values[ast.unparse(node.targets[0])] = node.value.value
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
+        raise _no_module(problem, file) from None
+    if "FACTS" in values:
+        raise ModuleError(
+            "a module of an earlier version of spelgen", file=file, expected=_EXPECTED,
+            do="build it again with `spelgen build`, and train it again",
+        )  # fmt: skip
+    if "SPEC" not in values:
+        raise _no_module(None, file)
+    return spec_from_json(str(values["SPEC"]), file)
+
+
+def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
+    """Return the specification in the text of a module. Raises ModuleError if the text differs from its module."""
+    spec = parse_spec(text, file)
+    # the whole text is compared: an edit anywhere would be lost without a word
+    if text in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
+        return spec
+    raise ModuleError(
+        "a module that was edited, or written by another version of spelgen", file=file, expected=_EXPECTED,
+        do="build it again, or use the edited one from Python: `from MODULE import Model; spelgen.fit(Model(), logs)`",
+    )  # fmt: skip
+
+
+def _no_module(problem: Exception | None, file: Path | None) -> ModuleError:
+    reason = f" ({type(problem).__name__})" if problem is not None else ""
+    return ModuleError(
+        f"no specification of spelgen in it{reason}",
+        file=file,
+        expected=_EXPECTED,
+        do="build it again, or check the path",
+    )

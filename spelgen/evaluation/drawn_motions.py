@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from scipy.integrate import cumulative_trapezoid
 
-from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import States
 from spelgen.dynamics.bristles import bristles_along
 from spelgen.dynamics.protocol import RigidDynamics
@@ -19,9 +18,10 @@ from spelgen.evaluation.horizons import EvaluatedLogs
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
 from spelgen.evaluation.tuning import TUNING
+from spelgen.labels import MODEL
 from spelgen.logs.dynamics_samples import DynamicsSamples
-from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.tuning import shows_accelerations
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
@@ -77,21 +77,20 @@ def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
     """Return the motion of median error, and the motion of largest error if there are several."""
     # a sort keeps the order of equal errors: the same logs give the same page
     ordered = sorted(motions, key=lambda motion: math.inf if motion.error is None else motion.error)
-    chosen = {}
-    if ordered:
-        chosen["typical"] = ordered[(len(ordered) - 1) // 2]
+    if not ordered:
+        return ()
+    chosen = [replace(ordered[(len(ordered) - 1) // 2], which="typical")]
     if len(ordered) > 1:
-        chosen["worst"] = ordered[-1]
-    return tuple(replace(motion, which=which) for which, motion in chosen.items())
+        chosen.append(replace(ordered[-1], which="worst"))
+    return tuple(chosen)
 
 
 def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
     """Return the motion at about `max_samples` samples at most."""
+    # every sample at the same distance: filtered curves would hide spikes that the errors contain
     stride = -(-len(motion.t) // max_samples)
-    curves: dict[str, Any] = {}
-    for name, values in vars(motion).items():
-        if isinstance(values, np.ndarray):
-            curves[name] = values[::stride]
+    arrays = {name: values for name, values in vars(motion).items() if isinstance(values, np.ndarray)}
+    curves: dict[str, Any] = {name: values[::stride] for name, values in arrays.items()}
     return replace(motion, **curves)
 
 
@@ -116,6 +115,7 @@ def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
         t=log.t - log.t[0],
         q=log.q,
         u=log.u,
+        # the first position is given, not predicted
         predicted_q=np.concatenate([log.q[:1], log.q[1:] + error]),
     )
 
@@ -123,6 +123,7 @@ def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
 def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
     """Return ten seconds from the middle of each log, as logs begin and end at rest, at the samples of a chart."""
     motions = []
+    # logs too slow for accelerations by a filter still show their torques
     slow = [piece for piece in logs.pieces if not shows_accelerations(piece.sample_rate)]
     for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
@@ -134,17 +135,10 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
     """Return the sample intervals of a log too slow for a filter: mean motion, acceleration and torque in each."""
     steps = cut_windows([piece], 2, measured=logs.used.filtered)
-    q = steps.q.mean(dim=1).numpy()
     qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt
-    return DynamicsSamples(
-        piece.name,
-        q,
-        steps.qd.mean(dim=1).numpy(),
-        qdd.numpy(),
-        steps.tau[:, 0].numpy(),
-        bristles_along(q, logs.reach),
-        rate=piece.sample_rate,
-    )
+    q, qd, tau = steps.q.mean(dim=1).numpy(), steps.qd.mean(dim=1).numpy(), steps.tau[:, 0].numpy()
+    z = bristles_along(q, logs.reach)
+    return DynamicsSamples(piece.name, q, qd, qdd.numpy(), tau, z, rate=piece.sample_rate)
 
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
@@ -162,10 +156,11 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
             "gravity": gravity.numpy(),
             "friction": model.friction_torque(q, qd, *friction_past(model, samples)).numpy(),
         }
-    predicted = {}
-    for name, predictor in dynamics.items():
-        predicted[name] = _at_joints(inputs, predicted_torques(predictor, samples))
+    torques = {name: predicted_torques(predictor, samples) for name, predictor in dynamics.items()}
+    predicted = {name: _at_joints(inputs, torque) for name, torque in torques.items()}
+    # at the joints, where the terms of the model act; logs have the torques of the motors
     measured = _at_joints(inputs, samples.tau)
+    # the samples are evenly spaced after the filter
     t = np.arange(len(samples.q)) / samples.rate
     # friction includes an offset of the torque
     stored = parts["inertia"] + parts["Coriolis"] + parts["gravity"]
@@ -175,9 +170,8 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
         "friction": predicted[MODEL] - stored,
         "not explained": measured - predicted[MODEL],
     }
-    energy = {}
-    for name, torque in works.items():
-        energy[name] = cumulative_trapezoid((torque * samples.qd).sum(axis=-1), t, initial=0)
+    power = {name: (torque * samples.qd).sum(axis=-1) for name, torque in works.items()}
+    energy = {name: cumulative_trapezoid(values, t, initial=0) for name, values in power.items()}
     return TorqueTrace(
         trajectory=samples.name,
         error=mean_nmse(predicted[MODEL] - measured, measured),

@@ -9,12 +9,10 @@ from pathlib import Path
 import torch
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import EvaluatedArm
-from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
-from spelgen.baselines.registry import command_followers, torque_predictors
+from spelgen.baselines.registry import EvaluatedArm, command_followers, torque_predictors
 from spelgen.dynamics.parameters import used_parameter_count, without_idle_residuals
-from spelgen.dynamics.protocol import RigidDynamics, input_of
+from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError, SpelgenError, in_one_line
@@ -28,16 +26,17 @@ from spelgen.evaluation.horizons import (
 )
 from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results
+from spelgen.evaluation.rollout import mass_errors
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_errors
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
-from spelgen.evaluation.truth import mass_errors
 from spelgen.evaluation.tuning import TUNING
+from spelgen.evaluation.verdict import SEEN
 from spelgen.fitting.fitted import Fit
+from spelgen.labels import MODEL
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import (
     Trajectory,
     joined_column,
@@ -45,7 +44,7 @@ from spelgen.logs.trajectory import (
     require_joints,
     require_torques,
 )
-from spelgen.logs.windows import Windows
+from spelgen.logs.tuning import SLOWEST
 
 STEPS: Sequence[int] = (1, 10)
 SECONDS: Sequence[float] = (1.0,)
@@ -86,8 +85,10 @@ def evaluate(
 
     Raises LogError.
     """
+    # checks come before rollouts, which take minutes
     tested = subject(model, arm)
     logs = [logs] if isinstance(logs, Trajectory) else list(logs)
+    # columns are matched by name: another order of the joints is no error, a missing joint is
     for trajectory in logs:
         require_joints(trajectory, tested.joints)
     notes = check(logs, tested.joints, tested.model.joint_types)
@@ -96,19 +97,19 @@ def evaluate(
         message = (
             f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
         )
-        notes.append(Diagnostic("warning", "tested-on-training-data", "logs", None, message))
-    if input_of(tested.model) == "position":
+        notes.append(Diagnostic("warning", SEEN, "logs", None, message))
+    # an arm under servos has no torques, so inverse dynamics and rollouts under torques are undefined for it
+    if tested.model.input_quantity == "position":
         if baselines:
-            raise LogError(
-                "baselines that take torques", expected="none: the model is one of position servos"
-            )
-        return tested.assessed(_evaluate_commands(tested, logs, notes))
-    require_torques(logs)
-    used = _preprocessing(tested.fit.preprocessing if tested.fit else None, preprocessing, logs)
-    ahead = (steps, seconds)
-    return tested.assessed(
-        _evaluate_torques(tested, logs, notes, used, baselines or {}, ahead, truth, progress)
-    )
+            expected = "none: the model is one of position servos"
+            raise LogError("baselines that take torques", expected=expected)
+        results = _evaluate_commands(tested, logs, notes)
+    else:
+        require_torques(logs)
+        used = _preprocessing(tested.fit.preprocessing if tested.fit else None, preprocessing, logs)
+        ahead = (steps, seconds)
+        results = _evaluate_torques(tested, logs, notes, used, baselines or {}, ahead, truth, progress)
+    return tested.assessed(results)
 
 
 def _preprocessing(
@@ -118,9 +119,8 @@ def _preprocessing(
     if chosen is None and used is not None:
         return used
     preprocessing = chosen or Preprocessing()
-    if (
-        used is not None and preprocessing.torque_delay is None
-    ):  # a property of the logger, independent of the filter
+    # the delay is a property of the logger, independent of the filter
+    if used is not None and preprocessing.torque_delay is None:
         preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
     return preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
 
@@ -136,18 +136,21 @@ def _evaluate_torques(
     progress: Progress | None,
 ) -> Results:
     """Evaluate the torques, and the motion under the logged torques."""
-    all_samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=tested.reach)
-    samples = [sample for sample in all_samples if len(sample.q)]
+    samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=tested.reach)
+    samples = [sample for sample in samples if len(sample.q)]
     # a rollout needs an initial sample and one more
-    tests = EvaluatedLogs(
-        used.pieces(logs, shortest=2), samples, used, tested.reach, tested.model.joint_types
-    )
+    pieces = used.pieces(logs, shortest=2)
+    tests = EvaluatedLogs(pieces, samples, used, tested.reach, tested.model.joint_types)
     lengths = horizon_lengths(tests, *ahead, notes)
+    # windows as long as in training: on longer ones errors of the dynamics would hide errors of the integrator
     probe = tests.windows(tested.window - 1, TUNING.probed_model_windows)
     # residual terms that were not selected only cost time
     model = without_idle_residuals(tested.model)
+    # chosen per predictor: stiff friction needs more steps, and its error must not count as an error of the dynamics
     solver = accurate_solver(model, probe)
-    predictors = [Predictor(MODEL, solver, model), *_baselines(tested, baselines, probe, notes)]
+    arm = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
+    predictors = [Predictor(MODEL, solver, model), *torque_predictors(arm)]
+    predictors += [of_dynamics(name, dynamics, probe) for name, dynamics in baselines.items()]
     tip = _tip(tested, notes)
     horizons: list[Horizon] = []
     longest: Predictions | None = None
@@ -159,19 +162,17 @@ def _evaluate_torques(
         # the curves of the longest horizon contain the shorter ones
         if k == max(lengths.values()):
             longest = predictions
-    all_dynamics: dict[str, RigidDynamics] = {}
+    all_dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
     torque: dict[str, TorqueErrors] = {}
-    for predictor in predictors:
-        if predictor.dynamics is not None:
-            all_dynamics[predictor.name] = predictor.dynamics
-            if samples:
-                torque[predictor.name] = torque_errors(predictor.dynamics, samples)
+    if samples:
+        torque = {name: torque_errors(dynamics, samples) for name, dynamics in all_dynamics.items()}
     if not horizons and not torque:
         raise LogError(
             "no figure: no rollout is evaluated, and torques need accelerations, which these logs do not show",
             expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
             do="omit --quick",
         )
+    # after the errors, which include these joints: only the assessment omits them
     steps = coarse_torques(logs, tested.joints, notes) if torque else {}
     masses = {}
     if truth is not None:
@@ -185,18 +186,6 @@ def _evaluate_torques(
         torque_steps=steps,
         mass_errors=masses,
     )
-
-
-def _baselines(
-    tested: Subject, additional: Mapping[str, RigidDynamics], probe: Windows, notes: list[Diagnostic]
-) -> list[Predictor]:
-    """Return the baselines of the registry, and the given ones. probe: windows that determine integrator steps."""
-    fitted = tested.fit.baselines if tested.fit else {}
-    arm = EvaluatedArm(tested.joints, tested.urdf, fitted, tested.fitted_arm, probe, notes)
-    return [
-        *torque_predictors(arm),
-        *(of_dynamics(name, dynamics, probe) for name, dynamics in additional.items()),
-    ]
 
 
 def _results(

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spelgen.baselines.names import observed
 from spelgen.baselines.predictor import Predictor, Solver, States
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.dynamics.protocol import integrable, known_past, memory_along
@@ -17,6 +16,7 @@ from spelgen.errors import Diagnostic
 from spelgen.evaluation.plain import finite
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import position_difference
+from spelgen.labels import counted, observed
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -74,9 +74,8 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
 def without_past(windows: Windows, past: int) -> Windows:
     """Return the windows without their first `past` steps; z remains the state at the first sample."""
-    return Windows(
-        windows.dt[:, past:], windows.q[:, past:], windows.qd[:, past:], windows.tau[:, past:], windows.z
-    )
+    dt, q, qd, tau = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
+    return Windows(dt, q, qd, tau, windows.z)
 
 
 TipPosition = Callable[[Tensor], Tensor]
@@ -146,10 +145,7 @@ class EvaluatedLogs:
     def starts(self, span: int, window_count: int) -> list[tuple[Trajectory, int]]:
         """Return the piece and the first sample of each of these windows."""
         stride = self.stride(span, window_count)
-        starts: list[tuple[Trajectory, int]] = []
-        for piece in self.pieces:
-            starts += [(piece, first) for first in range(0, len(piece) - span, stride)]
-        return starts
+        return [(piece, k) for piece in self.pieces for k in range(0, len(piece) - span, stride)]
 
     def windows(self, span: int, window_count: int) -> Windows:
         """Return these windows; they are shorter than `span` if all pieces are."""
@@ -171,11 +167,8 @@ def horizon_lengths(
     logs: EvaluatedLogs, steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
 ) -> dict[str, int]:
     """Return the number of samples of each horizon by name; longer ones than every trajectory are noted instead."""
-    lengths = {}
-    for k in steps:
-        lengths["1 step" if k == 1 else f"{k} steps"] = k
-    for duration in seconds:
-        lengths[f"{duration:g} s"] = round(duration * logs.rate)
+    lengths = {counted(k, "step"): k for k in steps}
+    lengths |= {f"{duration:g} s": round(duration * logs.rate) for duration in seconds}
     possible = {}
     for name, k in lengths.items():
         if 0 < k <= logs.longest:
@@ -196,6 +189,7 @@ def predict(
 ) -> tuple[Horizon, Predictions]:
     """Evaluate rollouts of `steps` samples: open loop, and with the disturbance observed before they start."""
     past = past_steps(logs.rate)
+    # without room for the past, the open-loop prediction is still evaluated
     if past + steps > logs.longest:
         message = f"no observer over {name}: the longest trajectory has {logs.longest} steps"
         notes.append(Diagnostic("info", "no-observer", "logs", None, message))
@@ -231,8 +225,10 @@ def end_errors(
     q, qd = (predicted[:, -1] for predicted in states)  # (W, n)
     measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
     # angles of revolute joints are compared modulo a revolution
+    # root mean square and not the mean: large errors decide whether a simulation can be used
     q_error = _rms(position_difference(q, measured_q, joint_types))
     qd_error = _rms(qd - measured_qd)
+    # relative to the motion, so that joints and horizons can be compared
     q_relative = q_error / _rms(position_difference(measured_q, windows.q[:, 0], joint_types))
     qd_relative = qd_error / _rms(measured_qd - windows.qd[:, 0])
     mean = torch.cat([q_relative, qd_relative]).mean(dim=0, keepdim=True)
@@ -240,9 +236,8 @@ def end_errors(
     if tip is not None:
         distance = _rms((tip(q) - tip(measured_q)).norm(dim=-1, keepdim=True))
         (tip_mm,) = finite(1000 * distance)
-    return StateErrors(
-        finite(q_error), finite(qd_error), finite(q_relative), finite(qd_relative), finite(mean)[0], tip_mm
-    )
+    of_q, of_qd, relative_q, relative_qd = map(finite, (q_error, qd_error, q_relative, qd_relative))
+    return StateErrors(of_q, of_qd, relative_q, relative_qd, finite(mean)[0], tip_mm)
 
 
 def _rms(values: Tensor) -> Tensor:

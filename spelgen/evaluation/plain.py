@@ -12,6 +12,7 @@ from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
 def number(value: float) -> float | None:
     """Return a number rounded to five digits; None if it is not finite."""
+    # JSON has neither infinity nor NaN; five digits are more than any figure is known to, and keep pages small
     if math.isfinite(value):
         return float(f"{value:.5g}")
     return None

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import CommandFollower
 from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.tuning import TUNING
-from spelgen.logs.commands import LogRows, delayed_commands, steps_between
+from spelgen.labels import MODEL
 from spelgen.logs.filtering import velocities
-from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split_at_gaps, steps_between
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,7 @@ class ServoModel:
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the positions per part, (K, n). All parts run in one batch, in which shorter ones are padded."""
+        # one number for all parts, which form one batch; more steps than needed only cost time
         steps = max(steps_between(log) for log, _ in parts)
         lengths = [rows.stop - rows.start - 1 for _, rows in parts]
         commands, intervals = [], []
@@ -78,9 +78,7 @@ def replays(
 
     Returns both, and the position errors of the model over whole logs. The baselines are described in `notes`.
     """
-    pieces: list[Trajectory] = []
-    for log in logs:
-        pieces += split_at_gaps(log, shortest=3)
+    pieces = [piece for log in logs for piece in split_at_gaps(log, shortest=3)]
     windows: list[LogRows] = []
     first_qd: list[np.ndarray] = []
     for piece in pieces:
@@ -90,12 +88,14 @@ def replays(
             first_qd.append(qd[start])
     for name, baseline in baselines.items():
         notes.append(Diagnostic("info", "baseline", "logs", None, f"{name}: {baseline.about}"))
+    # the model is one of the predictors: all are measured by the same code
     predictors = {MODEL: ServoModel(model), **baselines}
     # a log begins at rest; a window begins in motion
     logs_from_rest: list[LogRows] = [(piece, slice(0, len(piece))) for piece in pieces]
     at_rest = np.zeros((len(pieces), pieces[0].q.shape[1]))
     replay, missed = _replay("whole log", predictors, logs_from_rest, at_rest)
     results = [replay]
+    # logs shorter than a window have no second table
     if windows:
         name = f"windows of {TUNING.replay_window:g} s"
         results.append(_replay(name, predictors, windows, np.stack(first_qd))[0])
@@ -105,21 +105,26 @@ def replays(
 def _replay(
     name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
-    """Return the errors of each predictor from initial velocities qd (parts, n), and the errors of the model (K, n)."""
+    """Return the errors per predictor, and the position errors (K, n) of the model on each part.
+
+    qd: (parts, n) initial velocities [rad/s, m/s].
+    """
     q = np.stack([log.q[rows.start] for log, rows in parts])
-    errors: dict[str, list[np.ndarray]] = {}
+    measured = [log.q[rows][1:] for log, rows in parts]
+    errors = {}
     for predictor, follower in predictors.items():
-        errors[predictor] = []
-        for (log, rows), predicted in zip(parts, follower.positions(parts, q, qd), strict=True):
-            errors[predictor].append(predicted - log.q[rows][1:])
-    summaries = {}
-    for predictor, missed in errors.items():
-        # a log with gaps is several pieces of one name
-        by_name: dict[str, list[np.ndarray]] = {}
-        for (log, _), error in zip(parts, missed, strict=True):
-            by_name.setdefault(log.name, []).append(np.square(error))
-        trajectories = {log: float(np.sqrt(np.concatenate(x).mean())) for log, x in by_name.items()}
-        joints = np.sqrt(np.square(np.concatenate(missed)).mean(axis=0))
-        mean = float(np.mean(list(trajectories.values())))
-        summaries[predictor] = ReplayErrors(trajectories, mean, tuple(joints.tolist()))
+        errors[predictor] = list(map(np.subtract, follower.positions(parts, q, qd), measured))
+    names = [log.name for log, _ in parts]
+    summaries = {predictor: _summary(names, missed) for predictor, missed in errors.items()}
     return Replay(name, summaries), errors[MODEL]
+
+
+def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
+    """Return the errors (K, n) [rad, m] of parts of logs, pooled by the names of the logs."""
+    by_name: dict[str, list[np.ndarray]] = {}
+    # a log with gaps is several pieces of one name
+    for name, error in zip(names, errors, strict=True):
+        by_name.setdefault(name, []).append(np.square(error))
+    trajectories = {name: float(np.sqrt(np.concatenate(x).mean())) for name, x in by_name.items()}
+    joints = np.sqrt(np.square(np.concatenate(errors)).mean(axis=0))
+    return ReplayErrors(trajectories, float(np.mean(list(trajectories.values()))), tuple(joints.tolist()))

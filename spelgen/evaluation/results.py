@@ -1,21 +1,65 @@
-"""The results of an evaluation, shown in terminals and notebooks."""
+"""The results of an evaluation: the content of evaluation.json, shown in terminals and notebooks."""
 
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from html import escape
 
-from spelgen.baselines.names import MODEL
-from spelgen.evaluation.measurements import Measurements
+from pydantic import TypeAdapter
+
+from spelgen.errors import Diagnostic
+from spelgen.evaluation.horizons import Horizon
+from spelgen.evaluation.plain import record
+from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.tables import result_tables
-from spelgen.labels import counted
+from spelgen.evaluation.torque import TorqueErrors
+from spelgen.evaluation.traces import Traces
+from spelgen.evaluation.verdict import Verdict
+from spelgen.labels import MODEL, counted
 from spelgen.listing import WIDTH
+
+# It changes if evaluation.json of an earlier version cannot be read any more.
+SCHEMA = 11
 
 
 @dataclass(frozen=True, repr=False)
-class Results(Measurements):
-    """Measurements of `evaluate`, shown as an assessment and tables, in a terminal as in a notebook."""
+class Results:
+    """All measurements of `evaluate`, shown as an assessment and tables; `to_dict` is evaluation.json.
+
+    parameters: number of trained parameters. traces: curves behind the figures, of predictions over the longest
+    horizon. cutoff: of the filter of the test logs [Hz], None without one. substeps: integrator steps of the model per
+    sample interval. torque: errors by predictor, empty if the logs are too sparse for accelerations. torque_steps: see
+    `coarse_torques`. replays: of the commands of an arm under position servos. mass_errors: relative errors of M by
+    predictor, if the truth is known. assessment: of the model, with the coverage of its training logs; None before
+    the assessment.
+    """
+
+    robot: str
+    joints: tuple[str, ...]
+    joint_types: tuple[str, ...]
+    trajectories: tuple[str, ...]
+    parameters: int
+    diagnostics: tuple[Diagnostic, ...]
+    traces: Traces
+    cutoff: float | None = None
+    substeps: int = 1
+    horizons: tuple[Horizon, ...] = ()
+    torque: dict[str, TorqueErrors] = field(default_factory=dict)
+    torque_steps: dict[str, float] = field(default_factory=dict)
+    replays: tuple[Replay, ...] = ()
+    mass_errors: dict[str, float] = field(default_factory=dict)
+    assessment: Verdict | None = None
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON form, versioned by `schema`."""
+        return {"schema": SCHEMA} | record(self)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, object]) -> Results:
+        """Return the results of a `to_dict`. Raises ValueError for other content."""
+        return TypeAdapter(cls).validate_python(content)
 
     def text(self) -> str:
         """Return the assessment, then every table, in which the best of each row is starred."""
@@ -23,21 +67,21 @@ class Results(Measurements):
         paragraphs += [table.text() for table in result_tables(self)]
         if self.assessment is not None:
             words = f"{self.assessment.sentence} {self.assessment.because}"
+            # a hyphen of a name is no place for a line break: the name could not be searched for
             paragraphs.insert(0, textwrap.fill(words, WIDTH, break_on_hyphens=False))
         return "\n\n".join(paragraphs)
 
     def __repr__(self) -> str:
         heading = self._heading()
-        if self.horizons:
-            last = self.horizons[-1]
+        for last in self.horizons[-1:]:
             error = last.errors[MODEL].mean_relative_rms
             if error is not None:
                 heading += f", relative RMS {error:.3g} after {last.name}"
         return f"<Results of {heading}>"
 
     def _repr_html_(self) -> str:
-        tables = [table.listing().html() for table in result_tables(self)]
         sentence = "" if self.assessment is None else self.assessment.sentence
+        tables = [table.listing().html() for table in result_tables(self)]
         return "".join([f"<p>{escape(sentence)}</p>", *tables])
 
     def _heading(self) -> str:

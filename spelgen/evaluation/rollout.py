@@ -1,14 +1,17 @@
-"""Forward simulation of a model, and the invariants that it shows: M is positive definite, energy does not rise."""
+"""Forward simulation of a model, its invariants, and the error of M of simulated arms whose truth is known."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.dynamics.protocol import RigidDynamics, integrable
 from spelgen.emission.assemble import ArmModel
 from spelgen.evaluation.tuning import TUNING
@@ -74,6 +77,7 @@ def invariants(model: ArmModel, windows: Windows, low: Tensor, high: Tensor) -> 
 
 def _least_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
     """Return the smallest eigenvalue of M over random q in [low, high] (n,), divided by the mean eigenvalue."""
+    # a fixed seed: the same model has the same figure
     generator = torch.Generator().manual_seed(0)
     count = TUNING.sampled_positions
     q = low + (high - low) * torch.rand(count, len(low), dtype=low.dtype, generator=generator)
@@ -87,8 +91,60 @@ def _energy_rise(model: ArmModel, windows: Windows) -> float | None:
     q, qd = windows.q[: TUNING.started_states, 0], windows.qd[: TUNING.started_states, 0]
     no_input = q.new_zeros(len(q), TUNING.free_steps, model.n)
     q, qd = rollout(model, q, qd, no_input, 1e-3)
+    # the initial state is measured and may have any energy; later states are the model's own
     q, qd = q[:, 1:], qd[:, 1:]
     energy = model.hamiltonian(q, model.momentum(q, qd))
     kinetic = (energy - model.potential_energy(q)).max().item()
     rise = energy.diff(dim=1).max().item()
     return rise / kinetic if kinetic > 0 and math.isfinite(rise / kinetic) else None
+
+
+def true_mass(robot: Arm | Path | str, q: Tensor, joints: Sequence[str] | None = None) -> Tensor:
+    """Return M (T, n, n) [kg m^2, kg m, kg] of a URDF and its settings by Pinocchio, armature included.
+
+    Args:
+        robot: The true arm, or the path of its URDF.
+        q: Positions (T, n) [rad; m].
+        joints: Names of the n joints in the order of q; None: from the settings, or the longest chain.
+    """
+    from spelgen.dynamics.pinocchio_arm import arm_dynamics
+
+    path = robot.robot.path if isinstance(robot, Arm) else robot
+    loaded = load_arm(path, joints)
+    mass: Tensor = arm_dynamics(loaded.chain, loaded.settings).mass_matrix(q)
+    return mass
+
+
+def mass_error(learned: Tensor, true: Tensor) -> float:
+    """Return the relative error of M, without unit: root mean square of the entries of L^-1 (learned - true) L^-T.
+
+    L L^T is the mean of the true M, so each entry counts in the units of its own joints.
+
+    Args:
+        learned: M (T, n, n) of a model.
+        true: M (T, n, n) of the arm.
+    """
+    # the mean of the true M: with the M of each position, an error near a singular M would dominate
+    factor = torch.linalg.cholesky(true.mean(dim=0))
+    half = torch.linalg.solve_triangular(factor, learned - true, upper=False)
+    relative = torch.linalg.solve_triangular(factor, half.mT, upper=False)
+    return float(relative.square().mean().sqrt())
+
+
+def mass_errors(
+    dynamics: Mapping[str, RigidDynamics], truth: Arm | Path | str, joints: Sequence[str], q: Tensor
+) -> dict[str, float]:
+    """Return the relative error of M by predictor, at evenly spread positions.
+
+    Args:
+        dynamics: The model and the baselines, by name.
+        truth: The true arm, or the path of its URDF.
+        joints: Names of the n joints.
+        q: Positions (T, n) [rad; m] of the test logs.
+    """
+    # M changes slowly along a trajectory: more positions give the same error
+    q = q[:: max(1, len(q) // TUNING.mass_positions)]
+    true = true_mass(truth, q, joints)
+    with torch.no_grad():
+        learned = {name: torch.as_tensor(x.mass_matrix(q)) for name, x in dynamics.items()}
+    return {name: mass_error(mass, true) for name, mass in learned.items()}

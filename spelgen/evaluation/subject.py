@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import LinearServoRecord, arm_of_model
+from spelgen.baselines.registry import FittedBaselines, LinearServoRecord, arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.evaluation.results import Results
@@ -58,29 +58,32 @@ class Subject:
     @property
     def trained_on(self) -> frozenset[str]:
         """Names of its training and validation logs."""
-        if self.fit is None:
-            return frozenset()
-        return frozenset([*self.fit.record.training, *self.fit.record.validation])
+        names = [] if self.fit is None else [*self.fit.record.training, *self.fit.record.validation]
+        return frozenset(names)
+
+    @property
+    def baselines(self) -> FittedBaselines:
+        """The baselines that were fitted with it; {} if there are none."""
+        return {} if self.fit is None else self.fit.baselines
 
     @property
     def fitted_arm(self) -> Arm | None:
         """The arm that the baselines of its fit were fitted for. Raises UrdfError, ArmError or SettingsError."""
-        if self.fit is None or self.fit.urdf is None or not self.fit.baselines:
-            return None
-        return arm_of_model(self.model, self.fit.urdf)
+        urdf = None if self.fit is None else self.fit.urdf
+        return arm_of_model(self.model, urdf) if urdf is not None and self.baselines else None
 
     def assessed(self, results: Results) -> Results:
         """Return the results of its evaluation with their assessment."""
-        baselines = {} if self.fit is None else self.fit.baselines
         limits, independent = [], []
         if self.spec is not None:
             depends = {*self.spec.potential, *(k for entry in self.spec.entries for k in entry[3])}
             for k, joint in enumerate(self.spec.joints):
+                # a single limit states no range
                 bound = None if joint.lower is None or joint.upper is None else (joint.lower, joint.upper)
                 limits.append(bound)
                 if k not in depends:
                     independent.append(joint.name)
-        return replace(results, assessment=verdict(results, baselines, limits, independent))
+        return replace(results, assessment=verdict(results, self.baselines, limits, independent))
 
     @property
     def linear_servos(self) -> LinearServoRecord | None:
@@ -98,10 +101,8 @@ def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = 
     urdf = None if fit is None else fit.urdf
     if arm is not None:
         urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
-    weights = next(model.parameters(), None)
-    if weights is not None and (
-        weights.dtype != torch.float64 or not weights.is_cpu
-    ):  # logs are float64 on the CPU
+    # logs are float64 on the CPU
+    if any(weights.dtype != torch.float64 or not weights.is_cpu for weights in model.parameters()):
         model = copy.deepcopy(model).double().cpu()
     return Subject(model, model.joint_names, urdf, fit)
 
@@ -115,6 +116,7 @@ def read_test_logs(
     """
     run = RunFolder(folder)
     record, spec = run.read_record(), run.read_spec()
+    # test logs usually come from the same logger as the training logs
     if mapping is None:
         mapping = record.mapping
     elif isinstance(mapping, str | Path) and run.urdf.exists():  # it may contain all joints of the URDF

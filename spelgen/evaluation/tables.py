@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
 
-from spelgen.baselines.names import LEAST_SQUARES, MODEL, URDF, observed
-from spelgen.labels import UNITS, Units, share, thousandths
+from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, URDF, observed, share, thousandths
 from spelgen.listing import Listing, number
 
 if TYPE_CHECKING:  # `spelgen --help` lists the figures without loading torch
-    from spelgen.evaluation.measurements import Measurements
+    from spelgen.evaluation.results import Results
 
 OBSERVER = (
     "+ observer: with the constant disturbance that a momentum observer estimates from the 0.1 s before; "
@@ -22,12 +21,8 @@ OBSERVER = (
 
 Numbers = Mapping[str, float | None]
 """Numbers per column; None: unknown."""
-JointErrors = Sequence[float | None]
-Errors = TypeVar("Errors")
-Value = TypeVar("Value")
 MASS_TITLE = "Error of the mass matrix, relative to the true one (at positions of the test logs)"
 CSV_HEAD = ("table", "row", "predictor", "value")
-PARTS = ("variance", "motion")
 LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
 """The figures that `spelgen evaluate --limit` takes."""
 
@@ -64,10 +59,7 @@ class Table:
     @property
     def columns(self) -> list[str]:
         """Return the names of all columns, in the order of the rows."""
-        names: dict[str, None] = {}
-        for row in self.rows:
-            names |= dict.fromkeys(row.values)
-        return list(names)
+        return list(dict.fromkeys(name for row in self.rows for name in row.values))
 
     def text(self) -> str:
         """Return the table for a terminal; the best of each row is starred."""
@@ -77,12 +69,11 @@ class Table:
         """Return the table with numbers as text."""
         lines, columns = [], self.columns
         for row in self.rows:
-            texts, best = [row.label], row.best
-            for name in columns:
-                texts.append(f"{row.text(name)} {'*' if name in best else ' '}")
-            lines.append(tuple(texts))
-        head = ("", *(f"{name}  " for name in columns))
-        return Listing(self.title, head, tuple(lines), self.note)
+            # a blank in place of the star keeps the digits of a column below one another
+            stars = ["*" if name in row.best else " " for name in columns]
+            texts = [f"{row.text(name)} {star}" for name, star in zip(columns, stars, strict=True)]
+            lines.append((row.label, *texts))
+        return Listing(self.title, ("", *(f"{name}  " for name in columns)), tuple(lines), self.note)
 
 
 def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
@@ -90,7 +81,7 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
     return Table(title, tuple(map(Row, rows, rows.values())), note)
 
 
-def result_tables(results: Measurements) -> list[Table]:
+def result_tables(results: Results) -> list[Table]:
     """Return the tables of an evaluation: replays, errors per horizon and per joint, torques."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     if results.mass_errors:
@@ -100,127 +91,113 @@ def result_tables(results: Measurements) -> list[Table]:
 
 def _without_empty_baselines(full: Table) -> Table:
     """Return the table without columns of baselines that have no number."""
-    columns = {MODEL}
+    # the column of the model remains: that it has no number is a result
+    columns, rows = {MODEL}, []
     for row in full.rows:
         columns |= {name for name, value in row.values.items() if value is not None}
-    rows = []
     for row in full.rows:
         rows.append(replace(row, values={name: row.values[name] for name in row.values if name in columns}))
     return replace(full, rows=tuple(rows))
 
 
-def joined(runs: Mapping[str, Measurements]) -> list[Table]:
+def joined(runs: Mapping[str, Results]) -> list[Table]:
     """Return the tables and rows that all runs have, with a column for the model of each run."""
-    rows: dict[str, dict[str, dict[str, float | None]]] = {}
+    tables: dict[str, dict[str, dict[str, float | None]]] = {}
     for run, results in runs.items():
         for one_table in result_tables(results):
-            by_label = rows.setdefault(one_table.title, {})
+            rows = tables.setdefault(one_table.title, {})
             for row in one_table.rows:
-                by_label.setdefault(row.label, {})[run] = row.values[MODEL]
-    tables = []
-    for title, by_label in rows.items():
-        common = {label: values for label, values in by_label.items() if len(values) == len(runs)}
-        if common:
-            tables.append(table(title, common))
-    return tables
+                rows.setdefault(row.label, {})[run] = row.values[MODEL]
+    common = []
+    for title, rows in tables.items():
+        # a number that one run does not have cannot be compared
+        of_all = {label: values for label, values in rows.items() if len(values) == len(runs)}
+        if of_all:
+            common.append(table(title, of_all))
+    return common
 
 
-def csv_text(results: Measurements) -> str:
+def csv_text(results: Results) -> str:
     """Return the numbers of all tables as CSV, a line for each; unknown values are empty."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(CSV_HEAD)
     for one_table in result_tables(results):
         for row in one_table.rows:
-            for predictor, value in row.values.items():
-                writer.writerow((one_table.title, row.label, predictor, value))
+            writer.writerows((one_table.title, row.label, *value) for value in row.values.items())
     return file.getvalue()
 
 
-def summary(results: Measurements) -> Listing | None:
+def summary(results: Results) -> Listing | None:
     """Return the figures of URDF, least squares and model in one small table; None without torques."""
-    rows: dict[str, Numbers] = {"torque that is unexplained": _values(results.torque, lambda x: x.mean_nmse)}
-    if results.mass_errors:
-        rows["error of M(q)"] = results.mass_errors
-    names = [name for name in (URDF, LEAST_SQUARES, MODEL) if name in results.torque]
-    if MODEL not in names:
+    if MODEL not in results.torque:
         return None
+    errors = {name: x.mean_nmse for name, x in results.torque.items()}
+    rows: dict[str, Numbers] = {"torque that is unexplained": errors, "error of M(q)": results.mass_errors}
+    # in the order of increasing information, which shows the improvement of each step
+    names = [name for name in (URDF, LEAST_SQUARES, MODEL) if name in errors]
     lines = []
     for label, values in rows.items():
         numbers = [values.get(name) for name in names]
-        lines.append((label, *("-" if value is None else share(value) for value in numbers)))
+        # M has no row if the true one is unknown
+        if values:
+            lines.append((label, *("-" if value is None else share(value) for value in numbers)))
     return Listing(f"{results.robot} on the test logs", ("", *names), tuple(lines))
 
 
-def _values(errors: Mapping[str, Errors], value: Callable[[Errors], Value]) -> dict[str, Value]:
-    """Return a value of the errors of each predictor."""
-    return {predictor: value(of_predictor) for predictor, of_predictor in errors.items()}
-
-
-def _horizon_tables(results: Measurements) -> list[Table]:
+def _horizon_tables(results: Results) -> list[Table]:
+    """Return the errors per horizon, and the errors per joint of the last one."""
     if not results.horizons:
         return []
-    relative, tips = {}, {}
+    relative, tips, note = {}, {}, ""
     for horizon in results.horizons:
         head = horizon.name
         if not head.endswith(" s"):
             head = f"{head} ({horizon.seconds:.3g} s)"
-        relative[head] = _values(horizon.errors, lambda x: x.mean_relative_rms)
-        tips[head] = _values(horizon.errors, lambda x: x.tip_mm)
-    errors = results.horizons[-1].errors
-    note = OBSERVER if any(observed(MODEL) in horizon.errors for horizon in results.horizons) else ""
-    tables = [
-        table("Error relative to the motion (0: none, 1: as if the arm had stood still)", relative, note),
-        table("Error of the tip's position [mm]", tips),
-        _by_joint(
-            results, f"Position error{{}} after {head}", lambda x: x.position, _values(errors, lambda x: x.q)
-        ),
-        _by_joint(
-            results, f"Velocity error{{}} after {head}", lambda x: x.velocity, _values(errors, lambda x: x.qd)
-        ),
-    ]
+        relative[head] = {name: errors.mean_relative_rms for name, errors in horizon.errors.items()}
+        tips[head] = {name: errors.tip_mm for name, errors in horizon.errors.items()}
+        # short logs have no observer, and need no explanation of it
+        if observed(MODEL) in horizon.errors:
+            note = OBSERVER
+    q = {name: errors.q for name, errors in horizon.errors.items()}
+    qd = {name: errors.qd for name, errors in horizon.errors.items()}
+    title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
+    tables = [table(title, relative, note)]
     # no tip is known without a URDF
-    if all(value is None for row in tips.values() for value in row.values()):
-        del tables[1]
-    return tables
+    if any(value is not None for row in tips.values() for value in row.values()):
+        tables.append(table("Error of the tip's position [mm]", tips))
+    tables.append(_by_joint(results, f"Position error{{}} after {head}", "position", q))
+    return [*tables, _by_joint(results, f"Velocity error{{}} after {head}", "velocity", qd)]
 
 
-def _torque_tables(results: Measurements) -> list[Table]:
-    torque = results.torque
-    if not torque:
+def _torque_tables(results: Results) -> list[Table]:
+    """Return the nMSE of the torques, and their errors per joint."""
+    if not results.torque:
         return []
     rows = {
-        "mean of joints": _values(torque, lambda x: x.mean_nmse),
-        "with pauses": _values(torque, lambda x: x.nmse_with_pauses),
-        "worst joint": _values(torque, lambda x: x.worst_nmse),
+        "mean of joints": {name: errors.mean_nmse for name, errors in results.torque.items()},
+        "with pauses": {name: errors.nmse_with_pauses for name, errors in results.torque.items()},
+        "worst joint": {name: errors.worst_nmse for name, errors in results.torque.items()},
     }
+    rmse = {name: errors.rmse for name, errors in results.torque.items()}
     note = ""
     if results.torque_steps:
         note = f"logged in steps of their own size: {', '.join(results.torque_steps)}"
-    return [
-        table("Torque error of the inverse dynamics, nMSE over all test samples", rows),
-        _by_joint(
-            results,
-            "Torque error by joint, RMSE{}",
-            lambda x: x.torque,
-            _values(torque, lambda x: x.rmse),
-            note,
-        ),
-    ]
+    title = "Torque error of the inverse dynamics, nMSE over all test samples"
+    by_joint = _by_joint(results, "Torque error by joint, RMSE{}", "torque", rmse, note)
+    return [table(title, rows), by_joint]
 
 
-def _replay_tables(results: Measurements) -> list[Table]:
+def _replay_tables(results: Results) -> list[Table]:
     """Return the tables of replayed commands: per trajectory and per joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
         rows: dict[str, Numbers] = {}
         for log in replay.errors[MODEL].trajectories:
             rows[log] = {name: 1000 * errors.trajectories[log] for name, errors in replay.errors.items()}
-        means, joints = {}, {}
-        for name, errors in replay.errors.items():
-            means[name] = 1000 * errors.mean
-            joints[name] = [1000 * rms for rms in errors.joints]
-        rows["mean of all"] = means
+        # last, as a sum below its terms
+        rows["mean of all"] = {name: 1000 * errors.mean for name, errors in replay.errors.items()}
+        joints = {name: [1000 * rms for rms in errors.joints] for name, errors in replay.errors.items()}
         title = f"Commands replayed, {replay.name}: RMS"
         tables.append(table(f"{title} of positions over all joints [{unit}]", rows))
         title = f"{title} by joint, over all trajectories [{unit}]"
@@ -229,26 +206,21 @@ def _replay_tables(results: Measurements) -> list[Table]:
 
 
 def _by_joint(
-    results: Measurements,
-    title: str,
-    unit_of: Callable[[Units], str],
-    errors: Mapping[str, JointErrors],
-    note: str = "",
+    results: Results, title: str, quantity: str, errors: Mapping[str, Sequence[float | None]], note: str = ""
 ) -> Table:
     """Return a table with a row for each joint; the unit is in the title if all joints have the same."""
-    units = [unit_of(UNITS[joint_type]) for joint_type in results.joint_types]
-    if len(set(units)) == 1:
-        return table(title.format(f" [{units[0]}]"), _joint_rows(results.joints, errors), note)
-    labels = [f"{joint} [{unit}]" for joint, unit in zip(results.joints, units, strict=True)]
-    return table(title.format(""), _joint_rows(labels, errors), note)
+    units = [asdict(UNITS[joint_type])[quantity] for joint_type in results.joint_types]
+    # a unit per row only if needed: it makes the first column wide
+    labels, common = results.joints, f" [{units[0]}]"
+    if len(set(units)) > 1:
+        pairs = zip(results.joints, units, strict=True)
+        labels, common = tuple(f"{joint} [{unit}]" for joint, unit in pairs), ""
+    return table(title.format(common), _joint_rows(labels, errors), note)
 
 
-def _joint_rows(labels: Sequence[str], errors: Mapping[str, JointErrors]) -> dict[str, Numbers]:
+def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | None]]) -> dict[str, Numbers]:
     """Return the errors of all predictors per joint."""
-    rows: dict[str, Numbers] = {}
-    for k, label in enumerate(labels):
-        rows[label] = {name: values[k] for name, values in errors.items()}
-    return rows
+    return {label: {name: values[k] for name, values in errors.items()} for k, label in enumerate(labels)}
 
 
 @dataclass(frozen=True)
@@ -262,33 +234,29 @@ class Figure:
 
     def text(self) -> str:
         """Return the value with its unit."""
-        if self.unit in PARTS:
+        if self.unit in ("variance", "motion"):
             return share(self.value, self.unit)
         return f"{number(self.value)} {self.unit}"
 
 
-def figures(results: Measurements) -> list[Figure]:
+def figures(results: Results) -> list[Figure]:
     """Return the known figures of the model: nMSE of torques, errors of the longest rollout and of replays."""
     candidates: list[tuple[str, str, str, float | None]] = []
     if MODEL in results.torque:
         torque = results.torque[MODEL]
-        candidates += [
-            ("torque.nmse", "nMSE of torques", "variance", torque.mean_nmse),
-            ("joint.nmse", "nMSE of the worst joint's torque", "variance", torque.worst_nmse),
-        ]
+        candidates.append(("torque.nmse", "nMSE of torques", "variance", torque.mean_nmse))
+        candidates.append(("joint.nmse", "nMSE of the worst joint's torque", "variance", torque.worst_nmse))
     # the longest horizon is the hardest, and the relevant one for simulation
     for horizon in results.horizons[-1:]:
-        errors = horizon.errors[MODEL]
-        candidates += [
-            ("rollout.rms", f"rollout error after {horizon.name}", "motion", errors.mean_relative_rms),
-            ("tip.mm", f"tip error after {horizon.name}", "mm", errors.tip_mm),
-        ]
+        errors, after = horizon.errors[MODEL], f"after {horizon.name}"
+        candidates.append(("rollout.rms", f"rollout error {after}", "motion", errors.mean_relative_rms))
+        candidates.append(("tip.mm", f"tip error {after}", "mm", errors.tip_mm))
     for replay in results.replays:
         label = f"position error, commands replayed, {replay.name}"
         mean = 1000 * replay.errors[MODEL].mean
         candidates.append(("replay", label, thousandths(results.joint_types), mean))
-    figures = []
+    named_figures = []
     for name, label, unit, value in candidates:
         if value is not None:
-            figures.append(Figure(name, label, unit, value))
-    return figures
+            named_figures.append(Figure(name, label, unit, value))
+    return named_figures

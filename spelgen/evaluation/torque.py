@@ -14,13 +14,9 @@ from spelgen.dynamics.protocol import known_past
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.plain import finite
 from spelgen.identification.tuning import TUNING as LEAST_SQUARES
-from spelgen.log_checks.statistics import quantisation_step
-from spelgen.log_checks.tuning import TUNING as LOG_CHECKS
+from spelgen.log_checks.statistics import has_few_levels, quantisation_step
 from spelgen.logs.dynamics_samples import DynamicsSamples, is_moving
 from spelgen.logs.trajectory import Trajectory, joined_column
-
-LEVELS = LOG_CHECKS.levels
-NEGLIGIBLE = LEAST_SQUARES.negligible
 
 
 @dataclass(frozen=True)
@@ -47,14 +43,13 @@ class TorqueErrors:
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
     """Return the torque errors on these samples; pauses count in `nmse_with_pauses` only."""
-    residuals, torques, moving, by_trajectory = [], [], [], {}
+    errors_by_log, by_trajectory = [], {}
     for sample in samples:
         residual, rows = predicted_torques(dynamics, sample) - sample.tau, is_moving(sample.qd)
         by_trajectory[sample.name] = mean_nmse(residual[rows], sample.tau[rows])
-        residuals.append(residual)
-        torques.append(sample.tau)
-        moving.append(rows)
-    residual, torque, rows = map(np.concatenate, (residuals, torques, moving))
+        errors_by_log.append((residual, sample.tau, rows))
+    residual, torque, rows = map(np.concatenate, zip(*errors_by_log, strict=True))
+    # pooled over samples: a mean over logs would give a log of one second the weight of one of an hour
     by_joint = _nmse(residual[rows], torque[rows])
     return TorqueErrors(
         nmse=by_trajectory,
@@ -67,17 +62,16 @@ def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueEr
 
 def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
     """Return the torques of the inverse dynamics on these samples, (T, n) [Nm, N]."""
-    q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
+    motion = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
-        torques: np.ndarray = dynamics.inverse_dynamics(q, qd, qdd, *friction_past(dynamics, samples)).numpy()
+        torques: np.ndarray = dynamics.inverse_dynamics(*motion, *friction_past(dynamics, samples)).numpy()
     return torques
 
 
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
     """Return z, (T, n, K), and the direction, (T, n), of these samples as arguments, see `known_past`."""
-    z = None if samples.z is None else torch.from_numpy(samples.z)
-    direction = None if samples.direction is None else torch.from_numpy(samples.direction)
-    return known_past(dynamics, z, direction)
+    past = (None if x is None else torch.from_numpy(x) for x in (samples.z, samples.direction))
+    return known_past(dynamics, *past)
 
 
 def mean_nmse(residual: np.ndarray, torque: np.ndarray) -> float | None:
@@ -92,7 +86,7 @@ def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """Return the nMSE of each joint, (T, n) -> (n,); NaN of a constant torque."""
     deviation = torque.std(axis=0)
     largest = np.abs(torque).max(axis=0, initial=0.0)
-    varies = deviation > NEGLIGIBLE * largest  # otherwise constant up to rounding
+    varies = deviation > LEAST_SQUARES.negligible * largest  # otherwise constant up to rounding
     # a prediction that is not finite must not be confused with a constant torque
     squares = np.nan_to_num(np.square(residual).mean(axis=0), nan=np.inf, posinf=np.inf)
     nmse: np.ndarray = np.full_like(squares, np.nan)
@@ -115,7 +109,7 @@ def coarse_torques(
         # infinite for a log that is not quantised; the median: most of the logs are quantised
         step = float(np.median(np.nan_to_num([quantisation_step(log.tau[:, k]) for log in logs], nan=np.inf)))
         torque = joined_column(logs, "tau")[:, k]
-        if np.isfinite(step) and np.ptp(torque) < LEVELS * step:
+        if np.isfinite(step) and has_few_levels(step, float(np.ptp(torque))):
             steps[joint] = step
             message = (
                 f"the torque of {joint} is logged in steps of {step:.3g}, as large as the torque itself: "

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.baselines.names import MODEL, is_drawn
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.drawn_motions import (
     DrawnMotion,
@@ -30,6 +29,7 @@ from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import PositionErrors
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
+from spelgen.labels import MODEL, is_drawn
 from spelgen.logs.trajectory import Trajectory, coverage, joined_column
 
 
@@ -141,6 +141,7 @@ def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosi
     for name, (q, _) in predictions.states.items():
         if is_drawn(name):
             relative[name] = _quantiles(errors[name][:, times])
+            # the tip needs a URDF, which a model from Python may not have
             if tip is not None:
                 distance = tip(q[:, times]) - tip(windows.q[:, 1 + times])
                 tips[name] = _quantiles(1000 * distance.norm(dim=-1))
@@ -172,6 +173,7 @@ def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> M
     for name, predictor in dynamics.items():
         with torch.no_grad():
             mass = torch.as_tensor(predictor.mass_matrix(q)).numpy()
+        # a curve with infinite values would stretch the axis of all others
         if np.isfinite(mass).all():
             curves[name] = MassCurves(mass[:, row, column].T)
     return MassTrace(motion.trajectory, motion.t, curves)

@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.errors import shortened
 from spelgen.evaluation.horizons import StateErrors
-from spelgen.evaluation.measurements import Measurements, Verdict
 from spelgen.evaluation.tuning import TUNING
-from spelgen.labels import listed, share, thousandths
+from spelgen.labels import CONSTANT_VELOCITY, MODEL, listed, observed, share, thousandths
 from spelgen.listing import number
 from spelgen.logs.checks import ELASTIC
+
+if TYPE_CHECKING:
+    from spelgen.evaluation.results import Results
 
 SEEN = "tested-on-training-data"
 STANDSTILL = " near standstill"
@@ -32,6 +32,14 @@ Limits = Sequence[tuple[float, float] | None]
 """Lower and upper position of each joint [rad, m]; None without limits."""
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """An assessment. sentence: uses, failures, motions to record. because: the figures behind it."""
+
+    sentence: str
+    because: str
+
+
 @dataclass
 class _Uses:
     """The uses that a model is good enough for, the uses that it is not, and the figures that prove both."""
@@ -42,7 +50,7 @@ class _Uses:
 
 
 def verdict(
-    results: Measurements,
+    results: Results,
     identified: Mapping[str, Any] | None = None,
     limits: Limits = (),
     independent: Collection[str] = (),
@@ -52,10 +60,12 @@ def verdict(
     identified: content of least_squares.json, for the coverage of the training logs. limits: of the joints.
     independent: names of joints on whose position the dynamics do not depend, as of a vertical first axis.
     """
+    # each assessment adds the uses that its figures prove
     uses = _Uses()
     _assess_torques(results, uses)
     _assess_motion(results, uses)
     _assess_replays(results, uses)
+    # such as an evaluation with --quick on logs without accelerations
     if not uses.proofs:
         return Verdict("No verdict: no horizon and no torque was evaluated.", "")
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
@@ -68,11 +78,8 @@ def verdict(
         sentence += f", not for {listed(uses.bad)}"
     joint, speed, proof = _worst_joint(results)
     recommendations = _recommendations(results, identified or {}, limits, independent, joint, speed)
-    details = []
-    if joint:
-        details.append(f"worst at {joint}{speed}")
-    if recommendations:
-        details.append(f"next, record {next(iter(recommendations))}")
+    details = [f"worst at {joint}{speed}"] if joint else []
+    details += [f"next, record {motion}" for motion in list(recommendations)[:1]]
     because = [] if elastic is None else [f"{elastic.where}: {elastic.message}."]
     for detail in details:
         # longer details follow the first sentence
@@ -85,7 +92,7 @@ def verdict(
     return Verdict(f"{sentence}.", " ".join(filter(None, because)))
 
 
-def _assess_torques(results: Measurements, uses: _Uses) -> None:
+def _assess_torques(results: Results, uses: _Uses) -> None:
     """Assess the torques by the worst joint, since a mean would hide it."""
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
@@ -93,11 +100,10 @@ def _assess_torques(results: Measurements, uses: _Uses) -> None:
     joint, unexplained = _worst_torque(results)
     if not joint:
         unexplained = torque.mean_nmse
-    for threshold, good, bad in TORQUE_USES:
-        if 1 - unexplained >= threshold:  # coefficient of determination
-            uses.good += good
-            uses.bad += bad
-            break
+    # 1 - nMSE is the coefficient of determination
+    _, good, bad = next(row for row in TORQUE_USES if 1 - unexplained >= row[0])
+    uses.good += good
+    uses.bad += bad
     mean, worst = (share(max(0.0, 1 - nmse)) for nmse in (torque.mean_nmse, unexplained))
     proof = f"explains {mean} of the variance of the torques"
     if worst != mean:
@@ -105,17 +111,18 @@ def _assess_torques(results: Measurements, uses: _Uses) -> None:
     uses.proofs.append(proof)
 
 
-def _worst_torque(results: Measurements) -> tuple[str, float]:
+def _worst_torque(results: Results) -> tuple[str, float]:
     """Return the joint of the largest nMSE of the model, and this nMSE; joints logged in coarse steps are omitted."""
+    torque = results.torque.get(MODEL)
+    pairs = [] if torque is None else zip(results.joints, torque.joint_nmse, strict=False)
     worst = ("", -math.inf)
-    if MODEL in results.torque:
-        for joint, error in zip(results.joints, results.torque[MODEL].joint_nmse, strict=False):
-            if error is not None and joint not in results.torque_steps:
-                worst = max(worst, (joint, error), key=itemgetter(1))
+    for joint, error in pairs:
+        if error is not None and error > worst[1] and joint not in results.torque_steps:
+            worst = joint, error
     return worst
 
 
-def _assess_motion(results: Measurements, uses: _Uses) -> None:
+def _assess_motion(results: Results, uses: _Uses) -> None:
     # a long horizon may diverge while a shorter one does not
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
     if results.horizons and not finite:
@@ -123,14 +130,13 @@ def _assess_motion(results: Measurements, uses: _Uses) -> None:
         uses.proofs.append("predicts no finite motion")
     for last in finite[-1:]:
         error = _relative(last.errors[MODEL])
-        if error <= TUNING.close_prediction:
-            uses.good.append(f"simulation {last.name} ahead")
-        elif error <= TUNING.rough_prediction:
-            uses.good.append(f"rough simulation {last.name} ahead")
-        else:
-            uses.bad.append(f"simulation {last.name} ahead")
+        simulation = f"simulation {last.name} ahead"
+        if error > TUNING.rough_prediction:
+            uses.bad.append(simulation)
             if _relative(last.errors.get(observed(MODEL))) <= TUNING.rough_prediction:
                 uses.good.append(f"prediction {last.name} ahead with a momentum observer")
+        else:
+            uses.good.append(simulation if error <= TUNING.close_prediction else f"rough {simulation}")
         proof = f"is off by {share(error, 'the motion')} after {last.name}"
         tip = last.errors[MODEL].tip_mm
         if tip is not None:
@@ -138,26 +144,23 @@ def _assess_motion(results: Measurements, uses: _Uses) -> None:
         uses.proofs.append(proof)
 
 
-def _assess_replays(results: Measurements, uses: _Uses) -> None:
+def _assess_replays(results: Results, uses: _Uses) -> None:
     # the first replay is of whole logs: over windows, drift is not visible
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
-        if error == min(errors.mean for errors in replay.errors.values()):
-            uses.good.append("simulation from commands")
-        else:
-            uses.bad.append("simulation from commands")
+        is_best = error == min(errors.mean for errors in replay.errors.values())
+        (uses.good if is_best else uses.bad).append("simulation from commands")
         distance = f"{1000 * error:.3g} {thousandths(results.joint_types)}"
         uses.proofs.append(f"misses {distance} of the positions that follow commands, {replay.name}")
 
 
 def _relative(errors: StateErrors | None) -> float:
     """Return the mean error divided by the motion; infinite if it is unknown."""
-    if errors is None or errors.mean_relative_rms is None:
-        return math.inf
-    return errors.mean_relative_rms
+    error = None if errors is None else errors.mean_relative_rms
+    return math.inf if error is None else error
 
 
-def _better_baselines(results: Measurements) -> list[str]:
+def _better_baselines(results: Results) -> list[str]:
     """Return sentences about the horizons at which a constant velocity, or another baseline, beats the model."""
     times: list[str] = []
     better: dict[str, list[str]] = {}
@@ -171,6 +174,7 @@ def _better_baselines(results: Measurements) -> list[str]:
         if errors[best] < model_error:
             better.setdefault(best, []).append(f"after {horizon.name}")
     torque = {name: x.mean_nmse for name, x in results.torque.items() if x.mean_nmse is not None}
+    # torques are compared without the observer, which does not estimate them
     best = min(torque, key=torque.__getitem__, default=MODEL)
     if MODEL in torque and best != MODEL:
         better.setdefault(best, []).append("in torque")
@@ -178,13 +182,11 @@ def _better_baselines(results: Measurements) -> list[str]:
     if times:
         ahead = f"A constant velocity predicts better {listed(times)} ahead"
         statements.append(f"{ahead}: there, use the model for torques only.")
-    if better:
-        reasons = [f"{name} is better {listed(occasions)}" for name, occasions in better.items()]
-        statements.append(f"But {listed(reasons)}.")
-    return statements
+    reasons = [f"{name} is better {listed(occasions)}" for name, occasions in better.items()]
+    return [*statements, f"But {listed(reasons)}."] if reasons else statements
 
 
-def _worst_joint(results: Measurements) -> tuple[str, str, str]:
+def _worst_joint(results: Results) -> tuple[str, str, str]:
     """Return the joint of the largest torque error, or of the largest motion error if only motion fails.
 
     Also returns the speed at which the torque error is larger, and a sentence about the joint.
@@ -202,7 +204,7 @@ def _worst_joint(results: Measurements) -> tuple[str, str, str]:
     return joint, speed, f"At {joint} the torque residual is {amount}."
 
 
-def _worst_motion(results: Measurements) -> tuple[str, float]:
+def _worst_motion(results: Results) -> tuple[str, float]:
     """Return the joint of the largest error in the longest rollouts, divided by its motion, and this error."""
     for last in results.horizons[-1:]:
         errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN
@@ -211,8 +213,8 @@ def _worst_motion(results: Measurements) -> tuple[str, float]:
     return "", math.inf
 
 
-def _slow_or_fast(results: Measurements, k: int) -> str:
-    """Return the speed of joint k at which its torque residual is larger; "" without a clear difference."""
+def _slow_or_fast(results: Results, k: int) -> str:
+    """Return the words for slow or for fast motion of joint k, whichever has the larger torque residual, or ""."""
     if not results.traces.torques:
         return ""
     residuals, speeds = [], []
@@ -231,7 +233,7 @@ def _slow_or_fast(results: Measurements, k: int) -> str:
 
 
 def _recommendations(
-    results: Measurements,
+    results: Results,
     identified: Mapping[str, Any],
     limits: Limits,
     independent: Collection[str],
@@ -242,6 +244,7 @@ def _recommendations(
     recommendations = {}
     trained = identified.get("coverage") or {}
     unseen = identified.get("unseen_directions")
+    # first: parameters that no log determines cannot be improved by any further fit
     if unseen:
         reason = f"The training logs do not excite {unseen} directions of the base parameters."
         recommendations["a richer motion (as spelgen excite proposes)"] = reason
@@ -258,6 +261,7 @@ def _recommendations(
             fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
     if fractions:
         joint = min(fractions, key=fractions.__getitem__)
+        # only the narrowest joint: one recommendation is followed, a list is not
         if fractions[joint] < TUNING.narrow_range:
             reason = f"{joint} has moved over {share(fractions[joint], 'its range')}."
             recommendations[f"wider motion of {joint}"] = reason
@@ -274,6 +278,7 @@ def _outside(
         for name, inner, outer in ranges:
             if quantity == "q" and name in independent:
                 continue
+            # a tenth: models extrapolate a little without harm
             room = 0.1 * (inner["high"] - inner["low"])
             if outer["low"] < inner["low"] - room or outer["high"] > inner["high"] + room:
                 exceeded.append(f"{word} of {name}")

@@ -13,9 +13,8 @@ from pydantic import Field
 from spelgen.arm.arm import Chain
 from spelgen.errors import ArmError, SpelgenError, collect
 from spelgen.excitation.tuning import TUNING
-from spelgen.settings.messages import validated
 from spelgen.settings.values import Group, Number, Positive
-from spelgen.settings.yaml_document import read_document
+from spelgen.settings.yaml_document import read_document, validated
 from spelgen.urdf.robot import UrdfJoint
 
 SPEEDS = {"revolute": TUNING.revolute_speed, "prismatic": TUNING.prismatic_speed}

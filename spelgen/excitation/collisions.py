@@ -15,10 +15,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from spelgen.arm.arm import Chain
+from spelgen.arm.arm import Chain, lump_links
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.arm.lump_links import lump_links
 from spelgen.arm.rational import rotation_from_rpy
 from spelgen.dynamics.pinocchio_arm import body_constraint, kinematic_model
 from spelgen.excitation.bounds import MotionBounds, Surroundings

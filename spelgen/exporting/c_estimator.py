@@ -1,4 +1,7 @@
-"""The estimator in C: a header and a source in addition to the model, with the noise levels of the run."""
+"""The estimator in C: a header and a source in addition to the model, with the noise levels of the run.
+
+The functions of the model that only the estimator calls are CasADi expressions, equal to `live.momentum`.
+"""
 
 from __future__ import annotations
 
@@ -6,49 +9,86 @@ import math
 import zlib
 from collections.abc import Iterable
 
+import casadi as ca
 import numpy as np
 
 from spelgen.exporting.c_source import CFunction, c_function
-from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.estimator_expressions import ENTRIES, estimator_functions
-from spelgen.live.noise import NoiseLevels
+from spelgen.exporting.description import TrainedModel, read_entries
+from spelgen.exporting.model_expressions import drive_friction, joint_mass, named_function
+from spelgen.exporting.residual_expressions import residual_symbols
+from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics
+from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.tuning import TUNING
 from spelgen.templates import render
 
 CALLED = ("inverse_dynamics", "friction", "gravity")
 """Functions of the model that the estimator calls, in addition to its own."""
 
+_ENTRIES = read_entries("""
+momentum_balance(q, qd, tau, low, high) -> momentum [Nm s, N s], torque [Nm, N], friction [Nm, N], \
+uncertainty [Nm, N], load_momentum [SI], load_torque [SI], jacobian [m, 1]
+    the terms of d/dt (p + P load) = torque - friction + N load, of an arm with a payload, and the tip's Jacobian
+payload_torque(q, qd, qdd, load) -> tau [Nm, N]
+    the torques that move a payload with ten inertial parameters at the last body
+""")
+
 
 def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFunction]:
     """Return the functions of the model that only the estimator calls."""
-    functions = estimator_functions(model, levels.point)
-    return [c_function(model, entry, functions[entry.name]) for entry in ENTRIES]
+    n, bodies = model.n, model.arm.bodies
+    sizes = {"q": n, "qd": n, "qdd": n, "tau": n, "load": 10, "low": model.memory, "high": model.memory}
+    inputs = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    q, qd, qdd, tau, load, low, high = inputs.values()
+    residuals, still = residual_symbols(model), ca.SX(n, 1)
+    arm = RigidBodies(model.arm, q, model.inertias)
+    # a payload is a second set of bodies, of which only the last has an inertia: its terms are linear in the load
+    payload = RigidBodies(model.arm, q, [ca.SX(10, 1)] * (len(bodies) - 1) + [load])
+    momentum, kinetic_gradient = arm.momentum(qd)
+    momentum += joint_mass(model, residuals) @ qd
+    gravity = arm.torque(still, still)
+    gradient = kinetic_gradient + residuals["kinetic"] - gravity - residuals["gravity"] - residuals["torque"]
+    applied = constant(model.inputs) @ (tau - model.torque_offset)
+    torque = applied + constant(model.friction_compensation) * qd + gradient
+    # the friction state is known up to an interval: its middle is the friction, half its width the uncertainty
+    first, second = (drive_friction(model, residuals, qd, gravity, z) for z in (high, low))
+    # of the last body's frame, in root axes: linear, then angular rows
+    pose, jacobian = frame_kinematics(bodies, len(bodies) - 1, np.eye(4), q)
+    rotation, weight = pose[:3, :3], load[0] * constant(model.arm.gravity)
+    load_momentum, load_gradient = payload.momentum(qd)
+    moment = ca.cross(rotation @ load[1:4], constant(model.arm.gravity))
+    # not by Newton-Euler: with its rounding errors, log odds differ 40 times as much from Python's
+    load_gradient += jacobian.T @ ca.vertcat(weight, moment)
+    at_point = jacobian[:3, :] - ca.skew(rotation @ levels.point) @ jacobian[3:, :]
+    outputs = {
+        "momentum_balance": (
+            momentum, torque, (first + second) / 2, ca.fabs(first - second) / 2,
+            ca.jacobian(load_momentum, load), ca.jacobian(load_gradient, load), at_point,
+        ),
+        "payload_torque": (payload.torque(qd, qdd),),
+    }  # fmt: skip
+    functions = []
+    for entry in _ENTRIES.values():
+        functions.append(
+            c_function(model, entry, named_function(entry, outputs[entry.name], inputs, residuals))
+        )
+    return functions
 
 
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     """Return header and source of the estimator, by name of the file."""
+    # C has no empty arrays
+    breakaway = model.breakaway.ravel() if model.memory else [0.0]
     tables: dict[str, Iterable[float]] = {
         "load_prior": TUNING.load_prior,
-        "load_white": levels.load.white,
-        "load_disturbance": levels.load.disturbance,
-        "load_time_constant": levels.load.time_constant,
-        "drift_white": levels.drift.white,
-        "drift_disturbance": levels.drift.disturbance,
-        "drift_time_constant": levels.drift.time_constant,
-        "observer": levels.observer,
-        "peak_start": levels.peak_start,
-        "peak_scale": levels.peak_scale,
-        "load_variance": [levels.load_variance],
-        "resting_torque": levels.resting,
-        "resting_speed": levels.resting_speed,
-        "speed": levels.speed,
-        "rest_speed": levels.rest_speed,
-        "encoder": levels.encoder,
-        "effort": levels.effort,
         "scales": TUNING.scales,
-        # C has no empty arrays
-        "breakaway": model.breakaway.ravel() if model.memory else [0.0],
+        "breakaway": breakaway,
     }
+    tables["rest_speed"] = levels.rest_speed
+    for name, level in levels:
+        if isinstance(level, BlockNoise):
+            tables |= {f"{name}_{key}": row for key, row in level}
+        elif name not in ("minutes", "point", "load_freedom"):
+            tables[name] = np.ravel(level)
     values = {
         "name": model.name,
         "upper": model.name.upper(),
@@ -62,15 +102,14 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "weights": TUNING.weights,
         "tables": {name: _numbers(row) for name, row in tables.items()},
         "motors": list(map(_numbers, model.motors)),
-        "inverse_inputs": list(map(_numbers, np.linalg.inv(model.inputs + np.diag(1 - model.actuated)))),
+        "inverse_inputs": list(map(_numbers, model.input_inverse)),
     }
     # a saved state belongs to one estimator
     identity = zlib.crc32(repr(sorted((name, str(value)) for name, value in values.items())).encode())
     files: dict[str, str] = {}
     for suffix in (".h", ".c"):
-        files[f"{model.name}_estimator{suffix}"] = render(
-            f"estimator{suffix}.jinja", **values, identity=identity
-        )
+        text = render(f"estimator{suffix}.jinja", **values, identity=identity)
+        files[f"{model.name}_estimator{suffix}"] = text
     return files
 
 

@@ -15,11 +15,12 @@ from spelgen.errors import RunError
 from spelgen.exporting.c_estimator import CALLED, estimator_c_functions, estimator_texts
 from spelgen.exporting.c_source import FRICTION_STATES, CFunction, c_functions, write_c
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.entry_points import ENTRY_POINTS
+from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
+# warnings are errors: users compile with the flags of their own projects
 _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 
 
@@ -38,36 +39,30 @@ def export_c(trained: Trained) -> Exported:
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
     """Return header and source by name, and a sentence with the result of the parity check."""
     model, levels = trained.described, trained.levels
-    functions, texts = c_functions(model, trained.entry_points), {}
+    entries, texts = dict(trained.entry_points), {}
     if levels is not None:
-        present = [function.entry.name for function in functions]
-        functions += c_functions(model, {name: ENTRY_POINTS[name] for name in CALLED if name not in present})
+        entries |= {name: ENTRY_POINTS[name] for name in CALLED}
+    functions = c_functions(model, entries)
+    if levels is not None:
         functions += estimator_c_functions(model, levels)
         texts = estimator_texts(model, levels)
-    checked = "Not checked: there is no C compiler"
-    program = compiler()
+    # the files themselves are compiled and compared, not a second rendering of them
     with tempfile.TemporaryDirectory() as folder:
-        source = write_c(model, functions, Path(folder))
-        sources = [source]
+        write_c(model, functions, Path(folder))
         for name, text in texts.items():
             Path(folder, name).write_text(text)
-            if name.endswith(".c"):
-                sources.append(Path(folder, name))
         files = {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
-        if program is not None:
-            library = called_by_c(compile_library(sources, program), functions)
-            parity = check_parity(library, trained, list(trained.entry_points), TUNING.tolerance)
-            checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}"
-    return files, checked
+        program = compiler()
+        if program is None:
+            return files, "Not checked: there is no C compiler"
+        called = called_by_c(compile_library(sorted(Path(folder).glob("*.c")), program), functions)
+        parity = check_parity(called, trained, list(trained.entry_points), TUNING.tolerance)
+    return files, f"Checked when exported, compiled by {Path(program).name}: {parity.summary}"
 
 
 def compiler() -> str | None:
     """Return the path of a C compiler; None if there is none."""
-    for name in ("gcc", "clang", "cc"):
-        program = shutil.which(name)
-        if program:
-            return program
-    return None
+    return next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
 
 
 def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -> Path:
@@ -75,6 +70,7 @@ def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -
     sources = [sources] if isinstance(sources, Path) else sources
     library = sources[0].with_suffix(".so")
     command = [program, *_FLAGS, *flags, *map(str, sources), "-o", str(library), "-lm"]
+    # no shell: the folder's name is never parsed
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         raise RunError(f"{Path(program).name} refuses the exported C", do=result.stderr.strip()[:500])
@@ -103,6 +99,7 @@ def called_by_c(
             # NaN fails the parity check if the function does not write a number
             outputs[key] = np.full((states, *shape), np.nan, dtypes.get(key, dtype))
         arguments += outputs.values()
+        # state by state, as a control loop calls it
         for state in range(states):
             rows = [array[state : state + 1] for array in arguments]
             call(*(row.ctypes.data_as(ctypes.c_void_p) for row in rows))

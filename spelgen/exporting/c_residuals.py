@@ -48,6 +48,7 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
             variables.append(f"{RESIDUAL}{name}[{symbols[name].numel()}]")
             arguments.append(RESIDUAL + name)
         calls.append(f"{call}, {', '.join(arguments)});")
+    # cos q and sin q are shared by the networks of M and V
     if "(encoded" in "".join(calls):
         variables.insert(0, "encoded[ENCODED]")
         calls.insert(0, "encode(q, encoded);")
@@ -71,7 +72,7 @@ def network_source(model: TrainedModel) -> list[str]:
         "networks.c.jinja",
         n=n,
         hidden=max(map(len, shapes.values())) - 1,
-        # the size of buffers, for the widest layer
+        # the size of buffers, for the widest layer: one array serves all networks
         width=max(max(shape) for layers in shapes.values() for shape in layers),
         encoded=3 * n,
         lanes=1 + n + n * (n + 1) // 2,
@@ -93,20 +94,14 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
         weight: (outputs, inputs).
         bias: (outputs,).
     """
-    first: list[int] = []
-    last: list[int] = []
-    packed: list[np.ndarray] = []
+    spans: list[tuple[int, int]] = []
     for column in weight.T:
         nonzero = np.flatnonzero(column).tolist() or [0, -1]
-        first.append(nonzero[0])
-        last.append(nonzero[-1] + 1)
-        packed.append(column[first[-1] : last[-1]])
-    return [
-        _table(f"{name}_bias", bias),
-        _table(f"{name}_weight", np.concatenate(packed)),
-        _table(f"{name}_first", np.array(first)),
-        _table(f"{name}_last", np.array(last)),
-    ]
+        spans.append((nonzero[0], nonzero[-1] + 1))
+    first, last = np.array(spans).T
+    packed = [column[slice(*span)] for column, span in zip(weight.T, spans, strict=True)]
+    tables = {"bias": bias, "weight": np.concatenate(packed), "first": first, "last": last}
+    return [_table(f"{name}_{key}", values) for key, values in tables.items()]
 
 
 def joint_function_source(model: TrainedModel) -> list[str]:
@@ -144,22 +139,20 @@ def _polynomials(spline: BSpline) -> np.ndarray:
     """Return the coefficients of 1, s, s^2, s^3 per interval, (intervals, 4); s is 0 to 1 in the interval."""
     curve = PPoly.from_spline((np.arange(len(spline.t)), spline.c, 3))
     # without the intervals outside of the knots of the curve
-    coefficients: np.ndarray = curve.c[::-1, 3 : len(spline.c)].T
-    return coefficients
+    return np.asarray(curve.c[::-1, 3 : len(spline.c)].T)
 
 
 def _spline_fields(splines: Mapping[int, BSpline]) -> list[str]:
     """Return joint, first knot and spacing of each spline, as initialisers of C."""
-    fields: list[str] = []
-    for joint, spline in splines.items():
-        spacing = np.ptp(spline.t) / (len(spline.t) - 1)
-        fields.append(f"{joint}, {float(spline.t[3])!r}, {float(spacing)!r}")
-    return fields
+    spacings = [float(np.ptp(spline.t) / (len(spline.t) - 1)) for spline in splines.values()]
+    firsts = [float(spline.t[3]) for spline in splines.values()]
+    return [f"{joint}, {x!r}, {h!r}" for joint, x, h in zip(splines, firsts, spacings, strict=True)]
 
 
 def _table(name: str, values: np.ndarray) -> str:
     """Return a constant C array with values (rows,) or (rows, columns), all digits."""
     scalar = "short" if values.dtype.kind == "i" else "real"
+    # repr keeps all digits, so that C reads the same double
     size = ""
     numbers = ", ".join(map(repr, values.tolist()))
     if values.ndim == 2:

@@ -11,8 +11,7 @@ from textwrap import wrap
 import casadi as ca
 
 from spelgen.exporting.c_residuals import joint_function_source, network_source, residual_calls
-from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import EntryPoint
+from spelgen.exporting.description import EntryPoint, TrainedModel
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.templates import render
 
@@ -82,13 +81,18 @@ def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, st
     note = (
         f": joint by joint, {model.breakaway.shape[1]} each" if model.memory else ": none, and z may be NULL"
     )
-    names = {"name": model.name, "upper": model.name.upper(), "n": model.n, "functions": functions}
-    joints, residuals = ", ".join(model.identifiers), network_source(model) + joint_function_source(model)
-    header = {"facts": facts, "joints": joints, "memory": model.memory, "memory_note": note}
-    return {
-        ".h": render("model.h.jinja", **names, **header),
-        ".c": render("model.c.jinja", **names, residuals=residuals),
+    context = {
+        "name": model.name,
+        "upper": model.name.upper(),
+        "n": model.n,
+        "functions": functions,
+        "facts": facts,
+        "joints": ", ".join(model.identifiers),
+        "memory": model.memory,
+        "memory_note": note,
+        "residuals": network_source(model) + joint_function_source(model),
     }
+    return {suffix: render(f"model{suffix}.jinja", **context) for suffix in (".h", ".c")}
 
 
 def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
@@ -102,28 +106,22 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
         # in single precision a small displacement would be lost in the sum with z
         scalar = "double" if entry.name == "friction_step" else "real"
         body.append(f"{scalar} {', '.join((*residuals, *variables))};")
-    body += calls + lines
-    real = f"{model.name}_real"
-    parameters: list[str] = []
-    for name in entry.inputs:
-        # a pointer, NULL without friction state: C has no empty arrays
-        size = function.numel_in(entry.inputs.index(name)) if name == "load" else f"{model.name.upper()}_N"
-        is_state = name in FRICTION_STATES
-        parameters.append(f"const double *{name}" if is_state else f"const {real} {name}[{size}]")
+    sizes = dict.fromkeys(entry.inputs, f"{model.name.upper()}_N") | {"load": "10"}
+    parameters = [f"const {_parameter(model, name, sizes[name])}" for name in entry.inputs]
     shapes: dict[str, tuple[int, ...]] = {}
     results: list[str] = []
     for k, (name, unit) in enumerate(entry.outputs.items()):
         rows, columns = function.size_out(k)
         shapes[name] = (rows, columns) if columns > 1 else (rows,)
-        parameters.append(
-            f"double *{name}" if name in FRICTION_STATES else f"{real} {name}[{rows * columns}]"
-        )
+        parameters.append(_parameter(model, name, str(rows * columns)))
         results.append(f"{name} ({', '.join(map(str, shapes[name]))}) [{unit}]")
+    # the line of the header: the results of the function, with shapes and units
     about = f"{entry.about[0].upper()}{entry.about[1:]}: {', '.join(results)}."
     symbol = f"{model.name}_{entry.name}"
-    listed = ",\n    ".join(parameters)
-    signature = f"void {symbol}(\n    {listed})"
-    wrapped = [wrap(line, _WIDTH, initial_indent="    ", subsequent_indent="        ") for line in body]
+    signature = f"void {symbol}(\n    " + ",\n    ".join(parameters) + ")"
+    wrapped = [
+        wrap(x, _WIDTH, initial_indent="    ", subsequent_indent="        ") for x in body + calls + lines
+    ]
     return CFunction(
         entry=entry,
         symbol=symbol,
@@ -135,6 +133,12 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
     )
 
 
+def _parameter(model: TrainedModel, name: str, size: str) -> str:
+    """Return the declaration of an array of a C function."""
+    # friction states are pointers, NULL without bristles: C has no empty arrays
+    return f"double *{name}" if name in FRICTION_STATES else f"{model.name}_real {name}[{size}]"
+
+
 def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the variables of a C function and its statements, one per CasADi instruction.
 
@@ -142,6 +146,7 @@ def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str
     each number is written once. A variable is a slot of CasADi's work vector, which is reused.
     """
     inputs = function.name_in()
+    # CasADi numbers the entries of a matrix in column-major order
     shapes = [function.size_out(k) for k in range(function.n_out())]
     variables: dict[str, None] = {}
     lines: list[str] = []

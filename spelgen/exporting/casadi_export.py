@@ -8,14 +8,22 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+from scipy.interpolate import BSpline
 
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint
+from spelgen.exporting.description import (
+    ENTRY_POINTS,
+    EntryPoint,
+    Residuals,
+    SigmoidNetwork,
+    TrainedModel,
+    spline_energy,
+)
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
-from spelgen.exporting.residual_expressions import residual_values
+from spelgen.exporting.residual_expressions import in_kinetic_energy
+from spelgen.exporting.rigid_expressions import constant
 from spelgen.exporting.tuning import TUNING
 
 
@@ -36,8 +44,10 @@ def export_casadi(trained: Trained) -> Exported:
 
 def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
     """Return functions by name: SX expressions of bodies and friction, MX expressions of residual terms."""
+    # without residual terms all is scalar: SX takes less time than calls within MX
     if not model.residuals:
         return expression_functions(model, entries)
+    # derivatives are taken of the function with its residual terms, not of its symbols
     bases = {name: ENTRY_POINTS[name.removesuffix("_derivatives")] for name in entries}
     expressions = expression_functions(model, {base.name: base for base in bases.values()})
     functions: dict[str, ca.Function] = {}
@@ -55,7 +65,7 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
         return function
     arguments = function.mx_in()[: len(entry.inputs)]
     states = dict(zip(entry.inputs, arguments, strict=True))
-    residuals = residual_values(model, states["q"], states.get("qd"))
+    residuals = _residual_values(model, states["q"], states.get("qd"))
     outputs = function.call(arguments + [residuals[name] for name in needed])
     return ca.Function(entry.name, arguments, outputs, list(entry.inputs), list(entry.outputs))
 
@@ -64,10 +74,8 @@ def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
     """Return the derivatives of a function with respect to its first inputs, one per output of the entry point."""
     arguments = function.mx_in()
     (output,) = function.call(arguments)
-    derivatives: list[ca.MX] = []
-    for argument, _ in zip(arguments, entry.outputs, strict=False):
-        # dense: callers expect n x n numbers
-        derivatives.append(ca.densify(ca.jacobian(output, argument)))
+    # dense: callers expect n x n numbers
+    derivatives = [ca.densify(ca.jacobian(output, x)) for x in arguments[: len(entry.outputs)]]
     return ca.Function(entry.name, arguments, derivatives, list(entry.inputs), list(entry.outputs))
 
 
@@ -95,3 +103,57 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
         return outputs
 
     return called
+
+
+def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
+    """Return expressions for the symbols, without derivatives, at q and qd (n, 1); qd: None if not needed."""
+    residuals = model.residuals
+    values: dict[str, ca.MX] = {}
+    encoded = ca.vertcat(ca.cos(q), ca.sin(q), q)
+    if residuals.mass is not None:
+        mass = values["mass"] = _network(residuals.mass, encoded)
+        if qd is not None:
+            values["rate"] = ca.jtimes(mass, q, qd)
+            values["kinetic"] = ca.jtimes(mass, q, in_kinetic_energy(model, qd), True)
+    if residuals.potential is not None:
+        values["energy"] = _network(residuals.potential, encoded)
+        # reverse mode: takes about the time of the network
+        values["gravity"] = ca.gradient(values["energy"], q)
+    # its derivative is the torque: both stay consistent
+    if residuals.has_torque:
+        values["torque_energy"] = _torque_energy(residuals, q)
+        values["torque"] = ca.gradient(values["torque_energy"], q)
+    if residuals.friction:
+        factors = [_spline(spline, q[joint]) for joint, spline in residuals.friction.items()]
+        values["factor"] = ca.vertcat(*factors)
+    return values
+
+
+def _network(network: SigmoidNetwork, encoded: ca.MX) -> ca.MX:
+    """Return the outputs, (outputs, 1), for inputs (3 n, 1)."""
+    layer = encoded
+    for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
+        # the sigmoid, which CasADi does not have
+        layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))
+    return constant(network.weights[-1]) @ layer + network.biases[-1]
+
+
+def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
+    """Return the potential energy of functions of single joints, (1, 1) [J], at q (n, 1)."""
+    energy = ca.MX(0)
+    for joint, spline in residuals.torque.items():
+        energy += _spline(spline_energy(spline), q[joint])
+    for ripple in residuals.ripple:
+        frequencies = ripple.frequency * np.arange(1, len(ripple.cosines) + 1)
+        phase = frequencies * q[ripple.joint]
+        energy += ca.dot(ripple.cosines / frequencies, ca.sin(phase))
+        energy -= ca.dot(ripple.sines / frequencies, ca.cos(phase))
+    return energy
+
+
+def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
+    """Return the value at q, (1, 1); outside of the knots it is constant."""
+    knots, degree = spline.t, spline.k
+    # bspline extrapolates its last polynomial, the model does not
+    inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])
+    return ca.bspline(inside, ca.DM(spline.c), [knots.tolist()], [degree], 1, {})

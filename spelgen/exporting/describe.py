@@ -16,12 +16,19 @@ from scipy.interpolate import BSpline
 from torch import Tensor
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
+from spelgen.dynamics.protocol import motors_of, residual_terms
 from spelgen.dynamics.tip import last_link, tip_kinematics
 from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.errors import RunError
-from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, TrainedModel
-from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.exporting.description import (
+    EntryPoint,
+    Harmonics,
+    Residuals,
+    Servos,
+    SigmoidNetwork,
+    TrainedModel,
+    entry_points,
+)
 from spelgen.listing import Listing
 from spelgen.live.noise import NoiseLevels
 from spelgen.runtime.friction_laws import FrictionConstants
@@ -30,11 +37,9 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 if TYPE_CHECKING:
     from spelgen.dynamics.prepared import PreparedModel
     from spelgen.emission.assemble import ArmModel
-    from spelgen.runtime.encoding import JointEncoding
+    from spelgen.runtime.networks import JointEncoding
     from spelgen.runtime.parts import Layers
     from spelgen.runtime.residual_terms import ResidualTerms
-
-_MAX_NAME_LENGTH = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +108,9 @@ def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
             do="--to torch, onnx, mjcf and urdf take every preset",
         )
     weights = exact.prepare()
-    # armature and constant residual terms are one matrix
     constant_mass = array(weights.armature)
     residuals = Residuals((), None, None, {}, (), {})
+    # a constant residual of M needs no evaluation: it is added to the armature
     if residual_terms(exact) is not None:
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
@@ -138,6 +143,7 @@ def identifier(text: str) -> str:
 
 def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
     """Return a different identifier for each joint, similar to its name."""
+    # names of joints become fields and comments of the emitted code
     identifiers: list[str] = []
     for number, name in enumerate(names, start=1):
         plain = _letters_and_digits(name)
@@ -152,18 +158,18 @@ def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _letters_and_digits(text: str) -> str:
-    return re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:_MAX_NAME_LENGTH]
+    # all functions and macros of an export start with it: 40 characters keep their lines readable
+    return re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:40]
 
 
 def array(value: Tensor) -> np.ndarray:
     """Return a copy of a tensor (...,) as a float64 array of the same shape."""
-    values: np.ndarray = value.detach().double().cpu().numpy().copy()
-    return values
+    return np.array(value.detach().double().cpu())
 
 
 def servos_of(model: ArmModel) -> Servos | None:
     """Return the position servos of a model; None if it has none."""
-    if input_of(model) == "torque":
+    if model.input_quantity == "torque":
         return None
     kp, kd, limit, dead_zone = map(array, model.servo.prepare())
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
@@ -173,7 +179,7 @@ def _residuals(model: ArmModel) -> Residuals:
     """Return the residual terms that are not zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
-    # Only entries of the lower triangle that any function contributes to.
+    # Only entries of the lower triangle that any function contributes to: all others would be computed zeros.
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
@@ -203,12 +209,10 @@ def _network(
     """
     if layers is None or not any(tensor.any() for tensor in layers[-1]):
         return None
-    weights, biases = [], []
-    for weight, bias in layers:
-        weights.append(array(weight))
-        biases.append(array(bias))
+    weights, biases = (list(map(array, tensors)) for tensors in zip(*layers, strict=True))
     # inputs become (cos q, sin q, q) of all joints
     first, second = np.hsplit(weights[0], 2)
+    # a prismatic input (q - center) slope is a weight of q and a part of the bias
     slopes, revolute = first * array(encoding.slope), array(encoding.revolute)
     weights[0] = np.hstack([first * revolute, second * revolute, slopes])
     biases[0] -= slopes @ array(encoding.center)
@@ -244,11 +248,12 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
     cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
-        # number of leading frequencies 1, 2, ...
+        # number of leading frequencies 1, 2, ...; frequencies of the motor are multiples of its gear ratio
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]
             used = np.flatnonzero((c != 0) | (s != 0))
+            # trailing zeros would cost a rotation of the phasor each
             if used.size:
                 last = used[-1] + 1
                 ripple.append(Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))

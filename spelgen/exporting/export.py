@@ -57,6 +57,7 @@ def export(
         trained = load_run(trained)
     intervals: tuple[Listing, ...] = ()
     levels = None
+    # a model that is not a fit has neither intervals nor noise levels
     if isinstance(trained, Fit):
         levels = stored_levels(trained)
         if trained.checkpoint.posterior:

@@ -14,6 +14,7 @@ from spelgen.labels import printable
 if TYPE_CHECKING:
     from spelgen.exporting.describe import Trained
 
+# of all formats: an export has no other units than the model
 UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 
 
@@ -43,6 +44,7 @@ EXPORTERS = {
     "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2", "for ROS 2"),
 }
 """The formats, by the values of --to."""
+# only formats of one file are recognised by the name of the output
 _BY_SUFFIX = {exporter.suffix: name for name, exporter in EXPORTERS.items() if exporter.suffix}
 
 if TYPE_CHECKING:
@@ -71,13 +73,10 @@ class Exported:
         """
         path = Path(path)
         require_fitting(self.to, path)
-        if EXPORTERS[self.to].suffix:
-            paths = [path.with_name(path.stem + name) for name in self.files]
-            outputs = paths
-        else:
-            paths = [path / name for name in self.files]
-            outputs = [path]  # an existing folder is not replaced either
-        for output in outputs:
+        is_folder = not EXPORTERS[self.to].suffix
+        paths = [path / name if is_folder else path.with_name(path.stem + name) for name in self.files]
+        # an existing folder is not replaced either
+        for output in [path] if is_folder else paths:
             if output.exists() and not force:
                 raise RunError("this output exists already", file=output, do="force replaces it")
         for file, content in zip(paths, self.files.values(), strict=True):
@@ -128,15 +127,15 @@ def with_readme(
         summary: sentences without full stops.
         example: lines of Python that run in the folder of the README.
     """
+    # five lines that a user needs before the first call; the rest is in docs/deploy.md
     exporter, conventions = EXPORTERS[to], f"{UNITS}; the tip is the link {trained.tip}; {about}"
     title, result = f"Dynamics of {trained.robot} {exporter.title}", f"{'; '.join(summary)}."
     name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"
     text = readme(title, use, trained.joint_names, conventions, result)
-    if example:
-        text += "\n".join(["", "```python", *example, "```", ""]).encode()
-    for table in trained.intervals:
-        lines = map(printable, table.text().splitlines())
-        text += "\n".join(["", "```text", *lines, "```", ""]).encode()
+    blocks = [("python", example)] if example else []
+    blocks += [("text", list(map(printable, table.text().splitlines()))) for table in trained.intervals]
+    for language, lines in blocks:
+        text += "\n".join(["", f"```{language}", *lines, "```", ""]).encode()
     return Exported(to, trained.robot, {**files, name: text}, tuple(summary))
 
 

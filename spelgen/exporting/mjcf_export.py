@@ -13,22 +13,30 @@ import torch
 from lxml import etree
 
 from spelgen.arm.arm import Chain, Coordinate, make_arm
+from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_regressor import about_center, quaternion
-from spelgen.dynamics.tip_frame import tip_frame
+from spelgen.dynamics.pinocchio_arm import body_constraint
+from spelgen.dynamics.tip_frame import link_poses, tip_frame
 from spelgen.emission.build import build
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import Servos
 from spelgen.exporting.exported import Exported, with_readme
-from spelgen.exporting.mjcf_shapes import add_shapes
 from spelgen.exporting.parity import Parity, Values, random_inputs, relative, require_parity
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
 from spelgen.exporting.tuning import TUNING
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+from spelgen.urdf.geometry import LinkShape, link_shapes
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
-SECTIONS = ("worldbody", "equality", "tendon", "actuator")
+_SECTIONS = ("worldbody", "equality", "tendon", "actuator")
+_CONTACTS = {
+    "visual": {"group": "2", "contype": "0", "conaffinity": "0"},
+    "collision": {"group": "3", "contype": "1", "conaffinity": "0"},
+}
+"""Attributes of geoms by element of the URDF. Links touch other things but not each other, since shapes of neighbours
+overlap, and the model has no contacts."""
 
 
 def export_mjcf(trained: Trained) -> Exported:
@@ -36,6 +44,7 @@ def export_mjcf(trained: Trained) -> Exported:
 
     Raises RunError if M, bias and forward dynamics of these bodies differ in MuJoCo.
     """
+    # MuJoCo has rigid bodies only: residual terms and networks are projected onto them
     projection = rigid_body_projection(trained.model, trained.arm)
     text, omitted = mjcf_text(projection)
     parity = check_mjcf(text, projection)
@@ -75,14 +84,14 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
     q = torch.from_numpy(random["q"])
+    # the file has the URDF's angles, the model rounded ones: M would differ by their tolerance
     bodies = _with_exact_angles(projection)
     mass = bodies.mass_matrix(q)
     bias = bodies.nonlinear_effects(q, torch.from_numpy(random["qd"]))
     force = torch.from_numpy(torques @ projection.inputs.T) - bias
     expected = {"mass_matrix": mass, "bias": bias, "forward_dynamics": torch.linalg.solve(mass, force)}
-    differences: dict[str, float] = {}
-    for name, values in _simulated(text, arm, random["q"], random["qd"], controls).items():
-        differences[name] = relative(values, expected[name].numpy())
+    simulated = _simulated(text, arm, random["q"], random["qd"], controls)
+    differences = {name: relative(values, expected[name].numpy()) for name, values in simulated.items()}
     return require_parity(differences, TUNING.mujoco_tolerance, states)
 
 
@@ -114,14 +123,13 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
     # positions and velocities of all joints, mimic joints included, from the coordinates
-    jacobian = np.zeros((model.nv, len(arm.coordinates)))
-    offset = np.zeros(model.nv)
-    for body in arm.bodies:
-        (dof,) = model.joint(body.name).dofadr
-        jacobian[dof, body.coordinate] = float(body.multiplier)
-        offset[dof] = body.offset
+    constraint = body_constraint(arm)
+    # MuJoCo orders joints by the tree of bodies
+    order = np.argsort([model.joint(name).dofadr[0] for name in constraint.names])
+    jacobian, offset = constraint.jacobian[order], constraint.offset[order]
     driven = [arm.joint_names.index(model.actuator(k).name) for k in range(model.nu)]
     data = mujoco.MjData(model)
+    # MuJoCo stores a sparse M: it is expanded into this array
     full = np.zeros((model.nv, model.nv))
     values: dict[str, list[np.ndarray]] = {"mass_matrix": [], "bias": [], "forward_dynamics": []}
     for position, velocity, control in zip(q, qd, controls, strict=True):
@@ -150,7 +158,8 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     # the default is degrees; autolimits: a given range is a limit
     _add(root, "compiler", angle="radian", autolimits="true")
     _add(root, "option", gravity=arm.gravity)
-    world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in SECTIONS)
+    world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in _SECTIONS)
+    # a motor that rotates with several joints cannot be the armature of one of them
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
     elements, tip = [world], tip_frame(projection.arm)
     for body, inertia in zip(tip.bodies, projection.inertias, strict=True):
@@ -185,11 +194,10 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     for section in (equality, tendons):
         if not len(section):
             root.remove(section)
-    omitted = add_shapes(root, elements, projection.arm)
+    omitted = _add_shapes(root, elements, projection.arm)
     # indented for people
     etree.indent(root)
-    text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
-    return text + b"\n", omitted
+    return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8")) + b"\n", omitted
 
 
 def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> dict[str, object]:
@@ -225,6 +233,7 @@ def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos:
     """Add a position actuator for each joint, whose control is the delayed command."""
     for k, joint in enumerate(joints):
         limit = servos.limit[k]
+        # an infinite force range is an error in MuJoCo, an absent one is unlimited
         force = (-limit, limit) if np.isfinite(limit) else None
         gains = {"kp": servos.kp[k], "kv": servos.kd[k]}
         _add(actuators, "position", name=joint.name, joint=joint.name, **gains, forcerange=force)
@@ -239,6 +248,58 @@ def _add_tendon(
         if coefficient:
             _add(tendon, "joint", joint=joint.name, coef=coefficient)
     return tendon
+
+
+def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: Arm) -> str:
+    """Add the shapes of all links to a model.
+
+    Args:
+        root: of the model, which gets the meshes.
+        elements: of the world and of the bodies, in the order of the arm.
+        arm: with the URDF.
+
+    Returns the links with shapes that are omitted, since they cannot be read or are flat; empty without any.
+    """
+    names = [link.name for link in arm.robot.links]
+    assets = etree.SubElement(root, "asset")
+    omitted: dict[str, None] = {}
+    poses = link_poses(arm)
+    for kind, attributes in _CONTACTS.items():
+        found = link_shapes(
+            arm.robot.path, "visual" if kind == "visual" else "collision", names, TUNING.faces
+        )
+        omitted |= dict.fromkeys(found.unread)
+        for shape in found.shapes:
+            if shape.mesh is not None and _is_flat(shape.mesh[0]):
+                omitted[shape.link] = None
+                continue
+            carrier, pose = poses[shape.link]
+            pose = pose @ shape.pose
+            form = _form(shape, assets) | {"pos": pose[:3, 3], "quat": quaternion(pose[:3, :3])}
+            # the <inertial> of the body has the mass
+            _add(elements[carrier + 1], "geom", **form, **attributes, mass=0)
+    if not len(assets):
+        root.remove(assets)
+    return ", ".join(omitted)
+
+
+def _form(shape: LinkShape, assets: etree._Element) -> dict[str, object]:
+    """Return type and size of a geom; a mesh is added to the assets."""
+    if shape.mesh is None:
+        sizes = {"box": [x / 2 for x in shape.size], "cylinder": [shape.size[0], shape.size[-1] / 2]}
+        return {"type": shape.kind, "size": sizes.get(shape.kind, shape.size)}
+    vertices, faces = shape.mesh
+    # six digits: a mesh has thousands of numbers
+    rows, name = " ".join(f"{x:.6g}" for x in vertices.ravel().tolist()), f"mesh{len(assets) + 1}"
+    _add(assets, "mesh", name=name, vertex=rows, face=faces, inertia="shell")
+    return {"type": "mesh", "mesh": name}
+
+
+def _is_flat(vertices: np.ndarray) -> bool:
+    """True if a mesh with vertices (V, 3) has no convex hull in three dimensions."""
+    # singular values: a flat mesh may lie in any plane
+    extents = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
+    return len(extents) < 3 or bool(extents[2] <= TUNING.flat * extents[0])
 
 
 def _add(parent: etree._Element, tag: str, **attributes: object) -> etree._Element:

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import casadi as ca
 import numpy as np
 
-from spelgen.exporting.description import Servos, TrainedModel
-from spelgen.exporting.entry_points import EntryPoint
+from spelgen.exporting.description import EntryPoint, Servos, TrainedModel
 from spelgen.exporting.residual_expressions import (
     Symbols,
     coriolis,
@@ -16,13 +15,7 @@ from spelgen.exporting.residual_expressions import (
     symbol_jacobians,
     symmetric,
 )
-from spelgen.exporting.rigid_expressions import (
-    body_frames,
-    constant,
-    mass_and_potential,
-    rigid_torque,
-    tip_kinematics,
-)
+from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics, mass_and_potential
 
 RESIDUAL = "residual_"
 """Prefix of the names of residual terms among the inputs of a function."""
@@ -35,8 +28,10 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
     names = ("q", "qd", "qdd", "tau", "dq", "u")
     inputs = {name: ca.SX.sym(name, model.n) for name in names}
     inputs["z"] = ca.SX.sym("z", model.memory)
+    # all entry points share their subexpressions, so they are built together
     residuals = residual_symbols(model)
     expressions = _expressions(model, inputs, residuals)
+    # the derivatives take most of the time of an export
     if any(name.endswith("_derivatives") for name in entries):
         expressions |= _derivatives(model, inputs, residuals)
     functions: dict[str, ca.Function] = {}
@@ -80,28 +75,28 @@ def _expressions(
     q, qd, qdd, tau, dq, u, z = inputs.values()
     standstill = ca.SX(model.n, 1)
     motors = constant(model.motors)
-    frames = body_frames(model.arm.bodies, q)
+    bodies = RigidBodies(model.arm, q, model.inertias)
     rigid_mass, rigid_potential = mass_and_potential(model, q)
-    # M of the motors' rotors and of the residual terms
-    added_mass = constant(model.constant_mass) + symmetric(model, residuals["mass"])
+    added_mass = joint_mass(model, residuals)
     mass = rigid_mass + added_mass
-    rigid_gravity = rigid_torque(model, frames, standstill, standstill)
+    rigid_gravity = bodies.torque(standstill, standstill)
     added_gravity = added_bias = residuals["gravity"] + residuals["torque"]
     if model.residuals.mass is not None:
         added_bias = added_gravity + coriolis(model, residuals, qd, derivatives=derivatives)
-    bias = rigid_torque(model, frames, qd, standstill) + added_bias
+    bias = bodies.torque(qd, standstill) + added_bias
     friction = drive_friction(model, residuals, qd, rigid_gravity, z)
     compensation = constant(model.friction_compensation) * qd
     # one recursive Newton-Euler pass; M qdd + h would take two
-    force = rigid_torque(model, frames, qd, qdd) + added_mass @ qdd + added_bias + friction - compensation
+    force = bodies.torque(qd, qdd) + added_mass @ qdd + added_bias + friction - compensation
+    to_inputs = constant(model.input_inverse)
     applied = constant(model.inputs) @ (tau - model.torque_offset)
     # Half of qd times it is the kinetic energy: M is used once.
     momentum = mass @ qd
     potential = rigid_potential + residuals["energy"] + residuals["torque_energy"]
-    pose, jacobian = tip_kinematics(model, q)
+    pose, jacobian = frame_kinematics(model.tip.bodies, model.tip.carrier, model.tip.pose, q)
     outputs = {
         "force": force,
-        "inverse_dynamics": _inputs(model, force) + model.torque_offset,
+        "inverse_dynamics": to_inputs @ force + model.torque_offset,
         "forward_dynamics": _solve(mass, applied + compensation - bias - friction),
         "mass_matrix": mass,
         "bias": bias,
@@ -117,6 +112,11 @@ def _expressions(
     if model.servos is not None:
         outputs["servo_torque"] = _servo_torque(model.servos, u, q, qd)
     return {name: (output,) for name, output in outputs.items()}
+
+
+def joint_mass(model: TrainedModel, residuals: Symbols) -> ca.SX:
+    """Return M of the motors' rotors and of the residual terms, (n, n)."""
+    return constant(model.constant_mass) + symmetric(model, residuals["mass"])
 
 
 def drive_friction(model: TrainedModel, residuals: Symbols, qd: ca.SX, gravity: ca.SX, z: ca.SX) -> ca.SX:
@@ -155,8 +155,7 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
         slow = slow * slow
     dry = constants.coulomb + constants.load_dependence * load + constants.stribeck * slow
     viscous = constants.viscous * qd + constants.saturation * _smooth_sign(qd, constants.saturation_velocity)
-    torque: ca.SX = viscous + dry * direction
-    return torque
+    return ca.SX(viscous + dry * direction)
 
 
 def _smooth_sign(velocity: ca.SX, width: np.ndarray) -> ca.SX:
@@ -167,8 +166,7 @@ def _smooth_sign(velocity: ca.SX, width: np.ndarray) -> ca.SX:
 def sliding_bristles(model: TrainedModel, qd: ca.SX) -> ca.SX:
     """Return z, (n K, 1), of motors that have moved at qd (n, 1) for a long time."""
     direction = ca.tanh(qd / model.friction.coulomb_smoothing_velocity)
-    z: ca.SX = _per_element(model.breakaway, direction) * model.breakaway.ravel()
-    return z
+    return ca.SX(_per_element(model.breakaway, direction) * model.breakaway.ravel())
 
 
 def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
@@ -180,18 +178,12 @@ def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
         dq: displacements, (n, 1).
     """
     limit = breakaway.ravel()
-    z_next: ca.SX = ca.fmin(ca.fmax(z + _per_element(breakaway, dq), -limit), limit)
-    return z_next
+    return ca.SX(ca.fmin(ca.fmax(z + _per_element(breakaway, dq), -limit), limit))
 
 
 def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:
     """Return values (n, 1) repeated for the K elements of each joint, (n K, 1)."""
     return ca.vec(ca.repmat(values.T, breakaway.shape[1], 1))
-
-
-def _inputs(model: TrainedModel, force: ca.SX) -> ca.SX:
-    """Return the inputs for generalised forces (n, columns); at a passive joint, the torque required there."""
-    return constant(np.linalg.inv(model.inputs + np.diag(1 - model.actuated))) @ force
 
 
 def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
@@ -200,6 +192,7 @@ def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
     if servos.dead_zone.any():
         error -= ca.fmin(ca.fmax(error, -servos.dead_zone), servos.dead_zone)
     torque: ca.SX = servos.kp * error - servos.kd * qd
+    # without a limit, no comparison in C
     for joint in np.flatnonzero(np.isfinite(servos.limit)).tolist():
         limit = servos.limit[joint]
         torque[joint] = ca.fmin(ca.fmax(torque[joint], -limit), limit)
@@ -225,8 +218,9 @@ def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Ou
     right = ca.horzcat(-by_position, -by_velocity, constant(model.inputs))
     # at the accelerations of the forward dynamics
     right = ca.substitute(right, inputs["qdd"], *expressions["forward_dynamics"])
+    to_inputs = constant(model.input_inverse)
     return {
-        "inverse_dynamics_derivatives": (_inputs(model, by_position), _inputs(model, by_velocity)),
+        "inverse_dynamics_derivatives": (to_inputs @ by_position, to_inputs @ by_velocity),
         "forward_dynamics_derivatives": tuple(ca.horzsplit(_solve(mass, right), model.n)),
     }
 

@@ -17,15 +17,12 @@ from spelgen.dynamics.prepared import batched_jacobians
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.entry_points import ENTRY_POINTS
+from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.tuning import TUNING
 from spelgen.structure.nominal import working_range
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
-
-# Speeds of joints without a velocity limit [rad/s], [m/s].
-_NOMINAL_SPEEDS = {"revolute": 1.0, "prismatic": 0.3}
 
 Values = dict[str, np.ndarray]
 """Inputs or outputs of an entry point by name, (states, ...) each."""
@@ -120,6 +117,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
     They are the same in each call, since exports are reproducible.
     """
     random = np.random.default_rng(0)
+    # velocities within the limits: friction at higher speeds is extrapolated
     speed = nominal_speeds(coordinates)
     q = np.stack([random.uniform(*working_range(joint), states) for joint in coordinates], axis=-1)
     return {
@@ -129,6 +127,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
         "dq": 0.05 * speed * random.standard_normal(q.shape),
         # break-away displacements are fractions of a milliradian
         "z": 1e-4 * random.standard_normal((states, memory)),
+        # forward dynamics are linear in tau: its size is of no importance
         "tau": 10.0 * random.standard_normal(q.shape),
         "u": q + 0.3 * random.standard_normal(q.shape),
     }
@@ -136,7 +135,8 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
 
 def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
     """Return the velocity limits of the URDF, or nominal speeds of joints without a limit, (n,) [rad/s, m/s]."""
-    return np.array([joint.velocity or _NOMINAL_SPEEDS[joint.joint_type] for joint in coordinates])
+    nominal = {"revolute": TUNING.angular_speed, "prismatic": TUNING.linear_speed}
+    return np.array([joint.velocity or nominal[joint.joint_type] for joint in coordinates])
 
 
 def relative(values: np.ndarray, expected: np.ndarray) -> float:

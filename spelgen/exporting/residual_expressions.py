@@ -1,4 +1,4 @@
-"""Residual terms of a model, as CasADi symbols and as CasADi expressions of q.
+"""Residual terms of a model as CasADi symbols.
 
 Scalar expressions of a model contain residual terms as symbols, so that a program can compute them by loops over
 weights and lookup of splines. The symbols are, for R the part of M that the network of M adds to (m entries of its
@@ -20,10 +20,8 @@ from typing import TypeVar
 
 import casadi as ca
 import numpy as np
-from scipy.interpolate import BSpline
 
-from spelgen.exporting.description import Residuals, SigmoidNetwork, TrainedModel, spline_energy
-from spelgen.exporting.rigid_expressions import constant
+from spelgen.exporting.description import TrainedModel
 
 Symbols = dict[str, ca.SX]
 Scalars = TypeVar("Scalars", ca.SX, ca.MX)
@@ -37,7 +35,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
     has_potential = residuals.potential is not None
     sizes = {
         "mass": (entries, entries, 1),
-        # directional derivatives: a program computes them in one sweep, without all n columns of first
+        # directional derivatives: a program computes them in one sweep, without the n columns of the symbol `first`
         "rate": (entries, entries, 1),
         "kinetic": (entries, n, 1),
         # for derivatives of forces
@@ -70,11 +68,11 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
     """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1); qd: (n, 1). derivatives: whether ``first`` replaces rate."""
     if not derivatives:
         return symmetric(model, symbols["rate"]) @ qd - symbols["kinetic"]
-    kinetic = symbols["first"].T @ _in_kinetic_energy(model, qd)
+    kinetic = symbols["first"].T @ in_kinetic_energy(model, qd)
     return symmetric(model, symbols["first"] @ qd) @ qd - kinetic
 
 
-def _in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
+def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
     """Return the factor of each entry of R in 1/2 qd^T R qd, (m, 1); qd: (n, 1)."""
     products = []
     for row, column in model.residuals.entries:
@@ -88,6 +86,7 @@ def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX,
     """Return the symbols that depend on q, (k, 1) each, with their derivatives with respect to q, (k, n)."""
     # the friction factor of a joint depends on the position of this joint only
     joints = np.eye(model.n)[list(model.residuals.friction)]
+    # second is (m, n n): a block of n columns per joint of the first derivative
     by_joint = ca.horzsplit(symbols["second"], model.n)
     jacobians = [
         (symbols["factor"], symbols["factor_slope"] * ca.SX(joints)),
@@ -98,55 +97,3 @@ def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX,
     ]
     # without the terms that the model does not have
     return [(symbol, jacobian) for symbol, jacobian in jacobians if symbol.nnz()]
-
-
-def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return expressions for the symbols, without derivatives, at q and qd (n, 1); qd: None if not needed."""
-    residuals = model.residuals
-    values: dict[str, ca.MX] = {}
-    encoded = ca.vertcat(ca.cos(q), ca.sin(q), q)
-    if residuals.mass is not None:
-        mass = values["mass"] = _network(residuals.mass, encoded)
-        if qd is not None:
-            values["rate"] = ca.jtimes(mass, q, qd)
-            values["kinetic"] = ca.jtimes(mass, q, _in_kinetic_energy(model, qd), True)
-    if residuals.potential is not None:
-        values["energy"] = _network(residuals.potential, encoded)
-        # reverse mode: takes about the time of the network
-        values["gravity"] = ca.gradient(values["energy"], q)
-    if residuals.has_torque:
-        values["torque_energy"] = _torque_energy(residuals, q)
-        values["torque"] = ca.gradient(values["torque_energy"], q)
-    if residuals.friction:
-        factors = [_spline(spline, q[joint]) for joint, spline in residuals.friction.items()]
-        values["factor"] = ca.vertcat(*factors)
-    return values
-
-
-def _network(network: SigmoidNetwork, encoded: ca.MX) -> ca.MX:
-    """Return the outputs, (outputs, 1), for inputs (3 n, 1)."""
-    layer = encoded
-    for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
-        # the sigmoid, which CasADi does not have
-        layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))
-    return constant(network.weights[-1]) @ layer + network.biases[-1]
-
-
-def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
-    """Return the potential energy of functions of single joints, (1, 1) [J], at q (n, 1)."""
-    energy = ca.MX(0)
-    for joint, spline in residuals.torque.items():
-        energy += _spline(spline_energy(spline), q[joint])
-    for ripple in residuals.ripple:
-        frequencies = ripple.frequency * np.arange(1, len(ripple.cosines) + 1)
-        phase = frequencies * q[ripple.joint]
-        energy += ca.dot(ripple.cosines / frequencies, ca.sin(phase))
-        energy -= ca.dot(ripple.sines / frequencies, ca.cos(phase))
-    return energy
-
-
-def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
-    """Return the value at q, (1, 1); outside of the knots it is constant."""
-    knots, degree = spline.t, spline.k
-    inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])
-    return ca.bspline(inside, ca.DM(spline.c), [knots.tolist()], [degree], 1, {})

@@ -42,8 +42,7 @@ class NearestFriction(NamedTuple):
     @property
     def coulomb(self) -> np.ndarray:
         """Mean Coulomb friction of both directions, (n,): a URDF and MuJoCo have one number."""
-        mean: np.ndarray = (self.forward - self.backward) / 2
-        return mean
+        return np.asarray((self.forward - self.backward) / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +86,10 @@ class RigidBodyProjection:
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     """Return the projection of a trained model of ``arm``."""
+    # a copy in double precision: the model of the user is not changed
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
+    # rigid bodies of the model need no search; residual terms are omitted, and the summary states it
     exact = isinstance(model, RigidBodyDynamics)
     bodies: ArmModel = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
@@ -151,6 +152,7 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
         model: trained model.
         q: (positions, n) [rad, m], of which every k-th is used.
     """
+    # friction changes most at low speed: logarithmic steps
     fractions = np.geomspace(0.02, 1.0, TUNING.friction_speeds)
     fractions = np.concatenate([-fractions[::-1], fractions])
     speeds = np.outer(fractions, nominal_speeds(arm.coordinates))

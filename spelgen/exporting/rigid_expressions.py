@@ -12,11 +12,16 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from spelgen.arm.arm import Body
+from spelgen.arm.arm import Body, Chain
 from spelgen.exporting.description import TrainedModel
 from spelgen.structure.recursion import Position, base_denominators, energies
 
 _Z = ca.sparsify(ca.DM([0, 0, 1]))
+
+Frame = tuple[ca.SX, ca.SX]
+"""Rotation (3, 3) and position (3, 1) of a body's frame in the frame of its parent."""
+Wrench = tuple[ca.SX, ca.SX]
+"""Force and torque, or linear and angular momentum, (3, 1) each, about the origin of a body's frame."""
 
 
 def constant(values: object) -> ca.DM:
@@ -24,112 +29,116 @@ def constant(values: object) -> ca.DM:
     return ca.sparsify(ca.DM(np.array(values, dtype=float)))
 
 
-def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
+def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[Frame]:
     """Return rotation (3, 3) and position (3, 1) of each body's frame in the frame of its parent, at q (n, 1)."""
-    frames: list[tuple[ca.SX, ca.SX]] = []
+    frames: list[Frame] = []
     for body in bodies:
         rotation = ca.SX(constant(body.rotation))
         position = ca.SX(constant(body.translation))
         displacement = float(body.multiplier) * q[body.coordinate] + body.offset
         if body.joint_type == "revolute":
-            rotation = rotation @ rotation_about_z(displacement)
+            rotation = rotation @ _rotation_about_z(displacement)
         else:
             position = position + rotation[:, 2] * displacement
         frames.append((rotation, position))
     return frames
 
 
-def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.SX, qdd: ca.SX) -> ca.SX:
-    """Return the torques of the rigid bodies, without armature, (n, 1) [Nm, N].
+class RigidBodies:
+    """The bodies of an arm at q, (n, 1).
 
-    Args:
-        model: description.
-        frames: from `body_frames` at q.
-        qd, qdd: (n, 1); structural zeros are omitted.
+    inertias: (bodies, 10) numbers, or a symbol (10, 1) of each body; structural zeros take no operations.
     """
-    bodies = model.arm.bodies
-    # angular velocity, angular acceleration, acceleration and spin of the base, then of the bodies, in their frames;
-    # instead of gravity the base accelerates upwards
-    gravity = np.array(model.arm.gravity, dtype=float)
-    motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
-    forces: list[ca.SX] = []
-    torques: list[ca.SX] = []
-    for body, ten, (rotation, position) in zip(bodies, model.inertias, frames, strict=True):
-        w, rate, acceleration, spin = motions[body.parent + 1]
-        ratio = float(body.multiplier)
-        speed = ratio * qd[body.coordinate]
-        added = ratio * qdd[body.coordinate]
-        # Everything is in the frame of the body: constants of the body need no rotation.
-        acceleration = rotation.T @ (acceleration + spin @ position)
-        w, rate = rotation.T @ w, rotation.T @ rate
-        turning = ca.cross(w, _Z) * speed
-        if body.joint_type == "revolute":
-            w = w + _Z * speed
-            rate = rate + _Z * added + turning
-        else:
-            # Coriolis acceleration: 2 w x v
-            acceleration = acceleration + _Z * added + 2 * turning
-        # spin p is the acceleration of point p relative to the origin
-        spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
-        motions.append((w, rate, acceleration, spin))
-        m, x, y, z, xx, xy, xz, yy, yz, zz = ten.tolist()
-        moment = ca.SX(constant([x, y, z]))
-        inertia = ca.SX(constant([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        # Newton, then Euler about the frame's origin
-        forces.append(m * acceleration + spin @ moment)
-        torque = ca.cross(moment, acceleration) + inertia @ rate
-        torques.append(torque + ca.cross(w, inertia @ w))
-    joint_torques = ca.SX(model.n, 1)
-    # children come after their parents
-    for index in reversed(range(len(bodies))):
-        body, force, torque = bodies[index], forces[index], torques[index]
-        along_axis = torque[2] if body.joint_type == "revolute" else force[2]
-        # mimic joints share the coordinate of their leader
-        joint_torques[body.coordinate] += float(body.multiplier) * along_axis
-        if body.parent >= 0:
-            rotation, position = frames[index]
-            force = rotation @ force
-            forces[body.parent] += force
-            torques[body.parent] += rotation @ torque + ca.cross(position, force)
-    return joint_torques
+
+    def __init__(self, arm: Chain, q: ca.SX, inertias: Sequence[ca.SX] | np.ndarray) -> None:
+        # frames are shared by torque and momentum, so that their sines are computed once
+        self.arm, self.bodies, self.frames = arm, arm.bodies, body_frames(arm.bodies, q)
+        self.inertias: list[tuple[ca.SX, ca.SX, ca.SX]] = []
+        for ten in map(ca.sparsify, map(ca.SX, inertias)):
+            # xx, xy, xz, yy, yz, zz follow mass and first moment
+            tensor = ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)
+            self.inertias.append((ten[0], ten[1:4], tensor))
+
+    def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
+        """Return the torques of the bodies, without armature, (n, 1) [Nm, N]; structural zeros of qd are omitted."""
+        # angular velocity, angular acceleration, acceleration and spin of the base, then of the bodies, in their
+        # frames; instead of gravity the base accelerates upwards
+        gravity = np.array(self.arm.gravity, dtype=float)
+        motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
+        wrenches: list[Wrench] = []
+        for body, (mass, moment, inertia), (rotation, position) in self._rows():
+            w, rate, acceleration, spin = motions[body.parent + 1]
+            ratio = float(body.multiplier)
+            speed, added = ratio * qd[body.coordinate], ratio * qdd[body.coordinate]
+            # Everything is in the frame of the body: constants of the body need no rotation.
+            acceleration = rotation.T @ (acceleration + spin @ position)
+            w, rate = rotation.T @ w, rotation.T @ rate
+            turning = ca.cross(w, _Z) * speed
+            if body.joint_type == "revolute":
+                w = w + _Z * speed
+                rate = rate + _Z * added + turning
+            else:
+                # Coriolis acceleration: 2 w x v
+                acceleration = acceleration + _Z * added + 2 * turning
+            # spin p is the acceleration of point p relative to the origin
+            spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
+            motions.append((w, rate, acceleration, spin))
+            # Newton, then Euler about the frame's origin
+            force = mass * acceleration + spin @ moment
+            torque = ca.cross(moment, acceleration) + inertia @ rate
+            wrenches.append((force, torque + ca.cross(w, inertia @ w)))
+        self._carry(wrenches)
+        torques = ca.SX(len(self.arm.coordinates), 1)
+        for body, wrench in reversed(list(zip(self.bodies, wrenches, strict=True))):
+            # mimic joints share the coordinate of their leader
+            torques[body.coordinate] += float(body.multiplier) * _along(body, wrench)
+        return torques
+
+    def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return M qd and d/dq of the kinetic energy, without armature, (n, 1) each.
+
+        The momentum of the bodies that a joint carries is projected onto its axis S, and onto dS/dt = twist x S.
+        """
+        # angular velocity, and velocity of the origin, of the base, then of the bodies, in their frames
+        twists = [(ca.SX(3, 1), ca.SX(3, 1))]
+        momenta: list[Wrench] = []
+        for body, (mass, moment, inertia), (rotation, position) in self._rows():
+            w, v = twists[body.parent + 1]
+            w, v = rotation.T @ w, rotation.T @ (v + ca.cross(w, position))
+            speed = _Z * (float(body.multiplier) * qd[body.coordinate])
+            w, v = (w + speed, v) if body.joint_type == "revolute" else (w, v + speed)
+            twists.append((w, v))
+            momenta.append((mass * v + ca.cross(w, moment), inertia @ w + ca.cross(moment, v)))
+        self._carry(momenta)
+        momentum, gradient = ca.SX(qd.shape[0], 1), ca.SX(qd.shape[0], 1)
+        for body, (w, v), (linear, angular) in zip(self.bodies, twists[1:], momenta, strict=True):
+            turned = ca.dot(ca.cross(w, _Z), linear)
+            if body.joint_type == "revolute":
+                turned = ca.dot(ca.cross(w, _Z), angular) + ca.dot(ca.cross(v, _Z), linear)
+            ratio = float(body.multiplier)
+            momentum[body.coordinate] += ratio * _along(body, (linear, angular))
+            gradient[body.coordinate] += ratio * turned
+        return momentum, gradient
+
+    def _rows(self) -> zip[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
+        """Return each body with mass, first moment (3, 1) and tensor (3, 3), and its frame; parents come first."""
+        return zip(self.bodies, self.inertias, self.frames, strict=True)
+
+    def _carry(self, wrenches: list[Wrench]) -> None:
+        """Add to the wrench of each body the wrenches of all bodies that it carries."""
+        for index in reversed(range(len(wrenches))):
+            parent = self.bodies[index].parent
+            if parent >= 0:
+                rotation, position = self.frames[index]
+                force, torque = wrenches[parent]
+                added = rotation @ wrenches[index][0]
+                turned = rotation @ wrenches[index][1] + ca.cross(position, added)
+                wrenches[parent] = force + added, torque + turned
 
 
-def rigid_momentum(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return M qd and d/dq of the kinetic energy of the rigid bodies, without armature, (n, 1) each.
-
-    The momentum of the bodies that a joint carries is projected onto its axis S, and onto dS/dt = twist x S.
-    """
-    bodies = model.arm.bodies
-    # angular velocity, and velocity of the origin, of the base, then of the bodies, in their frames
-    twists = [(ca.SX(3, 1), ca.SX(3, 1))]
-    momenta: list[tuple[ca.SX, ca.SX]] = []
-    for body, ten, (rotation, position) in zip(bodies, model.inertias, frames, strict=True):
-        w, v = twists[body.parent + 1]
-        w, v = rotation.T @ w, rotation.T @ (v + ca.cross(w, position))
-        speed = _Z * (float(body.multiplier) * qd[body.coordinate])
-        w, v = (w + speed, v) if body.joint_type == "revolute" else (w, v + speed)
-        twists.append((w, v))
-        m, x, y, z, xx, xy, xz, yy, yz, zz = ten.tolist()
-        moment = ca.SX(constant([x, y, z]))
-        inertia = ca.SX(constant([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        momenta.append((m * v + ca.cross(w, moment), inertia @ w + ca.cross(moment, v)))
-    momentum, gradient = ca.SX(model.n, 1), ca.SX(model.n, 1)
-    for index in reversed(range(len(bodies))):
-        body, (linear, angular) = bodies[index], momenta[index]
-        w, v = twists[index + 1]
-        ratio = float(body.multiplier)
-        if body.joint_type == "revolute":
-            along, turned = angular[2], ca.dot(ca.cross(w, _Z), angular) + ca.dot(ca.cross(v, _Z), linear)
-        else:
-            along, turned = linear[2], ca.dot(ca.cross(w, _Z), linear)
-        momentum[body.coordinate] += ratio * along
-        gradient[body.coordinate] += ratio * turned
-        if body.parent >= 0:
-            rotation, position = frames[index]
-            linear = rotation @ linear
-            angular = rotation @ angular + ca.cross(position, linear)
-            momenta[body.parent] = momenta[body.parent][0] + linear, momenta[body.parent][1] + angular
-    return momentum, gradient
+def _along(body: Body, wrench: Wrench) -> ca.SX:
+    """Return the component of a wrench along or about the axis of the body's joint, (1, 1)."""
+    return wrench[1][2] if body.joint_type == "revolute" else wrench[0][2]
 
 
 def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -142,35 +151,35 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     result = energies(model.arm, positions, model.inertias.tolist(), float)
     mass = ca.SX(model.n, model.n)
     for (row, column), entry in result.mass.items():
-        # one expression for both triangles
+        # the same expression in both triangles: CasADi computes it once
         mass[row, column] = mass[column, row] = entry
     return mass, ca.SX(result.potential)
 
 
-def tip_kinematics(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return pose (4, 4) and Jacobian (6, n), linear then angular, of the tip link in the root frame, at q (n, 1)."""
-    bodies = model.tip.bodies
-    frames = body_frames(bodies, q)
-    # poses of the root link, then of all bodies
+def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return pose (4, 4) and Jacobian (6, n), linear then angular, of a frame in the root frame, at q (n, 1).
+
+    carrier: index of the body that carries the frame; -1: the root link. pose: (4, 4), in the frame of this body.
+    """
+    # poses of the root link, then of all bodies: poses of bodies that do not carry the frame vanish from the function
     poses = [ca.SX.eye(4)]
-    for body, frame in zip(bodies, frames, strict=True):
+    for body, frame in zip(bodies, body_frames(bodies, q), strict=True):
         poses.append(poses[body.parent + 1] @ ca.vertcat(ca.horzcat(*frame), constant([[0, 0, 0, 1]])))
-    pose = poses[model.tip.carrier + 1] @ constant(model.tip.pose)
-    jacobian = ca.SX(6, model.n)
-    index = model.tip.carrier
-    while index >= 0:
-        body = bodies[index]
+    placed = poses[carrier + 1] @ constant(pose)
+    jacobian = ca.SX(6, q.shape[0])
+    while carrier >= 0:
+        body = bodies[carrier]
         # the axis is z of the body's frame
-        axis, origin = poses[index + 1][:3, 2], poses[index + 1][:3, 3]
+        axis, origin = poses[carrier + 1][:3, 2], poses[carrier + 1][:3, 3]
         column = ca.vertcat(axis, ca.SX(3, 1))
         if body.joint_type == "revolute":
-            column = ca.vertcat(ca.cross(axis, pose[:3, 3] - origin), axis)
+            column = ca.vertcat(ca.cross(axis, placed[:3, 3] - origin), axis)
         jacobian[:, body.coordinate] += float(body.multiplier) * column
-        index = body.parent
-    return pose, jacobian
+        carrier = body.parent
+    return placed, jacobian
 
 
-def rotation_about_z(angle: ca.SX) -> ca.SX:
+def _rotation_about_z(angle: ca.SX) -> ca.SX:
     """Return the rotation about z, (3, 3), by an angle (1, 1)."""
     c, s = ca.cos(angle), ca.sin(angle)
     rotation = ca.SX(3, 3)

@@ -11,6 +11,10 @@ class ExportTuning:
 
     # [1] Random states of a parity check.
     states: int = 200
+    # [rad/s] Speed of a revolute joint without a velocity limit in these states.
+    angular_speed: float = 1.0
+    # [m/s] Speed of a prismatic joint without a velocity limit.
+    linear_speed: float = 0.3
     # [1] Largest difference of C, CasADi and torch programs, relative to the largest value; `benchmarks/deploy.py`
     # measures 4e-14.
     tolerance: float = 1e-12
@@ -34,6 +38,8 @@ class ExportTuning:
     friction_speeds: int = 25
     # [1] Triangles of all meshes of an MJCF together.
     faces: int = 20_000
+    # [1] Thickness of a mesh, relative to its size, below which MuJoCo refuses it.
+    flat: float = 1e-5
 
 
 TUNING = ExportTuning()

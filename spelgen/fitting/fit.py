@@ -8,9 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import FittedBaselines, arm_of_model
-from spelgen.baselines.registry import fit_baselines
-from spelgen.dynamics.protocol import input_of
+from spelgen.baselines.registry import FittedBaselines, arm_of_model, fit_baselines
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, OptionError, RunError, SettingsError, SpelgenError
 from spelgen.files import write_json
@@ -32,8 +30,8 @@ from spelgen.fitting.servo.objective import ServoObjective
 from spelgen.fitting.torque.objective import TorqueObjective
 from spelgen.logs.dynamics_samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.tuning import shows_accelerations
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig, fit_config
 
@@ -107,7 +105,7 @@ def fit(
     if run is not None and not options.resume:
         # Before the logs are filtered and cut, which may take minutes.
         run.require_free(force=options.force)
-    # locked after the request was checked: a wrong option leaves no folder
+    # locked after the request was checked: a wrong option creates no folder
     with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
         return _Fitting(request, objective, run).fitted()
@@ -215,7 +213,7 @@ def objective_of(request: FitRequest) -> Objective:
     """Return the objective of a request. Raises OptionError if it does not apply to the model."""
     name = request.config.objective
     objective = OBJECTIVES[name]
-    under = input_of(request.model)
+    under = request.model.input_quantity
     if objective.input != under:
         message = (
             f"{name} belongs to arms with 'input: {objective.input}' in their settings, this has '{under}'"
@@ -230,7 +228,7 @@ def default_objective(model: ArmModel, rates: Rates) -> str:
     "servo" for an arm under position servos; "torque" for rigid bodies if a log is sampled densely enough for
     accelerations; else "rollout".
     """
-    if input_of(model) == ServoObjective.input:
+    if model.input_quantity == ServoObjective.input:
         return ServoObjective.name
     if isinstance(model, RigidBodyDynamics) and any(map(shows_accelerations, rates())):
         return "torque"

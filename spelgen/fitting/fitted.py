@@ -27,8 +27,8 @@ from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.filtering import low_pass
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, gap_ends
+from spelgen.logs.tuning import SLOWEST
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import FitConfig
 from spelgen.spec import ModelSpec

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.base_combinations import base_combinations, constants_regressor
+from spelgen.dynamics.body_regressor import base_combinations, constants_regressor
 from spelgen.dynamics.parameters import evaluate_with, friction_factor
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
@@ -31,7 +31,7 @@ from spelgen.labels import UNITS, parameter_name
 from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.runtime.friction_laws import FrictionLaws
-from spelgen.runtime.inputs import MotorInputs
+from spelgen.runtime.motors import MotorInputs
 
 # Finite difference, in standard deviations of the parameters.
 STEP = 1e-4

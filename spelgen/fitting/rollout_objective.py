@@ -20,7 +20,7 @@ from spelgen.fitting.rollout import rollout_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.objective import fit_torques, torque_samples
 from spelgen.fitting.tuning import TUNING
-from spelgen.logs.rates import SLOWEST
+from spelgen.logs.tuning import SLOWEST
 from spelgen.logs.windows import Windows
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import Rollout, TorqueFit

@@ -22,8 +22,8 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.windows import LAST_PART
 from spelgen.settings.fits import CONFIGS, FitConfig, Objective, Substeps
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.messages import validated
 from spelgen.settings.values import Count, NonNegative, Positive, Whole
+from spelgen.settings.yaml_document import validated
 
 Content = dict[str, Any]
 """The content of a file of a run folder, by key: JSON, or a checkpoint of torch."""
@@ -102,23 +102,16 @@ class Record(BaseModel):
     def require_same_run(self, resumed: Record, folder: Path) -> None:
         """Raise RunError if `resumed`, the record of a resumed fit, has other data or settings."""
         if self.data_digest != resumed.data_digest:
-            raise RunError(
-                "other logs than the run was started with",
-                file=folder,
-                do="give the same --data or start a new run",
-            )
+            do = "give the same --data or start a new run"
+            raise RunError("other logs than the run was started with", file=folder, do=do)
         original, changed_settings = self._settings(), resumed._settings()
         changed = []
         for name in original | changed_settings:
             if name not in MAY_CHANGE and original.get(name) != changed_settings.get(name):
                 changed.append(f"{name} {changed_settings.get(name)} instead of {original.get(name)}")
         if changed:
-            raise RunError(
-                ", ".join(changed),
-                file=folder,
-                expected="the settings the run was started with",
-                do="or start a new run",
-            )
+            expected, do = "the settings the run was started with", "or start a new run"
+            raise RunError(", ".join(changed), file=folder, expected=expected, do=do)
 
     def _settings(self) -> Content:
         settings = self.model_dump(include={"objective", "validation_fraction", "seed"})

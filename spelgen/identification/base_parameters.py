@@ -14,7 +14,6 @@ import numpy as np
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import BRISTLES, FrictionModel
 from spelgen.dynamics.regressor_dynamics import regressor
-from spelgen.identification.tuning import TUNING
 from spelgen.labels import parameter_name
 from spelgen.structure.base_parameters import base_parameters as body_base_parameters
 
@@ -71,13 +70,13 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
     # norm of each column after projection onto the complement of all columns before it
     remainder = np.abs(np.diag(np.linalg.qr(columns[:, candidates], mode="r")))
     length = np.maximum(np.linalg.norm(columns[:, candidates], axis=0), 1.0)
-    chosen = candidates[remainder > TUNING.dependent * length]
+    chosen = candidates[remainder > 1e-9 * length]
     combination = np.zeros((len(chosen), len(names)))
     for row, parameter in enumerate(exact):
         for k, weight in parameter.weights:
             combination[row, k] = float(weight)
     drives = np.linalg.lstsq(columns[:, chosen], columns[:, inertial:], rcond=None)[0]
-    drives[np.abs(drives) < TUNING.rounding * np.abs(drives).max(initial=1.0)] = 0.0
+    drives[np.abs(drives) < 1e-8 * np.abs(drives).max(initial=1.0)] = 0.0  # rounding
     combination[:, inertial:] = drives
     base_names = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :].tolist()]
     return BaseParameters(tuple(base_names), chosen, combination, tuple(names), len(exact))

@@ -6,27 +6,128 @@ candidate is accepted if it lowers the torque residual on held-out blocks of tim
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from itertools import permutations
-from typing import Literal
+from itertools import permutations, product
+from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import chain_regressor
+from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.friction import FrictionModel
-from spelgen.identification.drive_samples import DriveSamples
 from spelgen.identification.least_squares import block_products, normal_solution, varying
 from spelgen.identification.tuning import HINTS, TUNING
+from spelgen.logs.dynamics_samples import (
+    FREQUENCY,
+    SHORTEST,
+    DynamicsSamples,
+    dynamics_samples,
+    is_moving,
+    long_pieces,
+)
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.tuning import SAMPLES
 from spelgen.runtime.body_chain import BodyChain
 
 FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
+STEPS = max(HINTS.shifts)
+SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
+
+
+class DriveSamples(NamedTuple):
+    """S samples of moving joints with their torques.
+
+    q, qd, qdd: (S, n) [rad, m, s]. bent: (S, n, K), bristle deflection divided by the break-away displacement.
+    direction: (S, n), see `DynamicsSamples`. torques: (S, n, D) [Nm, N], shifted by each of the D `SHIFTS`.
+    """
+
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+    bent: np.ndarray
+    direction: np.ndarray
+    torques: np.ndarray
+
+    @property
+    def tau(self) -> np.ndarray:
+        """Return the torques without shift, (S, n) [Nm, N]."""
+        return self.torques[..., STEPS]
+
+    def thinned(self, stride: int) -> DriveSamples:
+        """Return every `stride`-th sample."""
+        return DriveSamples(*(column[::stride] for column in self))
+
+
+class DriveLog:
+    """Collector of samples of successive trajectories, evenly subsampled to at most twice `DriveHintTuning.samples`.
+
+    Of many trajectories only every second, fourth, ... is used, since filtering all of a long log takes minutes.
+    """
+
+    def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
+        """Create a collector without samples.
+
+        Args:
+            joint_types: of the n joints.
+            drives: inputs and speeds of the drives.
+            preprocessing: its filter and gap are used.
+        """
+        self._inputs, self._preprocessing = drives.inputs, replace(preprocessing, torque_delay=0.0)
+        smoothing = np.full(len(joint_types), FrictionModel().coulomb_smoothing_velocity)
+        self._reach = replace(reach_of(joint_types, drives.speeds), smoothing_velocity=smoothing)
+        self._samples: list[DriveSamples] = []
+        self._every = self._step = 1
+        self._number = 0
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Add the samples of a trajectory that is dense and long enough for accelerations."""
+        # most of ten thousand short motions are skipped before they are filtered
+        if trajectory.duration < SHORTEST:
+            return
+        self._number += 1
+        if self._number % self._step:
+            return
+        for piece in long_pieces(trajectory, self._preprocessing.gap):
+            # pauses included: at a constant rate a filtered torque is shifted by whole samples
+            samples = dynamics_samples(
+                [piece], pauses=True, preprocessing=self._preprocessing, reach=self._reach
+            )
+            self._samples += [self._shifted(x).thinned(self._every) for x in samples if len(x.q) > 2 * STEPS]
+        while self._count > 2 * HINTS.samples:
+            if len(self._samples) > HINTS.trajectories:
+                self._samples = self._samples[1::2]
+                self._step *= 2
+            else:
+                self._samples = [x.thinned(2) for x in self._samples]
+                self._every *= 2
+
+    def _shifted(self, samples: DynamicsSamples) -> DriveSamples:
+        """Return the moving samples at a constant rate, without the ends, which have no shifted torques."""
+        inner = samples[STEPS:-STEPS]
+        assert inner.z is not None and inner.direction is not None
+        torques = sliding_window_view(samples.tau @ self._inputs.T, len(SHIFTS), axis=0)
+        columns = (inner.q, inner.qd, inner.qdd, inner.z / self._reach.values, inner.direction, torques)
+        moving = is_moving(inner.qd)
+        return DriveSamples(*(column[moving] for column in columns))
+
+    @property
+    def _count(self) -> int:
+        return sum(len(x.q) for x in self._samples)
+
+    def samples(self) -> DriveSamples | None:
+        """Return all samples, or None if no joint moves."""
+        if not self._count:
+            return None
+        columns = zip(*self._samples, strict=True)
+        return DriveSamples(*map(np.concatenate, columns)).thinned(-(-self._count // HINTS.samples))
 
 
 @dataclass(frozen=True)
@@ -86,11 +187,6 @@ class DriveProblem:
     def bodies(self) -> np.ndarray:
         """Return the columns of the bodies' parameters, (S, n, 10 bodies)."""
         return self.rows[..., : -len(FRICTION.effects) * len(self.size) - 1]
-
-    @property
-    def is_short(self) -> bool:
-        """Whether there are too few samples for a hint."""
-        return len(self.rows) < HINTS.fewest_samples
 
     @property
     def free(self) -> list[int]:
@@ -155,15 +251,16 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     Joints with a declared coupling are not searched.
     """
     # all pairs on few samples: an approximate ratio suffices to detect a coupling
-    coarse = problem.in_one_block(HINTS.coarse)
+    coarse = problem.in_one_block(4)
     candidates: list[Coupling] = []
     for joint, moved_by in permutations(problem.free, 2):
         if abs(joint - moved_by) > 1:
             continue  # shafts and belts run along the arm; farther pairs explain springs
-        for ratio in HINTS.ratios:
-            candidates.append(Coupling(joint, moved_by, ratio, "joints"))
-            candidates.append(Coupling(joint, moved_by, ratio, "motors"))
-    if problem.is_short or not candidates:
+        # each initial ratio covers half to twice its value
+        for ratio, sign in product((0.4, 1.0, 2.5), (1.0, -1.0)):
+            candidates.append(Coupling(joint, moved_by, sign * ratio, "joints"))
+            candidates.append(Coupling(joint, moved_by, sign * ratio, "motors"))
+    if len(problem.rows) < HINTS.fewest_samples or not candidates:
         return None
     nearest = min(candidates, key=coarse.cost)
     best = _with_best_ratio(nearest, problem.in_one_block(1).cost)
@@ -184,7 +281,7 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
         bounds=bounds, method="bounded", options={"xatol": abs(start.ratio) / 100},
     )  # fmt: skip
     simple = replace(start, ratio=float(Fraction(float(best.x)).limit_denominator(4)))
-    if simple.ratio and cost(simple) <= (1 + HINTS.simple_ratio) * best.fun:
+    if simple.ratio and cost(simple) <= 1.02 * best.fun:
         return simple
     return replace(start, ratio=round(float(best.x), 3))
 
@@ -196,6 +293,7 @@ def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: in
     # between -1 and 1, so that no single block dominates
     gains = (logged - mended) / (logged + mended)
     standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
-    # of hundreds of couplings one is always better by chance (Bonferroni's bound)
-    needed = -float(stdtrit(len(gains) - 1, HINTS.chance / candidates))
+    # Of hundreds of couplings one is always better by chance: 1 in 400 for all candidates, as for terms of a fit
+    # (Bonferroni's bound).
+    needed = -float(stdtrit(len(gains) - 1, 1 / 400 / candidates))
     return bool(gains.mean() > needed * standard_error)

@@ -3,19 +3,47 @@ joints, combinations."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
+from typing import NamedTuple
 
 import numpy as np
 
-from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, HypothesisFit, Vector3
+from spelgen.arm.arm import Chain
+from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, HypothesisFit
 from spelgen.identification.tuning import GEOMETRY
+from spelgen.settings.log_mapping import SCALES
 
-STANDARD_GRAVITY = 9.81  # m/s^2
 RIGHT_ANGLE = np.pi / 2
-RARE = {"gravity": 1, "joint-zero": 2, "torque-unit": 2, "gravity-compensated": 3}
-STEP = 1e-4  # [rad, m] of finite differences
+# penalties of changes that are rarer than a wrong sense or order, which explain as much
+RARE = {"gravity": 1, "joint-zero": 2, "torque-unit": 2, "joint-unit": 2, "gravity-compensated": 3}
+
+
+# columns that another order of joints affects
+ORDERS = {
+    "joint-order": ("motion_source", "torque_source"),
+    "torque-order": ("torque_source",),
+    "motion-order": ("motion_source",),
+}
+
+
+class Scaling(NamedTuple):
+    """Factors (n,) of the motion and of the torques of joints, if their columns are in another unit."""
+
+    code: str
+    motion: np.ndarray
+    torque: np.ndarray
+
+
+ANGLES = {SCALES[unit]: unit for unit in ("turns", "deg")}
+
+
+def angle_scalings(arm: Chain) -> list[Scaling]:
+    """Return the candidates for angles and their rates in revolutions, and in degrees, of all revolute joints."""
+    turning = np.array([x.joint_type == "revolute" for x in arm.coordinates])
+    ones = np.ones(len(turning))
+    return [Scaling("joint-unit", np.where(turning, size, ones), ones) for size in ANGLES if turning.any()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,17 +59,18 @@ class HypothesisComparison:
         return self.better[0].hypothesis.codes
 
 
-def compare_readings(problem: GeometryProblem, factors: Sequence[np.ndarray] = ()) -> HypothesisComparison:
+def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ()) -> HypothesisComparison:
     """Return the hypotheses that fit a log significantly better than the unchanged log.
 
-    factors: candidates of factors on the torques, (n,) each, for another unit or motor constant.
+    scalings: candidates for other units.
     """
-    coarse = problem.thinned(GEOMETRY.samples)
+    coarse = problem.thinned(200)  # all hypotheses are compared on few samples
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
-    for _ in range(GEOMETRY.changes):
+    # three changes at most, an order of joints as one: more explain any log
+    for _ in range(3):
         best = min(fits, key=_rank)
-        tried = single_changes(coarse, best, factors)
+        tried = single_changes(coarse, best, scalings)
         if best is unchanged and min(tried, key=_rank).cost < unchanged.cost - GEOMETRY.needed:
             tried += reordered(coarse, unchanged)
         if min(tried, key=_rank).cost > best.cost - GEOMETRY.needed:
@@ -49,10 +78,11 @@ def compare_readings(problem: GeometryProblem, factors: Sequence[np.ndarray] = (
         fits = [*tried, unchanged]
     likely = _likely(unchanged, fits)
     if not likely:
-        return HypothesisComparison(unchanged, _rescaled(coarse, unchanged, factors))
+        return HypothesisComparison(unchanged, _rescaled(coarse, unchanged, scalings))
     finer = problem.thinned(GEOMETRY.confirming_samples)
     unchanged = finer.fit(problem.unchanged)
-    confirmed = [finer.fit(fit.hypothesis) for fit in likely[: GEOMETRY.named]]
+    # a message names three readings at most
+    confirmed = [finer.fit(fit.hypothesis) for fit in likely[:3]]
     return HypothesisComparison(unchanged, _likely(unchanged, confirmed))
 
 
@@ -65,13 +95,13 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
 
 
 def _rescaled(
-    problem: GeometryProblem, unchanged: HypothesisFit, factors: Sequence[np.ndarray]
+    problem: GeometryProblem, unchanged: HypothesisFit, scalings: Sequence[Scaling]
 ) -> tuple[HypothesisFit, ...]:
     """Return the fit with the best factor on the torques, if its cost is lower.
 
     A low cost is no evidence for a factor, since light bodies can explain small torques; the evidence is from gravity.
     """
-    fits = [problem.fit(hypothesis) for hypothesis in _scaled(problem.unchanged, factors)]
+    fits = [problem.fit(x) for x in _scaled(problem.unchanged, scalings) if "torque-unit" in x.codes]
     best = min(fits, key=_rank, default=unchanged)
     return (best,) if best.cost < unchanged.cost else ()
 
@@ -82,11 +112,11 @@ def _rank(fit: HypothesisFit) -> float:
 
 
 def single_changes(
-    problem: GeometryProblem, base: HypothesisFit, factors: Sequence[np.ndarray]
+    problem: GeometryProblem, base: HypothesisFit, scalings: Sequence[Scaling]
 ) -> list[HypothesisFit]:
     """Return the fits with one change in addition to the changes of the base."""
     reading = base.hypothesis
-    changed = [*_senses(reading), *_swapped(reading), *_scaled(reading, factors)]
+    changed = [*_senses(reading), *_swapped(reading), *_scaled(reading, scalings)]
     fits = [problem.fit(hypothesis) for hypothesis in changed]
     for k, coordinate in enumerate(problem.arm.coordinates):
         fits += _with_offset(problem, base, k, coordinate.joint_type == "revolute")
@@ -101,34 +131,36 @@ def _changed(base: Hypothesis, code: str, **changes: object) -> Hypothesis:
 def _senses(base: Hypothesis) -> Iterator[Hypothesis]:
     """Yield the readings with the opposite sense of a joint: of its position, its torque or both; of all torques."""
     yield _changed(base, "torque-sense", torque_scale=-base.torque_scale)
-    for k in range(len(base.offset)):
-        sign: np.ndarray = 1.0 - 2.0 * (np.arange(len(base.offset)) == k)
+    for sign in 1.0 - 2.0 * np.eye(len(base.offset)):
         torque = {"torque_scale": sign * base.torque_scale}
         yield _changed(base, "torque-sense", **torque)
         # an offset of the mapping may have been determined in either sense
-        for offset in (base.offset, sign * base.offset)[: 1 + (base.offset[k] != 0)]:
+        offsets = {x.tobytes(): x for x in (base.offset, sign * base.offset + 0.0)}
+        for offset in offsets.values():
             motion = {"motion_scale": sign * base.motion_scale, "offset": offset}
             yield _changed(base, "joint-sense", **motion)
             yield _changed(base, "joint-sense", **motion, **torque)
 
 
-def _swapped(base: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield the readings with the columns of two joints exchanged: all columns, or the torques."""
+def _swapped(base: Hypothesis, codes: Iterable[str] = tuple(ORDERS)) -> Iterator[Hypothesis]:
+    """Yield the hypotheses with the columns of two joints exchanged."""
     for pair in combinations(range(len(base.offset)), 2):
         order = np.arange(len(base.offset))
         order[list(pair)] = pair[::-1]
-        torque = base.torque_source[order]
-        yield _changed(base, "joint-order", motion_source=base.motion_source[order], torque_source=torque)
-        yield _changed(base, "torque-order", torque_source=torque)
+        for code in codes:
+            sources = {"motion_source": base.motion_source[order], "torque_source": base.torque_source[order]}
+            yield _changed(base, code, **{name: sources[name] for name in ORDERS[code]})
 
 
-def _scaled(base: Hypothesis, factors: Sequence[np.ndarray]) -> Iterator[Hypothesis]:
-    for factor in factors:
-        yield _changed(base, "torque-unit", torque_scale=base.torque_scale * factor)
+def _scaled(base: Hypothesis, scalings: Sequence[Scaling]) -> Iterator[Hypothesis]:
+    for code, motion, torque in scalings:
+        yield _changed(
+            base, code, motion_scale=base.motion_scale * motion, torque_scale=base.torque_scale * torque
+        )
 
 
 def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[HypothesisFit]:
-    """Return the best orders of all columns, and of the torques, by exchanging two joints at a time.
+    """Return the best orders of all columns, of the torques and of the motion, by exchanging two joints at a time.
 
     Long arms have local minima: the search starts at random orders, too.
     """
@@ -137,22 +169,41 @@ def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[Hypoth
     # joints may be logged in the alphabetical order of their names
     starts.append(np.argsort(np.argsort(joints)))
     rng = np.random.default_rng(0)
-    starts += [rng.permutation(len(joints)) for _ in range(GEOMETRY.random_orders)]
+    starts += [rng.permutation(len(joints)) for _ in range(6)]
     fits = {}
-    for code in ("joint-order", "torque-order"):
-        for start in starts:
-            order = {"torque_source": start}
-            if code == "joint-order":
-                order["motion_source"] = start
-            fit = problem.fit(_changed(unchanged.hypothesis, code, **order))
-            while True:
-                swaps = [x for x in _swapped(fit.hypothesis) if x.codes == (code,)]
-                best = min(map(problem.fit, swaps), key=_rank)
-                if best.cost > fit.cost - 1.0:
-                    break
-                fit = best
-            fits[code, fit.hypothesis.torque_source.tobytes()] = fit
-    return [fit for fit in fits.values() if not np.array_equal(fit.hypothesis.torque_source, starts[0])]
+    for code, start in product(ORDERS, starts):
+        fit = problem.fit(_changed(unchanged.hypothesis, code, **dict.fromkeys(ORDERS[code], start)))
+        while True:
+            best = min(map(problem.fit, _swapped(fit.hypothesis, [code])), key=_rank)
+            if best.cost > fit.cost - 1.0:
+                break
+            fit = best
+        order = np.array([fit.hypothesis.motion_source, fit.hypothesis.torque_source])
+        if (order != starts[0]).any():
+            fits[code, order.tobytes()] = fit
+    return list(fits.values())
+
+
+def _refined(
+    problem: GeometryProblem,
+    fit: HypothesisFit,
+    jacobian: Callable[[HypothesisFit], np.ndarray],
+    moved: Callable[[HypothesisFit, np.ndarray], Hypothesis | None],
+) -> HypothesisFit:
+    """Return the fit after Gauss-Newton steps of D quantities of its hypothesis, while they lower the cost.
+
+    jacobian: derivative of the torques at a fit, (S, n, D). moved: the hypothesis after a step (D,); None if the step
+    is negligible.
+    """
+    for _ in range(4):
+        hypothesis = moved(fit, problem.step(fit, jacobian(fit)))
+        if hypothesis is None:
+            break
+        best = problem.fit(hypothesis)
+        if best.cost > fit.cost:
+            break
+        fit = best
+    return fit
 
 
 def _with_offset(
@@ -160,38 +211,40 @@ def _with_offset(
 ) -> list[HypothesisFit]:
     """Return the fit with the best zero offset of a joint; an empty list for an offset below calibration errors."""
     reading = base.hypothesis
+    unit = np.eye(len(reading.offset))[joint]
+    smallest = GEOMETRY.min_angle if revolute else GEOMETRY.min_shift
 
     def shifted(offset: float) -> Hypothesis:
-        changed = reading.offset.copy()
-        changed[joint] += offset
-        return _changed(reading, "joint-zero", offset=changed)
+        return _changed(reading, "joint-zero", offset=reading.offset + offset * unit)
+
+    def offset_of(fit: HypothesisFit) -> float:
+        return float(fit.hypothesis.offset[joint] - reading.offset[joint])
+
+    def jacobian(fit: HypothesisFit) -> np.ndarray:
+        step = 1e-4  # rad, m
+        change = problem.torque(shifted(offset_of(fit) + step), fit.parameters)
+        change = change - problem.torque(fit.hypothesis, fit.parameters)
+        return np.asarray(change[..., None] / step)
+
+    def moved(fit: HypothesisFit, step: np.ndarray) -> Hypothesis | None:
+        step = np.clip(step, -1.0, 1.0)
+        negligible = smallest if not offset_of(fit) else GEOMETRY.min_shift
+        return None if abs(step[0]) < negligible else shifted(offset_of(fit) + float(step[0]))
 
     starts = [0.0, *(RIGHT_ANGLE * np.array([1, 2, -1]))] if revolute else [0.0]
-    fits = {start: problem.fit(shifted(start)) for start in starts}
-    offset = min(fits, key=lambda start: fits[start].cost)
-    best = fits[offset]
-    for _ in range(GEOMETRY.refinements):
-        nudged = shifted(offset + STEP)
-        change = problem.torque(nudged, best.parameters) - problem.torque(best.hypothesis, best.parameters)
-        step = float(np.clip(problem.step(best, change[..., None] / STEP)[0], -1.0, 1.0))
-        if abs(step) < (GEOMETRY.min_angle if best is fits[0.0] and revolute else GEOMETRY.min_shift):
-            break
-        fit = problem.fit(shifted(offset + step))
-        if fit.cost > best.cost:
-            break
-        best, offset = fit, offset + step
+    fits = [problem.fit(shifted(start)) for start in starts]
+    best = _refined(problem, min(fits, key=lambda fit: fit.cost), jacobian, moved)
+    offset, is_right_angle = offset_of(best), False
     if revolute:
         offset = (offset + np.pi) % (2 * np.pi) - np.pi
         right = RIGHT_ANGLE * round(offset / RIGHT_ANGLE)
         exact = problem.fit(shifted(right))
-        if right and exact.cost < best.cost + GEOMETRY.right_angle:
+        is_right_angle = bool(right) and exact.cost < best.cost + GEOMETRY.right_angle
+        if is_right_angle:
             best, offset = exact, right
-    if abs(offset) < (GEOMETRY.min_angle if revolute else GEOMETRY.min_shift):
-        return []
     # if other masses have the same effect as the offset, its value is as uncertain as the masses of the URDF
-    if best.misfit > base.misfit - GEOMETRY.needed / 2:
+    if abs(offset) < smallest or best.misfit > base.misfit - GEOMETRY.needed / 2:
         return []
-    is_right_angle = offset in (RIGHT_ANGLE, -RIGHT_ANGLE, -np.pi)
     return [best if is_right_angle else problem.fit(shifted(round(offset, 4)))]
 
 
@@ -199,67 +252,49 @@ def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[Hypothe
     """Return the fits with the best direction of gravity, and with the fraction of gravity in compensated torques."""
     present = np.array(base.hypothesis.gravity)
     size = float(np.linalg.norm(present))
-    fits = []
-    if size:
-        fits += _with_compensation(problem, base)
-    axes = [
-        *-np.eye(3)[::-1],
-        *np.eye(3),
-    ]  # upright first: a vertical prismatic joint does not determine the sign of gravity
-    starts = [_gravity(problem, base, (size or STANDARD_GRAVITY) * axis) for axis in axes]
+    standard = size or 9.81  # m/s^2
+
+    def moved(fit: HypothesisFit, step: np.ndarray) -> Hypothesis | None:
+        gravity = np.array(fit.hypothesis.gravity)
+        new = gravity + step
+        new *= standard / max(float(np.linalg.norm(new)), 1e-9)
+        return None if np.linalg.norm(new - gravity) < 0.01 * standard else _falling(base, new)
+
+    # upright first: a vertical prismatic joint does not determine the sign of gravity
+    starts = [problem.fit(_falling(base, standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
     lowest = min(fit.cost for fit in starts)
-    best = next(fit for fit in starts if fit.cost < lowest + GEOMETRY.rare)
-    directions = [_best_direction(problem, start) for start in ((best, base) if size else (best,))]
-    direction = min(directions, key=lambda fit: fit.cost)
-    new = np.array(direction.hypothesis.gravity)
+    starts = [next(fit for fit in starts if fit.cost < lowest + GEOMETRY.rare), *([base] if size else [])]
+    refined = [_refined(problem, fit, lambda x: _gravity_jacobian(problem, x), moved) for fit in starts]
+    best = min(refined, key=lambda fit: fit.cost)
+    new, fits = np.array(best.hypothesis.gravity), []
+    if size:
+        fits.append(_with_compensation(problem, base))
     if np.linalg.norm(new - present) > GEOMETRY.min_angle * size:
-        axis = _gravity(problem, base, _nearest_axis(new))
-        is_axis = axis.cost < direction.cost + GEOMETRY.right_angle
-        fits.append(axis if is_axis else _gravity(problem, base, new.round(3)))
+        nearest = np.linalg.norm(new) * np.sign(new) * (np.abs(new) == np.abs(new).max())
+        axis = problem.fit(_falling(base, nearest))
+        is_axis = axis.cost < best.cost + GEOMETRY.right_angle
+        fits.append(axis if is_axis else problem.fit(_falling(base, new.round(3))))
     return fits
 
 
-def _gravity(problem: GeometryProblem, base: HypothesisFit, gravity: np.ndarray) -> HypothesisFit:
+def _falling(base: HypothesisFit, gravity: np.ndarray, code: str = "gravity") -> Hypothesis:
+    """Return the hypothesis of a fit with another gravity."""
     x, y, z = (float(value) + 0.0 for value in gravity)
-    return problem.fit(_changed(base.hypothesis, "gravity", gravity=(x, y, z)))
+    return _changed(base.hypothesis, code, gravity=(x, y, z))
 
 
-def _nearest_axis(gravity: np.ndarray) -> np.ndarray:
-    return np.asarray(np.linalg.norm(gravity) * np.sign(gravity) * (np.abs(gravity) == np.abs(gravity).max()))
-
-
-def _gravity_columns(problem: GeometryProblem, fit: HypothesisFit) -> np.ndarray:
+def _gravity_jacobian(problem: GeometryProblem, fit: HypothesisFit) -> np.ndarray:
     """Return the derivative of the torques with respect to the vector of gravity, (S, n, 3)."""
-    bodies = [problem.torque(replace(fit.hypothesis, gravity=x), fit.parameters) for x in UNIT_GRAVITIES]
-    return np.asarray(np.stack(bodies[1:], axis=2) - bodies[0][..., None])
+    without = problem.torque(_falling(fit, np.zeros(3)), fit.parameters)
+    torques = [problem.torque(_falling(fit, unit), fit.parameters) - without for unit in np.eye(3)]
+    return np.stack(torques, axis=2)
 
 
-UNIT_GRAVITIES: tuple[Vector3, ...] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
-def _best_direction(problem: GeometryProblem, fit: HypothesisFit) -> HypothesisFit:
-    """Return the fit with the best direction of gravity near the direction of a fit."""
-    size = float(np.linalg.norm(fit.hypothesis.gravity))
-    for _ in range(GEOMETRY.refinements):
-        gravity = np.array(fit.hypothesis.gravity)
-        new = gravity + problem.step(fit, _gravity_columns(problem, fit))
-        new *= size / max(float(np.linalg.norm(new)), 1e-9)
-        if np.linalg.norm(new - gravity) < 0.01 * size:
-            break
-        turned = _gravity(problem, fit, new)
-        if turned.cost > fit.cost:
-            break
-        fit = turned
-    return fit
-
-
-def _with_compensation(problem: GeometryProblem, base: HypothesisFit) -> list[HypothesisFit]:
+def _with_compensation(problem: GeometryProblem, base: HypothesisFit) -> HypothesisFit:
     """Return the fit with the fraction of gravity in torques that do not include a controller's compensation."""
-    present = np.array(base.hypothesis.gravity)
-    without = _gravity(problem, base, np.zeros(3))
-    column = (_gravity_columns(problem, without) @ present)[..., None]
-    part = float(np.clip(problem.step(without, column)[0], -GEOMETRY.compensated, GEOMETRY.compensated))
-    some = _gravity(problem, base, (part * present).round(3))
-    best = some if some.cost < without.cost - GEOMETRY.ambiguous else without
-    codes = tuple("gravity-compensated" if code == "gravity" else code for code in best.hypothesis.codes)
-    return [replace(best, hypothesis=replace(best.hypothesis, codes=codes))]
+    present, code = np.array(base.hypothesis.gravity), "gravity-compensated"
+    without = problem.fit(_falling(base, np.zeros(3), code))
+    part = problem.step(without, (_gravity_jacobian(problem, without) @ present)[..., None])
+    # with more than half of gravity in all joints, other masses are the reason
+    some = problem.fit(_falling(base, (np.clip(part, -0.5, 0.5) * present).round(3), code))
+    return some if some.cost < without.cost - GEOMETRY.ambiguous else without

@@ -20,7 +20,6 @@ from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import BaseParameters
 from spelgen.identification.intervals import DETERMINED, Interval, base_unit, interval_listing
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay
-from spelgen.identification.tuning import TUNING
 from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing
 
@@ -176,9 +175,9 @@ class Identification:
                 f"The logs do not excite {counted(self.unseen, 'direction')} of the base parameters: those values are "
                 "arbitrary; excite the arm more, or train the preset closed-form, which has a prior at the URDF."
             )
-        elif self.condition < TUNING.well_posed:
+        elif self.condition < 30.0:  # errors are not amplified noticeably
             conditioned += "well posed."
-        elif self.condition < TUNING.acceptable:
+        elif self.condition < 300.0:
             conditioned += "acceptable."
         else:
             conditioned += "poor: some parameters trade against each other; excite the arm more."

@@ -25,8 +25,8 @@ from spelgen.identification.tuning import TUNING
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
+from spelgen.logs.tuning import SLOWEST
 
 
 def identify(

@@ -10,7 +10,6 @@ import torch
 from scipy.special import stdtrit
 from torch import Tensor
 
-from spelgen.identification.tuning import TUNING
 from spelgen.listing import Listing
 
 QUANTILE = 1.96
@@ -52,7 +51,7 @@ class Interval:
     @property
     def determined(self) -> str:
         """Precision, the standard deviation relative to the value: ``firm``, ``fair``, ``weak`` or ``may be zero``."""
-        for word, limit in zip(DETERMINED, (TUNING.firm, TUNING.fair, 1.0), strict=False):
+        for word, limit in zip(DETERMINED, (0.05, 0.2, 1.0), strict=False):
             if self.std <= limit * abs(self.value):
                 return word
         return DETERMINED[-1]

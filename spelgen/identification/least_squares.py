@@ -141,7 +141,7 @@ def correlation_time(residuals: Sequence[np.ndarray]) -> np.ndarray:
 
     It is 1 + 2 times the sum of the autocorrelations up to the first negative one (Geyer, Stat. Sci. 7:473, 1992).
     """
-    max_lag = min(TUNING.largest_lag, max(map(len, residuals)) - 1)
+    max_lag = min(500, max(map(len, residuals)) - 1)  # 5 s
     power = sum(np.square(x).sum(axis=0) for x in residuals)
     time: np.ndarray = np.ones_like(power)
     correlated = power > 0

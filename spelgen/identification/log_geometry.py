@@ -8,21 +8,20 @@ explain the torques equally well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.identification.drive_hints import drive_rows
-from spelgen.identification.inertial_prior import InertialPrior, inertial_prior
+from spelgen.identification.drive_hints import FRICTION, drive_rows
 from spelgen.identification.least_squares import block_products, varying
 from spelgen.identification.tuning import GEOMETRY
 
-ARMATURE, VISCOUS, COULOMB = range(3)  # order of the friction effects of `drive_rows`
 Vector3 = tuple[float, float, float]
 
 
@@ -33,6 +32,11 @@ class MotionSamples(NamedTuple):
     qd: np.ndarray
     qdd: np.ndarray
     tau: np.ndarray
+
+    @classmethod
+    def joined(cls, samples: Sequence[MotionSamples]) -> MotionSamples:
+        """Return several samples together."""
+        return cls(*map(np.concatenate, zip(*samples, strict=True)))
 
     def thinned(self, count: int) -> MotionSamples:
         """Return at most `count` samples, evenly spaced."""
@@ -60,10 +64,9 @@ class Hypothesis:
     @classmethod
     def unchanged(cls, arm: Chain) -> Hypothesis:
         """Return the hypothesis of the unchanged log, in SI units and without offsets."""
-        joints = len(arm.coordinates)
-        order, ones = np.arange(joints), np.ones(joints)
+        order, ones = np.arange(len(arm.coordinates)), np.ones(len(arm.coordinates))
         x, y, z = map(float, arm.gravity)
-        return cls((), order, order, ones, ones, np.zeros(joints), gravity=(x, y, z))
+        return cls((), order, order, ones, ones, 0.0 * ones, gravity=(x, y, z))
 
     @property
     def motion_key(self) -> tuple[bytes, Vector3]:
@@ -125,8 +128,14 @@ class GeometryProblem:
         self.arm, self.speeds = arm, speeds
         self.unchanged = unchanged or Hypothesis.unchanged(arm)
         self.samples = self.unchanged.logged(samples)
-        self._prior: InertialPrior = inertial_prior(arm)
-        self._count = float(np.clip(seconds / GEOMETRY.correlation_time, 1.0, GEOMETRY.max_errors))
+        # Residuals of recorded arms are correlated for about 0.2 s: samples within it count as one independent error.
+        # At most 150 errors per joint count: errors of a rigid model do not average out in long logs.
+        self._count = float(np.clip(seconds / 0.2, 1.0, 150.0))
+        mean, precision = inertial_prior(arm)
+        self._bodies = len(mean)
+        drives = len(speeds) * len(FRICTION.effects)
+        self.prior_mean = np.append(mean, np.zeros(drives))
+        self._precision = block_diag(precision, np.zeros((drives, drives)))
         self._counted: np.ndarray | None = None
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
 
@@ -143,7 +152,7 @@ class GeometryProblem:
         return fewer
 
     def without_gravity(self, joint: int) -> GeometryProblem:
-        """Return the problem of the unchanged log in which the torque of one joint contains no gravity."""
+        """Return the problem of the unchanged log in which one joint's torque contains no gravity."""
         weightless = replace(self.unchanged, gravity=(0.0, 0.0, 0.0))
         rows = self.equations(self.unchanged)[0].copy()
         rows[:, joint] = self.equations(weightless)[0][:, joint]
@@ -156,10 +165,9 @@ class GeometryProblem:
         rows, _ = self.equations(fit.hypothesis)
         return np.asarray(np.sqrt(np.einsum("snk,kl,snl->sn", rows, fit.covariance, rows, optimize=True)))
 
-    def coulomb_friction(self, fit: HypothesisFit) -> np.ndarray:
-        """Return the Coulomb friction of a fit, (n,) [Nm, N]."""
-        joints = len(self.speeds)
-        return fit.parameters[len(self._prior.mean) + joints * COULOMB :][:joints]
+    def drive_parameters(self, fit: HypothesisFit) -> np.ndarray:
+        """Return the parameters of the drives in a fit, (effects, n); effects: see `drive_rows`."""
+        return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
     def torque(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
         """Return the torques (S, n) of parameters (K,) under a hypothesis."""
@@ -175,7 +183,7 @@ class GeometryProblem:
             q, qd, qdd, _ = hypothesis.signals(self.samples)
             rows = drive_rows(body_chain(self.arm, hypothesis.gravity), q, qd, qdd, self.speeds)
             rows = rows if self._counted is None else rows * self._counted
-            if len(self._equations) >= GEOMETRY.kept:
+            if len(self._equations) >= 30:  # of about 1 MB each
                 self._equations.pop(next(iter(self._equations)))
             self._equations[key] = rows, block_products(rows, 1)[:, 0]
         return self._equations[key]
@@ -191,83 +199,101 @@ class GeometryProblem:
         tau = tau if self._counted is None else tau * self._counted[..., 0]
         right, total = np.einsum("snk,sn->nk", rows, tau), np.square(tau).sum(axis=0)
         variance = len(tau) * _variance(tau)
-        prior, bodies = self._prior, len(self._prior.mean)
-        precision, mean = np.zeros(normal.shape[1:]), np.zeros(normal.shape[-1])
-        precision[:bodies, :bodies], mean[:bodies] = prior.precision, prior.mean
-        errors, scale = np.full(len(normal), GEOMETRY.initial_error), GEOMETRY.initial_scale
-        for _ in range(GEOMETRY.iterations):
+        mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
+        errors, scale = np.full(len(normal), 0.1), 0.1
+        for _ in range(6):  # the costs change by less than 0.1 after
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
             matrix = np.tensordot(weights, normal, 1)
             # the friction of a joint at rest is not identifiable
             ridge = 1e-9 * np.diag(matrix) + 1e-9
-            ridge[:bodies] = 0.0
+            ridge[: self._bodies] = 0.0
             covariance = inverse(matrix + scale * precision + np.diag(ridge))
             x = covariance @ (weights @ right + scale * precision @ mean)
             squares = total - 2 * right @ x + np.einsum("k,jkl,l->j", x, normal, x)
             errors = np.maximum(squares / variance, 0.0)
             distance = float((x - mean) @ precision @ (x - mean))
-            scale = 2 * prior.freedom / (prior.freedom + distance)
+            scale = 2 * freedom / (freedom + distance)
         misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
-        cost = misfit + prior.freedom * float(np.log1p(distance / prior.freedom))
-        cost += self._implausible(x, covariance, normal)
+        cost = (
+            misfit + freedom * float(np.log1p(distance / freedom)) + self._implausible(x, covariance, normal)
+        )
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of parameters with the torque Jacobian `columns` (S, n, D)."""
         rows, _ = self.equations(fit.hypothesis)
-        tau = fit.hypothesis.signals(self.samples).tau
-        weights = 1.0 / ((fit.errors + GEOMETRY.error_floor) * _variance(tau))
+        tau, known = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
+        weights = self._count / (len(tau) * (fit.errors + GEOMETRY.error_floor) * _variance(tau))
         joined = np.concatenate([rows, columns], axis=2) * np.sqrt(weights)[:, None]
         flat = joined.reshape(-1, joined.shape[2])
-        matrix = flat.T @ flat * (self._count / len(tau))
-        bodies = len(self._prior.mean)
-        matrix[:bodies, :bodies] += self._prior.precision
-        residual = (tau - rows @ fit.parameters) * np.sqrt(weights)
-        vector = flat.T @ residual.ravel() * (self._count / len(tau))
-        vector[:bodies] += self._prior.precision @ (self._prior.mean - fit.parameters[:bodies])
-        return np.asarray((inverse(matrix) @ vector)[-columns.shape[2] :])
-
-    def wrong_links(self, fit: HypothesisFit) -> Iterator[tuple[int, float, float]]:
-        """Yield the index of each body whose first moment differs significantly from the URDF's, and two numbers.
-
-        The first is the ratio of the moments along the direction of the URDF's, the second its standard deviation. A
-        body counts only if its effect on the torques is visible: small and distant bodies compensate for each other.
-        """
-        visible = GEOMETRY.visible * float(self.samples.tau.std(axis=0).max())
-        gravity = float(np.linalg.norm(fit.hypothesis.gravity))
-        for k in range(len(self.arm.bodies)):
-            block = slice(10 * k + 1, 10 * k + 4)
-            stated, moment = self._prior.mean[block], fit.parameters[block]
-            length = float(np.linalg.norm(stated))
-            torque = float(np.linalg.norm(moment - stated)) * gravity
-            if not length or torque < visible:
-                continue
-            axis = stated / length
-            ratio = float(axis @ moment) / length
-            deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / length
-            is_far = not 1 / GEOMETRY.wrong_moment < ratio < GEOMETRY.wrong_moment
-            if is_far and abs(ratio - 1) > GEOMETRY.certain * deviation:
-                yield k, ratio, deviation
+        matrix = flat.T @ flat
+        matrix[:known, :known] += self._precision
+        vector = flat.T @ ((tau - rows @ fit.parameters) * np.sqrt(weights)).ravel()
+        vector[:known] += self._precision @ (self.prior_mean - fit.parameters)
+        return np.asarray((inverse(matrix) @ vector)[known:])
 
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the penalty of negative rotor inertias, and of friction whose mean power over the log is positive.
 
-        Each adds half of its squared standard score, at most `implausible_inertia` or `implausible_friction`: drives
-        may compensate friction, and errors of the friction model may resemble inertia.
+        Each adds half of its squared standard score, up to a bound: drives may compensate friction, and errors of the
+        friction model may resemble inertia. Recorded arms have friction of positive power (shanghai, joint 6) or
+        negative rotor inertia (airbot), not both.
         """
         drives, n = np.arange(len(normal)), len(normal)
-        first = len(self._prior.mean)
-        viscous, coulomb = first + n * VISCOUS + drives, first + n * COULOMB + drives
+        armature, viscous, coulomb = (self._bodies + n * effect + drives for effect in range(3))
         functionals = np.zeros((2 * n, len(x)))
-        functionals[drives, first + n * ARMATURE + drives] = 1.0
+        functionals[drives, armature] = 1.0
         # friction power: qd (viscous qd + Coulomb sign qd), summed over the samples
         functionals[n + drives, viscous] = normal[drives, viscous, viscous]
         functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
         negative = np.minimum(functionals @ x, 0.0)
         variance = np.einsum("ik,kl,il->i", functionals, covariance, functionals)
         odds = 0.5 * np.square(negative) / np.maximum(variance, 1e-30)
-        bounds = np.repeat([GEOMETRY.implausible_inertia, GEOMETRY.implausible_friction], n)
-        return float(np.minimum(odds, bounds).sum())
+        return float(np.minimum(odds, np.repeat([15.0, 10.0], n)).sum())
+
+
+def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean (10 B,) and the precision (10 B, 10 B) of the inertial parameters of B bodies, by the URDF.
+
+    Errors of masses, centres of mass and tensors are independent; a body without an inertial has a wide prior about 0.
+    """
+    masses = [float(body.inertia[0]) for body in arm.bodies if body.inertia and body.inertia[0] > 0]
+    typical = float(np.median(masses)) if masses else 1.0
+    mean, precisions = [], []
+    for k, body in enumerate(arm.bodies):
+        lengths = [np.linalg.norm(np.array(x.translation, dtype=float)) for x in arm.bodies if x.parent == k]
+        mean.append(np.array(body.inertia or (0.0,) * 10, dtype=float))
+        root = _root(mean[-1], float(max(lengths, default=0.0)), typical)
+        precisions.append(np.linalg.inv(root @ root.T))
+    return np.concatenate(mean), block_diag(*precisions)
+
+
+def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
+    """Return a root (10, 10) of the covariance of (m, m c, I) of a body.
+
+    The columns are the derivatives with respect to the mass at a fixed shape, the centre of mass and the tensor about
+    the centre, times their standard deviations. own: (10,). length: to the next joint [m]. typical: mass of a body
+    without an inertial [kg].
+    """
+    if own[0] <= 0:
+        # wide: an extent of half a metre, a standard deviation of 20 times the mass of another body
+        extent = max(length, 0.5)
+        return 20.0 * typical * np.diag(np.repeat([1.0, extent, extent**2], (1, 3, 6)))
+    mass = own[0]
+    center, moments = own[1:4] / mass, own[[4, 7, 9]]
+    gyration = np.sqrt(max(float(moments.sum() / 2 / mass - center @ center), 0.0))
+    extent = max(float(np.linalg.norm(center)), gyration, length / 2, 0.03)
+    radius = max(gyration, 0.3 * extent)  # URDFs state point masses, too
+    root = np.zeros((10, 10))
+    root[:, 0] = own
+    for axis, unit in enumerate(np.eye(3)):
+        product = np.outer(center, unit) + np.outer(unit, center)
+        tensor = np.trace(product) * np.eye(3) - product
+        root[1:4, 1 + axis] = mass * extent * unit
+        root[4:, 1 + axis] = mass * extent * tensor[np.triu_indices(3)]
+    root[4:, 4:] = mass * radius**2 * np.eye(6)
+    # URDFs are wrong by half: their masses, their centres of mass relative to the extent, their tensors
+    return 0.5 * root
 
 
 def _variance(tau: np.ndarray) -> np.ndarray:

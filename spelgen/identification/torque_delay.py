@@ -13,8 +13,14 @@ from scipy.special import stdtrit
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.errors import Diagnostic
-from spelgen.identification.drive_hints import Coupling, DriveProblem, drive_problem, find_coupling
-from spelgen.identification.drive_samples import SHIFTS, DriveLog
+from spelgen.identification.drive_hints import (
+    SHIFTS,
+    Coupling,
+    DriveLog,
+    DriveProblem,
+    drive_problem,
+    find_coupling,
+)
 from spelgen.identification.least_squares import block_products, normal_solution, varying
 from spelgen.identification.tuning import HINTS, TUNING
 from spelgen.logs.preprocessing import Preprocessing
@@ -112,10 +118,12 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     # errors of a friction state resemble a delay; errors of friction without a state do not, since they are symmetric
     memory, direct = estimates
     likely = [direct]
-    if memory.squares <= HINTS.unlikely_form * direct.squares:
+    # on recorded arms its squared residual is 0.3 to 0.8 of the other form's
+    if memory.squares <= 2.0 * direct.squares:
         likely.append(memory)
     best = min(likely, key=lambda x: x.squares)
-    quantile = -stdtrit(HINTS.blocks - 1, HINTS.delay_chance / 2)
+    # an interval of 99 %: a log without delay must not get one
+    quantile = -stdtrit(HINTS.blocks - 1, 0.01 / 2)
     deviations = np.array([x.delay / x.standard_error for x in likely])
     if not ((deviations > quantile).all() or (deviations < -quantile).all()):
         return NO_DELAY

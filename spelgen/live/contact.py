@@ -75,7 +75,7 @@ class ContactObserver:
         else:
             step = t - self.t
             gains = np.full((len(inputs), 1), 1 - np.exp(-rate * step))
-            # the second momentum, at twice the bandwidth: the difference of both tells the change of acceleration
+            # twice the bandwidth: the difference of two estimates of dp/dt is proportional to its rate
             gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
             # the disturbance of a joint in contact contains the contact

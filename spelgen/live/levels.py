@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import arm_of_model
+from spelgen.baselines.registry import arm_of_model
 from spelgen.dynamics.bristles import bristle_reach, encoder_step
 from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
 from spelgen.dynamics.protocol import residual_terms
@@ -87,7 +87,7 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
         tested.append((fitted_to(fit, others), fold))
     levels = find_levels(tested, effort, tip)
-    # the digits that a run folder keeps
+    # rounded to the digits that a run folder contains
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
 

@@ -12,19 +12,19 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.listing import Listing, number
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
-from spelgen.log_checks.tuning import SERVO_LOGS as TUNING
-from spelgen.logs.checks import DEGREES, Findings, run_checks
-from spelgen.logs.commands import delayed_commands
+from spelgen.logs.checks import Findings, run_checks
 from spelgen.logs.filtering import derivative
-from spelgen.logs.joint_signals import is_factor
-from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
+from spelgen.logs.joint_signals import is_factor, mapping_line
+from spelgen.logs.trajectory import Trajectory, delayed_commands, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
+    from spelgen.settings.log_mapping import LogMapping
 
 MOVING = SAMPLES.moving
-DELAYS = np.arange(TUNING.earliest_delay, TUNING.latest_delay + 1e-9, TUNING.delay_step).round(9)
+# Delays of positions after commands [s]: negative ones mean shifted rows; cheap servos have less than 0.2 s.
+DELAYS = np.linspace(-0.1, 0.4, 51).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # shortest piece that the polynomial of the derivative fits into
 FOLLOWS = SIGNALS.agreement
@@ -67,7 +67,7 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
         tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))
     best = np.abs(correlations).argmax(axis=0)
     correlation = np.take_along_axis(np.array(correlations), best[None], axis=0)[0]
-    moves = u_std > TUNING.idle_command
+    moves = u_std > 0.01  # rad, m: less is noise of a constant command
     saturated = np.mean(np.abs(commands - q) > saturation, axis=0)
     joints = []
     for k, error in enumerate(_steady_state_errors(pieces)):
@@ -85,7 +85,8 @@ def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
     for piece in pieces:
         u = require_commands(piece)[:-1]
         velocity = np.gradient(derivative(piece.q, piece.sample_rate, 0), piece.t, axis=0)[1:]
-        span = max(1, round(TUNING.rest_time * piece.sample_rate))
+        # an SO-101 is at rest 0.25 s after its command
+        span = max(1, round(0.25 * piece.sample_rate))
         resting = (u == np.roll(u, span, axis=0)) & (np.abs(velocity) < MOVING)
         resting[:span] = False
         rests.append(resting)
@@ -135,27 +136,30 @@ class ServoLogs:
                 report = replace(report, following=following.joints[k])
                 # some loggers write measured positions in place of commands
                 is_copy = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in self._logs)
-                odd = _odd_command(k, names, report, following, is_copy)
+                odd = _odd_command(k, names, report, following, is_copy, self._logs[0].mapping)
             completed.append(report)
             if isinstance(odd, LogError):
                 summary.errors.append(odd)
                 continue
             if odd is not None:
                 summary.notes.append(odd)
-            for check, message in run_checks(POSITION_CHECKS, JointEvidence(coordinate, report)):
-                summary.add(check, message, f"joint {coordinate.name!r}")
+            for check, found in run_checks(POSITION_CHECKS, JointEvidence(coordinate, report)):
+                summary.add(check, found.message, f"joint {coordinate.name!r}")
         for log in self._logs:
-            if log.sample_rate < TUNING.sparse_rate:
-                message = (
-                    f"{log.sample_rate:.3g} Hz: delays and friction need {TUNING.sparse_rate:g} Hz or more"
-                )
+            if log.sample_rate < 20.0:
+                message = f"{log.sample_rate:.3g} Hz: delays and friction need 20 Hz or more"
                 summary.notes.append(Diagnostic("warning", "sparse", f"trajectory {log.name}", None, message))
                 break  # reported once: logs of one robot have one rate
         return completed, (*signal_tables(completed, ("q", "u")), _following_table(completed))
 
 
 def _odd_command(
-    k: int, joints: Sequence[str], report: JointReport, following: Following, is_copy: bool
+    k: int,
+    joints: Sequence[str],
+    report: JointReport,
+    following: Following,
+    is_copy: bool,
+    mapping: LogMapping,
 ) -> LogError | Diagnostic | None:
     """Return the finding about a joint's command: an error if it cannot be this joint's command; None without one.
 
@@ -174,29 +178,31 @@ def _odd_command(
         width = report.high["u"] - report.low["u"]
         code, message = "idle-command", f"its command moves by {width:.3g} alone: its servo is not determined"
     # the amplitudes of command and motion are equal within a fifth, unless one of them is in degrees
-    elif correlation > FOLLOWS and (is_factor(gain, DEGREES) or is_factor(gain, 1 / DEGREES)):
+    elif correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
-        do = "write 'units' of q and u under 'logs' in the robot's YAML"
+        units = {"q": "deg", "u": "rad"} if gain > 1 else {"q": "rad", "u": "deg"}
+        do = mapping_line({"joints": {joints[k]: {"units": units}}})
         return LogError(got, element=where, expected="both in radians", do=do)
     elif correlation < -FOLLOWS:
         got = f"positions that move against commands (correlation {correlation:.2g})"
         return LogError(got, element=where, expected="one sense", do="check the signs of q and u")
-    elif correlation < TUNING.ignores:
+    elif correlation < 0.5:
         # swapped columns: another joint follows this command
         for other, name in enumerate(joints):
             if following.correlation[k, other] > FOLLOWS:
                 got = f"a command that joint {name!r} follows, and this one does not"
                 do = "check the names of the columns"
+                for source in np.flatnonzero(following.correlation[:, k] > FOLLOWS)[:1].tolist():
+                    do = mapping_line(
+                        {"joints": {joints[k]: {"columns": {"u": mapping.column("u", joints[source])}}}}
+                    )
                 return LogError(got, element=where, expected="its own command", do=do)
         code, message = "not-following", f"it does not follow its command (correlation {correlation:.2g})"
-    elif following.delay[k, k] < 0:
-        early = -1000 * following.delay[k, k]
-        code, message = (
-            "ahead-of-command",
-            f"positions come {early:.0f} ms before commands: are rows shifted?",
-        )
-    else:
+    elif following.delay[k, k] >= 0:
         return None
+    else:
+        early = f"{-1000 * following.delay[k, k]:.0f} ms"
+        code, message = "ahead-of-command", f"positions come {early} before commands: are rows shifted?"
     return Diagnostic("warning", code, where, None, message)
 
 

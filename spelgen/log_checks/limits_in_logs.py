@@ -15,7 +15,6 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.labels import UNITS
-from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.checks import Findings
 
 CLIPPED, AT_A_STOP = "torque-clipped", "at-a-stop"
@@ -56,10 +55,11 @@ def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     upright = SIDES[:, None, None] * values
     tops = upright.max(axis=1)
-    width = TUNING.flat_top * np.ptp(values, axis=0)
+    # wide enough for the noise of clipped torques: half a per cent of the range
+    width = 0.005 * np.ptp(values, axis=0)
     shares = (upright >= (tops - width)[:, None]).mean(axis=1)
     below = (upright >= (tops - 4 * width)[:, None]).mean(axis=1) - shares
-    is_flat = (shares > TUNING.flat_share) & (shares > TUNING.flat_ratio * below) & (width > 0)
+    is_flat = (shares > 0.01) & (shares > 2.0 * below) & (width > 0)
     return np.where(is_flat, SIDES[:, None] * tops, np.nan), np.where(is_flat, shares, 0.0)
 
 
@@ -74,18 +74,19 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     # the model is fitted to the torques that are not at a limit
     fit = problem.on_torques(free).fit(problem.unchanged)
     residual = problem.torque(problem.unchanged, fit.parameters) - samples.tau
-    deviation, friction = problem.prediction_deviation(fit), problem.coulomb_friction(fit)
-    # the residual of few samples underestimates the noise: degrees of freedom are subtracted
-    noise = np.sqrt(
-        np.square(residual * free).sum(axis=0) / np.maximum(free.sum(axis=0) - TUNING.free_samples, 1e-9)
-    )
+    deviation, (_, _, friction, *_) = problem.prediction_deviation(fit), problem.drive_parameters(fit)
+    # The residual of few samples underestimates the noise: the 30 degrees of freedom of a joint's parameters are
+    # subtracted.
+    freedom = np.maximum(free.sum(axis=0) - 30, 1e-9)
+    noise = np.sqrt(np.square(residual * free).sum(axis=0) / freedom)
+    certain = 3.0  # standard deviations
     for k, coordinate in enumerate(problem.arm.coordinates):
         unit, levels = UNITS[coordinate.joint_type].torque, flat.tau[:, k]
         sides = zip(SIDES, at_torque[..., k], strict=True)
-        doubt = TUNING.certain * deviation[:, k]
+        doubt = certain * deviation[:, k]
         excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
         # an error of friction, estimated from few free samples, is not evidence of a limit
-        sure = max(TUNING.certain * noise[k], TUNING.excess * samples.tau[:, k].std(), abs(friction[k]))
+        sure = max(certain * noise[k], 0.08 * samples.tau[:, k].std(), abs(friction[k]))
         is_clipped = excess > sure
         if is_clipped.any():
             limits = " and ".join(f"{x:.4g}" for x in levels[is_clipped])
@@ -99,8 +100,8 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
             findings.errors.append(LogError(got, element=where, expected="the torques that moved it", do=do))
     for k, coordinate in enumerate(problem.arm.coordinates if not findings.errors else ()):
         for level, rows in zip(flat.q[:, k], at_position[..., k], strict=True):
-            difference = _median((np.abs(residual) - TUNING.certain * deviation)[rows, k])
-            if difference > TUNING.certain * noise[k] + 2 * abs(friction[k]):
+            difference = _median((np.abs(residual) - certain * deviation)[rows, k])
+            if difference > certain * noise[k] + 2 * abs(friction[k]):
                 message = (
                     f"q stays at {level:.4g} while its torque differs by {difference:.3g} from the model of the other "
                     "samples: contact with a stop; remove such motion"
@@ -114,7 +115,7 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
 def _at_levels(levels: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return a mask (2, S, n) of the samples of filtered signals (S, n) at a level (2, n); False without a level."""
     distance = SIDES[:, None, None] * (levels[:, None] - values)
-    return np.asarray(distance < TUNING.near_limit * np.ptp(values, axis=0))
+    return np.asarray(distance < 0.02 * np.ptp(values, axis=0))
 
 
 def _median(values: Sequence[float] | np.ndarray) -> float:

@@ -5,20 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import yaml
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
 from spelgen.errors import Diagnostic, LogError
-from spelgen.identification.geometry_search import HypothesisComparison
+from spelgen.identification.geometry_search import ANGLES, HypothesisComparison
 from spelgen.identification.log_geometry import Hypothesis, HypothesisFit
 from spelgen.identification.tuning import GEOMETRY
-from spelgen.log_checks.tuning import TUNING
+from spelgen.logs.joint_signals import joint_keys, plain_number, settings_line
 from spelgen.settings.log_mapping import LogMapping
 
-GRAVITY = ("gravity", "gravity-compensated")
 GEOMETRY_CODES = (
-    "joint-order", "torque-order", "joint-sense", "torque-sense", "joint-zero", "torque-unit", "torque-scale", *GRAVITY
+    "joint-order", "torque-order", "motion-order", "joint-sense", "torque-sense", "joint-zero", "joint-unit",
+    "torque-unit", "torque-scale", "gravity", "gravity-compensated",
 )  # fmt: skip
 RIGHT = "joints, zeros, units and gravity as the URDF and the settings state them"
 
@@ -27,11 +26,11 @@ def mapped_reading(arm: Chain, mapping: LogMapping, drives: Drives) -> Hypothesi
     """Return the hypothesis of the unchanged log: scales and offsets of its mapping, and gears of single joints."""
     joints = arm.joint_names
     gears = np.diag(drives.inputs) if np.count_nonzero(drives.inputs) == len(joints) else np.ones(len(joints))
+    torque_scale = np.array([mapping.scale("tau", joint) for joint in joints])
     return replace(
         Hypothesis.unchanged(arm),
         motion_scale=np.array([mapping.scale("q", joint) for joint in joints]),
-        torque_scale=np.array([mapping.scale("tau", joint) for joint in joints])
-        * np.where(gears, gears, 1.0),
+        torque_scale=torque_scale * np.where(gears, gears, 1.0),
         offset=np.array([mapping.offset("q", joint) for joint in joints]),
     )
 
@@ -68,9 +67,10 @@ class Remedies:
         keys = {name: self._joint_keys(k, reading) for k, name in enumerate(self.arm.joint_names)}
         changed = {name: changes for name, changes in keys.items() if changes}
         if changed:
-            texts.append(f"'joints: {_flow(changed)}' under 'logs' in the robot's YAML")
+            line = settings_line(joint_keys(changed, self.arm.joint_names))
+            texts.append(f"'{line}' under 'logs' in the robot's YAML")
         if reading.gravity != self.unchanged.gravity:
-            gravity = _flow({"gravity": list(map(_number, reading.gravity))})[1:-1]
+            gravity = settings_line({"gravity": list(map(plain_number, reading.gravity))})
             texts.append(f"'{gravity}' in the robot's YAML (then build the model again)")
         return " and ".join(texts)
 
@@ -89,45 +89,50 @@ class Remedies:
             keys["name"] = mapping.log_name(motion)
         elif columns:
             keys["columns"] = columns
-        sign = float(reading.motion_scale[k] / unchanged.motion_scale[k])
+        factor = float(reading.motion_scale[k] / unchanged.motion_scale[k])
+        sign = 1 if factor > 0 else -1
         if sign < 0:
             keys["sign"] = -present.sign
-        gain = float(reading.torque_scale[k] / unchanged.torque_scale[k]) / sign
+        if abs(factor) in ANGLES:
+            unit = ANGLES[abs(factor)]
+            keys["units"] = {"q": unit, "qd": f"{unit}/s"}
+        gain = float(reading.torque_scale[k] / unchanged.torque_scale[k]) * sign
         if gain != 1.0:
-            keys["gain"] = _number((present.gain or 1.0) * gain)
+            keys["gain"] = plain_number((present.gain or 1.0) * gain)
             if present.torque_offset:
                 keys["torque_offset"] = present.torque_offset * gain * sign
         if reading.offset[k] != unchanged.offset[k]:
-            keys["offset"] = _number(reading.offset[k])
+            keys["offset"] = plain_number(reading.offset[k])
         return keys
 
     def _change(self, code: str, reading: Hypothesis) -> tuple[np.ndarray, str]:
-        """Return a mask (n,) of the joints that a change affects, and a text about the content of the log."""
+        """Return a mask (n,) of the joints that a change affects, and a text that describes the content of the log."""
         unchanged, order = self.unchanged, np.arange(len(reading.offset))
-        reversed_motion = reading.motion_scale * unchanged.motion_scale < 0
-        factors = reading.torque_scale / unchanged.torque_scale
-        if code == "joint-order":
-            return reading.motion_source != order, "the columns of other joints"
-        if code == "torque-order":
-            return reading.torque_source != order, "the torques of other joints"
-        if code == "joint-sense":
-            text = "positions and velocities of the opposite sense, and torques of the right one"
-            if (factors[reversed_motion] < 0).all():
-                text = "positions, velocities and torques of the opposite sense"
-            return reversed_motion, text
-        if code == "torque-sense":
-            return (factors < 0) & ~reversed_motion, "torques of the opposite sense"
-        if code == "torque-unit":
-            largest = factors[np.abs(np.log(np.abs(factors))).argmax()]
-            return np.abs(factors) != 1, f"torques of another unit, {1 / largest:.3g} times as large"
-        if code == "joint-zero":
-            shifts = np.where(reversed_motion, 0.0, reading.offset - unchanged.offset)
-            k = int(np.abs(shifts).argmax())
-            shift = f"{np.rad2deg(shifts[k]):.3g} degrees"
-            if self.arm.coordinates[k].joint_type == "prismatic":
-                shift = f"{shifts[k]:.3g} m"
-            return shifts != 0, f"positions with another zero, by {shift}"
-        return order >= 0, self._gravity_text(code, reading)
+        motion = reading.motion_scale / unchanged.motion_scale
+        torque = reading.torque_scale / unchanged.torque_scale
+        shifts = np.where(motion < 0, 0.0, reading.offset - unchanged.offset)
+        k = int(np.abs(shifts).argmax())
+        shift = f"{np.rad2deg(shifts[k]):.3g} degrees"
+        if self.arm.coordinates[k].joint_type == "prismatic":
+            shift = f"{shifts[k]:.3g} m"
+        sense = "positions, velocities and torques of the opposite sense"
+        if not (torque[motion < 0] < 0).all():
+            sense = "positions and velocities of the opposite sense, and torques of the right one"
+        largest = torque[np.abs(np.log(np.abs(torque))).argmax()]
+        changes = {
+            "joint-order": (reading.motion_source != order, "the columns of other joints"),
+            "motion-order": (reading.motion_source != order, "the positions and velocities of other joints"),
+            "torque-order": (reading.torque_source != order, "the torques of other joints"),
+            "joint-sense": (motion < 0, sense),
+            "torque-sense": ((torque < 0) & (motion > 0), "torques of the opposite sense"),
+            "torque-unit": (
+                np.abs(torque) != 1,
+                f"torques of another unit, {1 / largest:.3g} times as large",
+            ),
+            "joint-unit": (np.abs(motion) != 1, f"positions in {ANGLES.get(np.abs(motion).max(), 'deg')}"),
+            "joint-zero": (shifts != 0, f"positions with another zero, by {shift}"),
+        }
+        return changes.get(code) or (order >= 0, self._gravity_text(code, reading))
 
     def _place(self, joints: np.ndarray) -> str:
         """Return the text that names the joints of a mask (n,) in a finding."""
@@ -148,24 +153,12 @@ class Remedies:
         """Return True if the difference may be an error of the URDF or of the mounting, not of the log."""
         if best.codes == ("torque-unit",):
             factor = np.abs(np.log(best.torque_scale / self.unchanged.torque_scale)).max()
-            return bool(factor < np.log(TUNING.impossible_factor))
+            return bool(factor < np.log(10.0))  # inertials of a URDF are never so wrong
         if best.codes == ("joint-zero",):
             return bool(np.abs(best.offset - self.unchanged.offset).max() < GEOMETRY.serious_angle)
         present = np.array(self.unchanged.gravity)
         turned = float(np.linalg.norm(present - np.array(best.gravity)))
         return best.codes == ("gravity",) and turned < GEOMETRY.serious_angle * float(np.linalg.norm(present))
-
-
-def _flow(value: object) -> str:
-    """Return a value as YAML in one line."""
-    text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=float("inf"))
-    return text.strip()
-
-
-def _number(value: float) -> float:
-    """Return a number with five digits; an integer if it is one."""
-    rounded = float(f"{value:.5g}")
-    return int(rounded) if rounded.is_integer() else rounded
 
 
 def _evidence(best: HypothesisFit, unchanged: HypothesisFit) -> str:

@@ -13,14 +13,27 @@ from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, SpelgenError
 from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing, number
-from spelgen.log_checks.gravity import GravityFit
 from spelgen.log_checks.statistics import Clock, Statistics
-from spelgen.log_checks.tuning import TUNING
-from spelgen.logs.checks import velocity_agreement
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.unit_checks import velocity_agreement
 
-UNFITTED = GravityFit()
 MEASURES = {"q": "position", "qd": "velocity", "tau": "torque", "u": "position"}
+
+
+@dataclass(frozen=True)
+class GravityFit:
+    """Gravity in the torque of one joint, after removal of friction and of the inertia torque of its own acceleration.
+
+    explained: fraction (0 to 1) of the remaining variance that gravity explains, for the best inertial parameters;
+    None if gravity never loads the joint, if the torque is constant, or for too few samples. factor: least-squares
+    ratio of the torque to the URDF's gravity torque. correlation: of these two. relative_deviation: standard deviation
+    of the URDF's gravity torque, divided by the torque's.
+    """
+
+    explained: float | None = None
+    factor: float | None = None
+    correlation: float | None = None
+    relative_deviation: float | None = None
 
 
 @dataclass(frozen=True)
@@ -58,7 +71,7 @@ class JointReport:
     steps: dict[str, float | None]
     velocity_factor: float | None
     velocity_correlation: float | None
-    gravity: GravityFit = UNFITTED
+    gravity: GravityFit = GravityFit()
     following: JointFollowing | None = None
 
     def largest(self, quantity: str) -> float:
@@ -129,9 +142,13 @@ class LogReport:
         """Return all tables, with at most `limit` trajectories."""
         return [_clock_table(self.trajectories, limit), *self.tables]
 
+    def _short_listings(self) -> list[Listing]:
+        # a data set of a thousand episodes would fill the terminal
+        return self.listings(20)
+
     def text(self) -> str:
         """Return the report for a terminal, in 80 columns, without the errors."""
-        paragraphs = [self.heading(), *map(Listing.text, self.listings(TUNING.shown))]
+        paragraphs = [self.heading(), *map(Listing.text, self._short_listings())]
         wrapped = partial(textwrap.fill, width=WIDTH, initial_indent="  ", subsequent_indent="    ")
         findings = list(map(wrapped, map(str, self.findings)))
         if findings:
@@ -151,7 +168,7 @@ class LogReport:
         for error in self.errors:
             lines.append(("error", "", str(error)))
         table = Listing(self.heading(), ("", "where", "what"), tuple(lines), left=(0, 1, 2))
-        return "".join(map(Listing.html, (table, *self.listings(TUNING.shown))))
+        return "".join(map(Listing.html, (table, *self._short_listings())))
 
 
 def joint_report(
@@ -193,7 +210,6 @@ def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
     """Return the table of durations, sample rates and gaps, with at most `limit` trajectories."""
     head = ("trajectory", "samples", "duration", "sample rate", "jitter", "gaps", "longest")
     rows = []
-    # a data set of a thousand episodes would fill the terminal
     for clock in trajectories[:limit]:
         longest = f"{clock.longest_gap:.3g} s" if clock.gaps else "-"
         duration, rate = f"{clock.duration:.4g} s", f"{clock.sample_rate:.4g} Hz"

@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from spelgen.log_checks.tuning import TUNING
-from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.tuning import is_dense
 
 
 @dataclass(frozen=True)
@@ -85,16 +84,22 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def quantisation_step(values: np.ndarray) -> float:
     """Return the step of a quantised signal (T,); NaN if the signal is not quantised, or constant."""
     differences = np.diff(np.unique(values))
+    tolerance = 0.05  # of a step, and of the levels, that may be off the grid
     # two or three levels do not determine a grid
     if len(differences) < 3:
         return float("nan")
-    smallest = np.quantile(differences, TUNING.step_tolerance)
+    smallest = np.quantile(differences, tolerance)
     step = float(np.median(differences[differences <= 1.5 * smallest]))
     # over a hundred levels the error of the step accumulates to a fraction of a step
     near = differences[differences < 100 * step] / step
-    is_whole = np.abs(near - np.round(near)) < TUNING.step_tolerance
-    is_grid = len(near) > 2 and is_whole.mean() > 1 - TUNING.step_tolerance
+    is_whole = np.abs(near - np.round(near)) < tolerance
+    is_grid = len(near) > 2 and is_whole.mean() > 1 - tolerance
     # a smooth quantised signal passes neighbouring levels one after the other; commands with round values jump
     changes = np.abs(np.diff(values))
-    is_command = np.ptp(values) < TUNING.levels * step and changes[changes > 0].mean() > 1.5 * step
+    is_command = has_few_levels(step, float(np.ptp(values))) and changes[changes > 0].mean() > 1.5 * step
     return step if is_grid and not is_command else float("nan")
+
+
+def has_few_levels(step: float, width: float) -> bool:
+    """Whether a signal that is quantised to steps has too few of them in its range for a reliable magnitude."""
+    return width < 10.0 * step

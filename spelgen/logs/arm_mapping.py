@@ -1,16 +1,13 @@
 """The joints of logs and the mapping of their columns, from an arm, a model, or names of joints."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from spelgen.errors import LogError
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings, load_mapping
-from spelgen.settings.yaml_document import YamlDocument
+from spelgen.settings.yaml_document import YamlDocument, validated
 from spelgen.urdf.robot import Robot
 
 GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
@@ -86,6 +83,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
 
 def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
     """Return a mapping as an object; keys that a file or a dict does not have are from the settings, `stated`."""
+    # a complete mapping replaces the one of the settings; keys of a file or a dict complete it
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):

@@ -1,12 +1,15 @@
-"""Read bags of ROS 2 (MCAP, sqlite3) and ROS 1 by the package `rosbags`: no ROS is needed."""
+"""Read bags of ROS 2 (MCAP, sqlite3) and ROS 1 by the package `rosbags`: no ROS is needed.
 
-from __future__ import annotations
+MCAP files without an end are read here: a recorder that was killed writes no summary and no index. Their records follow
+one another: an operation code (1 byte), a length (8 bytes) and a body. https://mcap.dev/spec
+"""
 
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +17,6 @@ import pyarrow as pa
 from spelgen.errors import LogError, in_one_line
 from spelgen.files import limited_memory, require_regular_file
 from spelgen.labels import counted
-from spelgen.logs.mcap import MAGIC, mcap_messages
 from spelgen.logs.tables import LogFormat, LogTable, table_layout
 from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
@@ -22,14 +24,11 @@ ROS1 = ".bag"
 MESSAGE = "sensor_msgs/msg/JointState"
 MEMORY = 2**29  # bytes in addition to the messages of a bag
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
+MAGIC = b"\x89MCAP0\r\n"  # at both ends of a complete MCAP file
+SCHEMA, CHANNEL, MESSAGE_RECORD, CHUNK = 3, 4, 5, 6  # operation codes of MCAP
 
-
-class StampedState(NamedTuple):
-    """A joint state with the times [ns] of its header, 0 if it has none, and of the recorder."""
-
-    stamp: int
-    recorded: int
-    state: Any
+StampedState = tuple[int, int, Any]
+"""Times [ns] of a joint state: of its header, 0 if it has none, and of the recorder; and the joint state."""
 
 
 def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -51,48 +50,46 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[tuple[int, Any]]:
     """Return times [ns] of one clock, and the states; the clocks of header and recorder may differ by hours."""
-    without = sum(not message.stamp for message in messages)
-    if messages and without == len(messages):
+    # a stamp of 0 means that the publisher has set none
+    stamped = [(stamp, state) for stamp, _, state in messages if stamp]
+    if messages and not stamped:
         remarks.append("no message has a stamp: times are those at which the recorder received them")
-        return [(message.recorded, message.state) for message in messages]
-    if without:
-        remarks.append(f"{counted(without, 'message')} without a stamp left out")
-    return [(message.stamp, message.state) for message in messages if message.stamp]
+        return [(recorded, state) for _, recorded, state in messages]
+    if len(stamped) < len(messages):
+        remarks.append(f"{counted(len(messages) - len(stamped), 'message')} without a stamp left out")
+    return stamped
 
 
 def _joint_states(path: Path, messages: Sequence[tuple[int, Any]], names: Sequence[str]) -> pa.Table:
     """Return the columns `t`, `q_<name>`, `qd_<name>`, `tau_<name>`; fields that are always empty are omitted."""
     times: list[int] = []
-    rows: list[np.ndarray] = []
+    rows: list[list[np.ndarray]] = []
     other_names: dict[str, None] = {}
     for stamp, state in messages:
-        missing = set(names) - set(state.name)
+        missing = [name for name in names if name not in state.name]
         if len(missing) == len(names):
             other_names |= dict.fromkeys(state.name)
             continue
-        number = len(rows) + 1
+        element = f"message {len(rows) + 1}"
         if missing:
-            raise LogError(
-                f"a message with the joints {', '.join(state.name)}", file=path, element=f"message {number}",
-                expected=f"{', '.join(sorted(missing, key=names.index))} in it too",
-            )  # fmt: skip
-        values = np.full((len(FIELDS), len(state.name)), np.nan)  # for empty fields of the message
-        for k, field in enumerate(FIELDS.values()):
+            got, expected = (
+                f"a message with the joints {', '.join(state.name)}",
+                f"{', '.join(missing)} in it too",
+            )
+            raise LogError(got, file=path, element=element, expected=expected)
+        places, row = [state.name.index(name) for name in names], []
+        for field in FIELDS.values():
             logged = np.asarray(getattr(state, field), dtype=float)
             if len(logged) not in (0, len(state.name)):
-                raise LogError(
-                    f"{len(logged)} values for {len(state.name)} joints", file=path,
-                    element=f"message {number}, {field}", expected="one of each",
-                )  # fmt: skip
-            if len(logged):
-                values[k] = logged
+                got = f"{len(logged)} values for {len(state.name)} joints"
+                raise LogError(got, file=path, element=f"{element}, {field}", expected="one of each")
+            # a field of a message may be empty
+            row.append(logged[places] if len(logged) else np.full(len(names), np.nan))
         times.append(stamp)
-        rows.append(values[:, list(map(state.name.index, names))])
+        rows.append(row)
     if not rows:
-        raise LogError(
-            f"joint states of {', '.join(other_names) or 'no joint'} only", file=path,
-            expected=", ".join(names), do="map the joints' names under 'logs'",
-        )  # fmt: skip
+        got = f"joint states of {', '.join(other_names) or 'no joint'} only"
+        raise LogError(got, file=path, expected=", ".join(names), do="map the joints' names under 'logs'")
     columns = {"t": (np.array(times) - times[0]) * 1e-9}
     for quantity, by_joint in zip(FIELDS, np.array(rows).transpose(1, 2, 0), strict=True):  # (3, n, T)
         if not np.isnan(by_joint).all():
@@ -125,33 +122,29 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     try:
         # rosbags unpacks a whole chunk of any size; messages as arrays take ten times their bytes
         with limited_memory(MEMORY + 20 * size):
+            messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, topic, path)
             unfinished = [] if is_ros1 else _unfinished(path)
             if unfinished:
                 messages = _without_end(unfinished, topic, path, remarks)
-            else:
-                messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, topic, path)
             for recorded, raw in messages:
                 state: Any = decode(raw, MESSAGE)
                 clock = state.header.stamp
-                yield StampedState(clock.sec * 1_000_000_000 + clock.nanosec, recorded, state)
+                yield clock.sec * 1_000_000_000 + clock.nanosec, recorded, state
     except (LogError, GeneratorExit):
         raise
     except Exception as error:  # rosbags, its storages and their decompressors raise many types
-        reason = in_one_line(error).rstrip(".")
         do = "a recording that was not closed may be repaired by `ros2 bag reindex` or `rosbag reindex`"
-        raise LogError(
-            f"an unreadable ROS bag ({reason})", file=path, do=None if isinstance(error, MemoryError) else do
-        ) from error
+        got = f"an unreadable ROS bag ({in_one_line(error).rstrip('.')})"
+        raise LogError(got, file=path, do=None if isinstance(error, MemoryError) else do) from error
 
 
 def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> Iterator[tuple[int, bytes]]:
     """Yield times [ns] and contents of the joint states of one topic."""
     with open_bag(path) as reader:
-        topics = {x.topic for x in reader.connections if x.msgtype == MESSAGE}
         others = {f"{x.topic} ({x.msgtype})" for x in reader.connections}
-        chosen = _chosen_topic(topics, others, topic, path)
-        connections = [x for x in reader.connections if x.msgtype == MESSAGE and x.topic == chosen]
-        for _, recorded, raw in reader.messages(connections):
+        connections = [x for x in reader.connections if x.msgtype == MESSAGE]
+        chosen = _chosen_topic({x.topic for x in connections}, others, topic, path)
+        for _, recorded, raw in reader.messages([x for x in connections if x.topic == chosen]):
             yield recorded, raw
 
 
@@ -173,15 +166,11 @@ def _without_end(
     """Yield times [ns] and contents of the joint states of one topic, in files of which one is incomplete."""
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
-        raise LogError(
-            "a recording that was not closed, without a complete message of joint states", file=path,
-            expected="an MCAP file with an end", do="try `mcap recover FILE`",
-        )  # fmt: skip
-    chosen = _chosen_topic({topic for topic, _, _ in messages}, set(), topic, path)
+        got = "a recording that was not closed, without a complete message of joint states"
+        raise LogError(got, file=path, expected="an MCAP file with an end", do="try `mcap recover FILE`")
+    chosen = _chosen_topic({name for name, _, _ in messages}, set(), topic, path)
     remarks.append("the recording was not closed: all complete messages were read")
-    for name, recorded, raw in messages:
-        if name == chosen:
-            yield recorded, raw
+    yield from ((recorded, raw) for name, recorded, raw in messages if name == chosen)
 
 
 def _chosen_topic(topics: set[str], present: set[str], topic: str | None, path: Path) -> str:
@@ -191,18 +180,68 @@ def _chosen_topic(topics: set[str], present: set[str], topic: str | None, path: 
     if topic is None and len(topics) == 1:
         return topics.pop()
     names, do = ", ".join(sorted(topics)), None
+    got, expected = f"no joint states on {topic}", f"one of {names}"
     if not topics:
-        listed = ", ".join(sorted(present)) or "(none)"
-        got, expected = f"only the topics {listed}", f"one of {MESSAGE}"
+        got, expected = f"only the topics {', '.join(sorted(present)) or '(none)'}", f"one of {MESSAGE}"
     elif topic is None:
-        got, expected, do = (
-            f"joint states on the topics {names}",
-            "one of them",
-            "name it by 'topic' under 'logs'",
-        )
-    else:
-        got, expected = f"no joint states on {topic}", f"one of {names}"
+        got, expected = f"joint states on the topics {names}", "one of them"
+        do = "name it by 'topic' under 'logs'"
     raise LogError(got, file=path, expected=expected, do=do)
+
+
+def mcap_messages(path: Path, message_type: str) -> Iterator[tuple[str, int, bytes]]:
+    """Yield topic, time of the recorder [ns] and content of the messages of a type, up to the last complete one."""
+    types: dict[int, str] = {}
+    topics: dict[int, str] = {}
+    for code, body in _records(path.read_bytes()[len(MAGIC) :]):
+        if code == SCHEMA:
+            types[struct.unpack_from("<H", body)[0]] = _text(body, 2)
+        elif code == CHANNEL:
+            number, schema = struct.unpack_from("<HH", body)
+            if types.get(schema) == message_type:
+                topics[number] = _text(body, 4)
+        elif code == MESSAGE_RECORD:
+            number, _, recorded = struct.unpack_from("<HIQ", body)
+            if number in topics:
+                yield topics[number], recorded, body[22:]
+
+
+def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield code and body of the records, also of those within chunks, until one is cut off."""
+    start = 0
+    while start + 9 <= len(data):
+        code, length = struct.unpack_from("<BQ", data, start)
+        body = data[start + 9 : start + 9 + length]
+        start += 9 + length
+        # a chunk that is cut off still has complete records before the cut
+        if code == CHUNK:
+            yield from _records(_unpacked(body))
+        elif len(body) == length:
+            yield code, body
+
+
+def _unpacked(chunk: bytes) -> bytes:
+    """Return the records of a chunk, or the complete records of a chunk that is cut off."""
+    if len(chunk) < 40:
+        return b""
+    (size,) = struct.unpack_from("<Q", chunk, 16)
+    compression = _text(chunk, 28)
+    packed = chunk[32 + len(compression) + 8 :]
+    if not compression:
+        return packed
+    if compression == "zstd":
+        from backports.zstd import ZstdDecompressor
+
+        return ZstdDecompressor().decompress(packed, size)
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+
+    return bytes(LZ4FrameDecompressor().decompress(packed, size))
+
+
+def _text(data: bytes, start: int) -> str:
+    """Return the text at an offset in the data; it is preceded by its length."""
+    (length,) = struct.unpack_from("<I", data, start)
+    return data[start + 4 : start + 4 + length].decode()
 
 
 BAG = LogFormat(read_bag, suffixes=(".mcap", ".db3", ROS1), marker="metadata.yaml", folder="a ROS 2 bag")

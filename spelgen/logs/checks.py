@@ -4,10 +4,8 @@ A check is a code, a severity and a function of a subject, registered in CHECKS.
 individually, so that only one need be in memory. Package `log_checks` has the checks that need the robot.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
@@ -15,23 +13,32 @@ import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
-from spelgen.logs.joint_signals import Advice, JointSignals
-from spelgen.logs.jump_checks import (
+from spelgen.logs.joint_signals import (
+    Advice,
+    JointSignals,
     find_dropouts,
-    find_held,
+    find_elastic,
+    find_frozen,
     find_jumps,
-    find_too_rare,
-    find_unsigned_velocity,
+    is_factor,
+    joint_keys,
+    mapping_line,
 )
-from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
-from spelgen.logs.resonance import find_elastic
-from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
-from spelgen.logs.tuning import SIGNALS
-from spelgen.settings.log_mapping import TIMES
+from spelgen.logs.trajectory import Trajectory, gap_ends
+from spelgen.logs.tuning import SLOWEST, is_dense, shows_accelerations
+from spelgen.logs.unit_checks import (
+    find_held,
+    find_time_unit,
+    find_too_rare,
+    find_units,
+    find_unsigned_velocity,
+    find_wrong_velocity,
+    velocity_agreement,
+    velocity_products,
+)
+from spelgen.settings.log_mapping import SCALES
 
-DEGREES = 180.0 / np.pi
 ELASTIC = "elastic-joint"
-TURNS = 4 * np.pi  # [rad] Joints with limits have smaller positions: larger ones are in degrees.
 
 Subject = TypeVar("Subject")
 
@@ -61,115 +68,35 @@ class Findings:
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
-    def add(self, check: Check[Any], message: str, where: str, file: Path | None = None) -> None:
-        """Add the message of a check; the message of an error is extended by the option that accepts it."""
-        if check.severity == "error":
-            do = f"{check.do}; --accept {check.code} if it is right"
-            error = LogError(message, file=file, element=where, expected=check.expected, do=do)
-            self.errors.append(error)
-        else:
+    def add(
+        self,
+        check: Check[Any],
+        message: str,
+        where: str,
+        file: Path | None = None,
+        keys: Mapping[str, object] | None = None,
+    ) -> None:
+        """Add the message of a check. With keys of the group `logs` that remedy it, a finding is an error."""
+        if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
+            return
+        do = f"{mapping_line(keys) if keys else check.do}; --accept {check.code} if it is right"
+        self.errors.append(LogError(message, file=file, element=where, expected=check.expected, do=do))
 
 
 def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
-) -> list[tuple[Check[Subject], str]]:
-    """Return the checks with a finding, and their messages. accepted: codes of checks that are omitted."""
-    results: dict[str, tuple[Check[Subject], str]] = {}
+) -> list[tuple[Check[Subject], Advice]]:
+    """Return the checks with a finding, and their findings. accepted: codes of checks that are omitted."""
+    results: dict[str, tuple[Check[Subject], Advice]] = {}
     for check in checks:
         # one message per cause: velocities in degrees would also fail the check of derivatives
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         found = check.find(subject)
-        if isinstance(found, Advice):
-            results[check.code] = replace(check, do=found.do), found.message
-        elif found is not None:
-            results[check.code] = check, found
+        if found is not None:
+            results[check.code] = check, Advice(found) if isinstance(found, str) else found
     return list(results.values())
-
-
-def velocity_products(trajectory: Trajectory) -> np.ndarray:
-    """Return sums of products (2n, 2n) of increments over several samples: of the integrals of qd, then of q."""
-    # imported here, since it takes half a second
-    from scipy.integrate import cumulative_trapezoid
-
-    products = np.zeros((2 * trajectory.q.shape[1],) * 2)
-    for piece in split_at_gaps(trajectory, shortest=2):
-        # over several samples: between neighbouring samples the quantisation of q may be larger than its change
-        span = min(SIGNALS.increments, len(piece) - 1)
-        integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
-        positions = np.concatenate([integral, piece.q], axis=1)
-        increments = positions[span:] - positions[:-span]
-        products += increments.T @ increments
-    return products
-
-
-def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return factors (n,) by which qd must be multiplied to be dq/dt, and correlations (n, n).
-
-    Correlation (i, j) is 1 if qd of joint i is proportional to dq/dt of joint j, and NaN if one of them is at rest.
-    products: see `velocity_products`.
-    """
-    n = len(products) // 2
-    qd_squares, q_squares = np.split(products.diagonal(), 2)
-    sizes = np.outer(np.sqrt(qd_squares), np.sqrt(q_squares))
-    correlations = products[:n, n:] / np.where(sizes > 1e-12, sizes, np.nan)
-    return products[:n, n:].diagonal() / np.where(qd_squares > 0, qd_squares, np.nan), correlations
-
-
-def find_degrees(signals: JointSignals) -> str | None:
-    """Find revolute joints that were probably recorded in degrees."""
-    if signals.kind == "prismatic":
-        return None
-    if signals.changes_by(DEGREES):
-        return f"q that changes {signals.factor:.3g} times as fast as qd says (180/pi is 57.3)"
-    if signals.changes_by(1 / DEGREES):
-        return f"qd that is {1 / signals.factor:.3g} times as large as q changes (180/pi is 57.3)"
-    if np.ptp(signals.q) > TURNS and not signals.turns:
-        return f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
-    return None
-
-
-def find_frozen(signals: JointSignals) -> str | None:
-    """Find a position or a velocity that never changes while the other one does."""
-    from scipy.integrate import cumulative_trapezoid
-
-    q, qd = signals.q, signals.qd
-    if np.ptp(qd) == 0 and np.ptp(q) > SIGNALS.drift:
-        return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
-    # by the trapezoidal rule, so that noise of qd about zero has a small integral
-    drift = np.abs(cumulative_trapezoid(qd, signals.trajectory.t)).max(initial=0.0)
-    if np.ptp(q) == 0 and drift > SIGNALS.drift:
-        return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
-    return None
-
-
-def find_time_unit(signals: JointSignals) -> str | Advice | None:
-    """Find times that are not in seconds: from a sample rate below 2 Hz, or from the ratio of dq/dt to qd."""
-    step = signals.step
-    if step > SIGNALS.slowest_step:
-        # reported once, and not for each joint
-        if signals.number:
-            return None
-        unit = time_unit(step)
-        message = f"a sample every {step:.3g} s"
-        if unit is None or signals.trajectory.mapping.units.t != "s":
-            return message
-        message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
-        return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
-    for unit in ("ms", "us", "ns"):
-        if signals.changes_by(TIMES[unit]):
-            message = f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
-            return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
-    return None
-
-
-def time_unit(step: float) -> str | None:
-    """Return the unit of time in which a step between samples is plausible for a robot's log; None if there is none."""
-    for unit, size in TIMES.items():
-        if SIGNALS.fastest_step <= step * size <= SIGNALS.slowest_step:
-            return unit
-    return None
 
 
 def find_no_torques(signals: JointSignals) -> str | None:
@@ -179,25 +106,6 @@ def find_no_torques(signals: JointSignals) -> str | None:
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"
-
-
-def find_wrong_velocity(signals: JointSignals) -> str | None:
-    """Find velocities that are not the derivative of the positions, and a joint or a sign that fits better."""
-    factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
-    # times in another unit are a finding of the first joint already
-    if signals.step > SIGNALS.slowest_step:
-        return None
-    if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
-        return None
-    advice = ""
-    if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
-        # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
-        advice = "; its sense is opposite: write 'velocity: differentiated' under 'logs' in the robot's YAML"
-    for joint, fit in zip(signals.joints, signals.correlations, strict=True):
-        if fit > max(SIGNALS.agreement, correlation):
-            advice = f"; it is the derivative of q of joint {joint!r}: check the names of the columns"
-            break
-    return f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}{advice}"
 
 
 def find_constant_torque(signals: JointSignals) -> str | None:
@@ -237,35 +145,31 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
     )
 
 
-CLOCK_CHECKS = [
-    Check("gap", "info", find_gaps),
-    Check("low-rate", "warning", find_low_rate),
-]
+CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
 # reported when a log is read, one message per repair
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
     Check(
-        "jumps", "error", find_jumps, expected="signals without jumps",
-        do="split recordings that were joined by a column 'trajectory', or check the encoder",
-    ),
-    Check(
-        "dropouts", "error", find_dropouts,
-        unless=("jumps",), expected="signals without holes and outliers",
-        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
-    ),
-    Check(
-        "degrees", "error", find_degrees, unless=("jumps",), expected="radians and rad/s",
-        do="convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, declare them there, "
-        "or in the Parquet schema's metadata 'units'",
-    ),
-    Check(
         "frozen", "error", find_frozen, expected="columns that belong together",
         do="check the logger, and the names of the columns",
     ),
     Check(
+        "jumps", "error", find_jumps, unless=("frozen",), expected="signals without jumps",
+        do="split recordings that were joined by a column 'trajectory', or check the encoder",
+    ),
+    Check(
+        "dropouts", "error", find_dropouts,
+        unless=("frozen", "jumps"), expected="signals without holes and outliers",
+        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
+    ),
+    Check(
+        "degrees", "error", find_units, unless=("jumps",), expected="radians and rad/s",
+        do="write 'units' under 'logs' in the robot's YAML, or declare them in the Parquet schema's metadata",
+    ),
+    Check(
         "time-unit", "error", find_time_unit, unless=("degrees", "frozen"), expected="times in seconds",
-        do="write 'units: {t: ms}' (us, ns) under 'logs' in the robot's YAML",
+        do="state the unit of t as 'units' under 'logs' in the robot's YAML",
     ),
     Check(
         "held-samples", "error", find_too_rare, unless=("time-unit",),
@@ -283,7 +187,7 @@ CHECKS: list[Check[JointSignals]] = [
         do="check the names of the columns and the logger",
     ),
     Check(
-        "velocity-is-no-derivative", "warning", find_wrong_velocity,
+        "velocity-is-no-derivative", "warning", find_wrong_velocity, expected="dq/dt",
         unless=("degrees", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign"),
     ),
     Check(ELASTIC, "warning", find_elastic, unless=("degrees", "time-unit", "frozen", "dropouts", "jumps")),
@@ -301,42 +205,64 @@ class LogChecks:
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
         self.products = np.zeros((2 * len(joints),) * 2)
         self._joints, self._kinds = joints, joint_types
-        self._results: dict[tuple[str, Check[Any]], list[tuple[str, str, Path | None]]] = {}
+        self._results: dict[tuple[str, Check[Any]], list[tuple[Advice, str, Path | None]]] = {}
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
         """Add a trajectory."""
         self._count += 1
-        where = f"trajectory {trajectory.name}"
-        for clock_check, message in run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted):
-            self._add(message, clock_check, message, where, trajectory)
-        for result, messages in ((REPAIRED, trajectory.repairs), (REMARKED, trajectory.remarks)):
-            for message in messages:
-                self._add(message, result, message, where, trajectory)
+        found: list[tuple[Check[Any], Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
+        found += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
+        found += [(REMARKED, Advice(message)) for message in trajectory.remarks]
+        for check, advice in found:
+            self._add(advice.message, check, advice, trajectory)
         products = velocity_products(trajectory)
         self.products += products
-        factors, correlations = map(np.ndarray.tolist, velocity_agreement(products))
+        factors, correlations = velocity_agreement(products)
         for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
-            columns = trajectory.q[:, k], trajectory.qd[:, k]
-            signals = JointSignals(trajectory, k, kind, self._joints, *columns, factors[k], correlations[k])
-            for joint_check, message in run_checks(CHECKS, signals, trajectory.accepted):
-                self._add(joint, joint_check, message, f"{where}, joint {joint!r}", trajectory)
+            columns, fits = (trajectory.q[:, k], trajectory.qd[:, k]), correlations[:, k].tolist()
+            signals = JointSignals(trajectory, k, kind, self._joints, *columns, float(factors[k]), fits)
+            for check, advice in run_checks(CHECKS, signals, trajectory.accepted):
+                self._add(joint, check, advice, trajectory)
 
-    def _add(self, group: str, result: Check[Any], message: str, where: str, trajectory: Trajectory) -> None:
-        self._results.setdefault((group, result), []).append((message, where, trajectory.file))
+    def _add(self, group: str, check: Check[Any], advice: Advice, trajectory: Trajectory) -> None:
+        occurrence = advice, f"trajectory {trajectory.name}", trajectory.file
+        self._results.setdefault((group, check), []).append(occurrence)
 
     def findings(self) -> Findings:
-        """Return the findings: one per joint and check; of checks of clocks, one per message."""
+        """Return the findings: errors per check, with all its joints; notes per check and joint, or message."""
         summary = Findings()
-        for (_, result), occurrences in self._results.items():
+        groups: dict[tuple[Check[Any], str], list[str]] = {}
+        for (group, check), occurrences in self._results.items():
             # joints at rest are a finding only if they never move
-            if result.everywhere and len(occurrences) < self._count:
-                continue
-            message, where, file = occurrences[0]
+            if not check.everywhere or len(occurrences) == self._count:
+                is_error = check.severity == "error" or occurrences[0][0].is_line
+                groups.setdefault((check, "" if is_error else group), []).append(group)
+        for (check, _), names in groups.items():
+            occurrences = self._results[names[0], check]
+            advice, where, file = occurrences[0]
+            message = advice.message
             if len(occurrences) > 1:
                 message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
-            summary.add(result, message, where, file)
+            if names[0] in self._joints:
+                where += f", joint {', '.join(map(repr, names))}"
+            entries = {name: self._results[name, check][0][0].joint for name in names}
+            keys = {**advice.keys, **(self._joint_keys(entries) if advice.joint else {})}
+            summary.add(check, message, where, file, keys)
         return summary
+
+    def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
+        """Return the keys of joints in the group `logs`; joints that rest or move little have the units of most."""
+        first, *_ = entries
+        units, kinds = entries[first].get("units", {}), dict(zip(self._joints, self._kinds, strict=True))
+        ratio = SCALES.get(units.get("qd"), 1.0) / SCALES.get(units.get("q"), 1.0)
+        factors, _ = velocity_agreement(self.products)
+        kin = [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[first] == "prismatic")]
+        is_shared = entries[first].keys() == {"units"} and 2 * len(entries) > len(kin)
+        for joint, factor in zip(self._joints, factors.tolist(), strict=True):
+            if is_shared and joint in kin and (np.isnan(factor) or is_factor(factor, ratio)):
+                entries.setdefault(joint, {"units": dict(units)})
+        return joint_keys(entries, self._joints)
 
 
 def check(

@@ -10,12 +10,11 @@ import numpy as np
 from spelgen.dynamics.bristles import BristleReach, bristles_along, direction_along
 from spelgen.logs.filtering import interpolated, low_passed, regular_times, require_cutoff, resampled
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.logs.tuning import SAMPLES, TUNING
+from spelgen.logs.tuning import SAMPLES, TUNING, shows_accelerations
 
-FREQUENCY = SAMPLES.sample_rate
-SHORTEST = SAMPLES.shortest_piece
+FREQUENCY = 100.0  # [Hz] of the common grid: twelve times the cutoff of the low-pass filter
+SHORTEST = 1.0  # [s] of a gap-free piece: shorter ones consist of filter transients
 HOLE = 0.25 / TUNING.automatic_cutoff  # [s] a shorter gap has no information in the pass band of the filter
 AUTOMATIC = Preprocessing()
 
@@ -100,8 +99,10 @@ def _columns(
         require_cutoff(piece, rate if is_denser else FREQUENCY, cutoff)
     q, qd, tau = sampled(piece.q), sampled(piece.qd), sampled(piece.tau)
     selected = is_moving(qd)
-    if cutoff is not None:  # a filter that begins or ends within a motion has a transient
-        unsettled = round(SAMPLES.unsettled * FREQUENCY / cutoff)
+    # a filter that begins or ends within a motion has a transient, whose error is 20 times the noise for this long, in
+    # periods of the cutoff
+    if cutoff is not None:
+        unsettled = round(0.75 * FREQUENCY / cutoff)
         selected[:unsettled] = selected[len(selected) - unsettled :] = False
     if pauses and selected.any():
         moving = np.flatnonzero(selected)

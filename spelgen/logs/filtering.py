@@ -1,15 +1,12 @@
 """Zero-phase filters, resampling and differentiation of signals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
-from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
-from spelgen.logs.tuning import TUNING
+from spelgen.logs.tuning import is_dense
 
 # SciPy is imported in the functions that need it: its import takes most of a second, and few commands need it
 
@@ -70,7 +67,8 @@ def _sections(rate: float, cutoff: float) -> np.ndarray:
     """Return the filter's second-order sections (S, 6); their design takes as long as filtering a minute of a joint."""
     from scipy.signal import butter
 
-    return np.asarray(butter(TUNING.filter_order, cutoff, fs=rate, output="sos"))
+    # fourth order, run forward and backward as in the logs' published protocols
+    return np.asarray(butter(4, cutoff, fs=rate, output="sos"))
 
 
 def regular_times(t: np.ndarray, frequency: float) -> np.ndarray:
@@ -96,12 +94,13 @@ def velocities(trajectory: Trajectory) -> np.ndarray:
 def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
     """Return the derivative of q (..., T, n) at a rate [Hz]; of order 0: the smoothed q.
 
-    By cubic polynomials over `derivative_span` (Savitzky and Golay, Anal. Chem. 36, 1964).
+    By cubic polynomials over 0.18 s (Savitzky and Golay, Anal. Chem. 36, 1964).
     """
     from scipy.signal import savgol_filter
 
     samples = q.shape[-2]
-    width = 2 * round(TUNING.derivative_span * rate / 2) + 1
+    # the span is a trade-off of noise and lag (SO-101)
+    width = 2 * round(0.18 * rate / 2) + 1
     # the width is uneven, at least five samples for a cubic, and at most the number of samples
     width = min(max(5, width), samples - 1 + samples % 2)
     return np.asarray(savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2))

@@ -3,8 +3,6 @@
 A new format is a file like `csv_files.py`, and its name in FORMATS.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
@@ -17,6 +15,9 @@ from spelgen.logs.npz import NPZ
 from spelgen.logs.parquet_files import LEROBOT, PARQUET
 from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
+
+LogPaths = Path | str | Iterable[Path | str]
+"""Files and folders of logs, or addresses."""
 
 UNPACK = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".xz": "unxz", ".bz2": "bunzip2"}
 FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
@@ -39,9 +40,7 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[
         return log_format.read(path, joints, mapping)
 
 
-def log_files(
-    paths: Path | str | Iterable[Path | str], role: str | None = None
-) -> tuple[list[Path], list[SpelgenError]]:
+def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], list[SpelgenError]]:
     """Return the logs at these paths, each once, and the errors of all other paths.
 
     role: "train" or "test": of a folder with files train.* or test.*, only the files with this stem are used.
@@ -61,8 +60,7 @@ def log_files(
 
 def _unpacking(path: Path) -> str | None:
     """Return the advice to unpack a compressed file; None for other files."""
-    command = UNPACK.get(path.suffix)
-    return None if command is None else f"unpack it: {command} {path.name}"
+    return f"unpack it: {UNPACK[path.suffix]} {path.name}" if path.suffix in UNPACK else None
 
 
 def _logs_at(path: Path, role: str | None) -> list[Path]:
@@ -77,12 +75,11 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
     # hidden files are not recordings: macOS adds "._log.csv" to log.csv on other file systems
     logs = sorted(x for x in path.iterdir() if format_of(x) is not None and not x.name.startswith("."))
     if not logs:
-        packed = [unpacking for unpacking in map(_unpacking, sorted(path.iterdir())) if unpacking]
-        raise LogError("a folder without logs", file=path, expected=formats, do="; ".join(packed[:1]) or None)
-    if role is None or not any(log.stem in ("train", "test") for log in logs):
-        return logs
+        packed = next(filter(None, map(_unpacking, sorted(path.iterdir()))), None)
+        raise LogError("a folder without logs", file=path, expected=formats, do=packed)
+    # other names state no role: all logs of the folder are then used
     selected = [log for log in logs if log.stem == role]
-    if not selected:
-        got, expected = f"a folder without {role}.* among its logs", f"{role}.*, or files by name"
-        raise LogError(got, file=path, expected=expected)
-    return selected
+    if selected or role is None or {"train", "test"}.isdisjoint(log.stem for log in logs):
+        return selected or logs
+    got, expected = f"a folder without {role}.* among its logs", f"{role}.*, or files by name"
+    raise LogError(got, file=path, expected=expected)

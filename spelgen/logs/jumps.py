@@ -4,14 +4,14 @@ Every function takes one signal (T,) or the columns of a log (T, C), of any form
 difference between neighbouring samples, the typical step the median of the steps that are not 0.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from spelgen.logs.tuning import TUNING
+
+FINEST_WORD = 4e-6  # smallest step of words relative to the range of a signal: words of 18 bits
 
 
 def jump_count(values: np.ndarray, period: float) -> int:
@@ -62,18 +62,19 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     steps = np.diff(values)
     sizes = np.abs(steps)
     is_jump = sizes > TUNING.jump * _usual(sizes)
-    # a signal with many large steps is noisy
-    if not is_jump.any() or is_jump.mean() > TUNING.most_jumps:
+    # a signal with more large steps is noisy
+    if not is_jump.any() or is_jump.mean() > 0.05:
         return outliers
     for first, second in pairwise(np.flatnonzero(is_jump)):
         out, back = steps[first], steps[second]
-        is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= TUNING.excursion
+        # an outlier has at most five samples: a signal that returns later has jumped
+        is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= 5
         if not is_excursion:
             continue
         low, high = max(0, first - TUNING.jump_window), second + 1 + TUNING.jump_window
         # a fast motion has large steps on both sides; the two largest steps may belong to another outlier
         around = np.sort(np.concatenate([sizes[low:first], sizes[second + 1 : high]]))[:-2]
-        if min(abs(out), abs(back)) > TUNING.local_jump * around.max(initial=0.0):
+        if min(abs(out), abs(back)) > 4.0 * around.max(initial=0.0):
             outliers[first + 1 : second + 1] = True
     if smooth or not outliers.any():
         return outliers
@@ -83,8 +84,27 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     return np.asarray(outliers & is_beyond)
 
 
-def jumps(t: np.ndarray, q: np.ndarray, limit: float = TUNING.fastest) -> np.ndarray:
-    """Return the rows after which a position (T,) jumps: faster than `limit` [rad/s, m/s] and typical steps.
+def is_stale(values: np.ndarray, changes: np.ndarray, least: float) -> np.ndarray:
+    """Return a mask (T,) of samples that repeat an old value for long, in a signal that otherwise changes.
+
+    The step to the value after them is large: quantised signals, and drives with a dead zone, go on with a typical one.
+    changes: (T,), a signal that cannot change by more than `least` while the values are constant.
+    """
+    stale = np.zeros(len(values), bool)
+    starts = np.flatnonzero(np.diff(values, prepend=np.nan))
+    lengths = np.diff(np.append(starts, len(values)))
+    steps = np.append(np.abs(np.diff(values[starts])), np.inf)
+    is_long = lengths > 20.0 * max(1.0, float(np.median(lengths)))
+    is_long &= (steps > 4.0 * _usual(steps[:-1])) & (len(starts) > 1)
+    for start, length in zip(starts[is_long], lengths[is_long], strict=True):
+        rows = slice(start + 1, start + length)
+        if np.ptp(changes[rows]) > least:
+            stale[rows] = True
+    return stale
+
+
+def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return the rows after which a position (T,) jumps: faster than any arm, and than typical steps.
 
     Steps across gaps in time are not jumps: the arm may have moved in the gap.
     """
@@ -93,8 +113,8 @@ def jumps(t: np.ndarray, q: np.ndarray, limit: float = TUNING.fastest) -> np.nda
     sizes, dt = np.abs(np.diff(q)), np.diff(t)
     median = float(np.median(dt))
     is_jump = (sizes > TUNING.jump * _usual(sizes)) & (dt <= TUNING.gap * median)
-    # time stamps may come in bursts: a step lasts at least the median time
-    return np.flatnonzero(is_jump & (sizes > limit * np.maximum(dt, median)))
+    # no arm is faster than 40 rad/s, m/s; time stamps may come in bursts: a step lasts at least the median time
+    return np.flatnonzero(is_jump & (sizes > 40.0 * np.maximum(dt, median)))
 
 
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
@@ -111,9 +131,8 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     index = np.arange(len(columns)) - np.repeat(starts, lengths)
     if len(starts) < 4 or not index.any():
         return np.repeat(is_held, lengths), 1
-    steps = np.abs(
-        np.diff(columns[starts, :positions], axis=0)
-    )  # after each block of equal rows except the last
+    # after each block of equal rows except the last
+    steps = np.abs(np.diff(columns[starts, :positions], axis=0))
     speeds = steps[1:] / lengths[1:-1, None]
     quantum = np.min(np.where(steps > 0, steps, np.inf), axis=0)
     makes_up = (steps[:-1] > 2.5 * quantum) & (steps[:-1] > 0.6 * lengths[:-2, None] * speeds)
@@ -160,20 +179,21 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
     rows = np.flatnonzero(np.abs(steps) > limit)
-    if not len(rows) or len(rows) > TUNING.most_words * len(values):
+    # a signal about 0, and with it the sign bit of its words, changes its sign at half of the steps at most
+    if not len(rows) or len(rows) > 0.5 * len(values):
         return None
     jump, usual = float(np.median(np.abs(steps[rows]))), _usual(np.abs(steps))
     # torques may reverse abruptly: in a signal with negative values only jumps over the whole range are overflows
-    is_signed = values.min() < -TUNING.finest_word * np.ptp(values)
+    is_signed = values.min() < -FINEST_WORD * np.ptp(values)
     if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * usual):
         return None
     sizes = [x for x in _word_sizes(values, turn) if 0.75 < x / jump < 1.35]
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        # overflowing words are within one period; words with a sign bit are on both sides of it
+        # overflowing words are within one period but for noise; words with a sign bit are on both sides of it
         readings = []
-        if np.ptp(values) < size * (1 + TUNING.word_margin):
+        if np.ptp(values) < 1.01 * size:
             readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))
         if not is_signed and values.max() >= size:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
@@ -198,11 +218,11 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
     levels = np.unique(values)
     differences = np.diff(levels)
     # values were converted back from SI units: equal ones differ by rounding errors
-    differences = differences[differences > TUNING.finest_word * np.ptp(values)]
+    differences = differences[differences > FINEST_WORD * np.ptp(values)]
     if differences.size:
         step = float(differences.min())
         numbers = values / step
-        if np.abs(numbers - np.round(numbers)).max() < TUNING.word_rounding:
+        if np.abs(numbers - np.round(numbers)).max() < 0.02:
             sizes += [step * 2.0**k for k in range(10, 18)]
     return sizes
 

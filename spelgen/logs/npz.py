@@ -1,7 +1,5 @@
 """Reader of NPZ archives, with an array per column, or matrices with a column per joint."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -36,16 +34,21 @@ class NpzArrays:
             # zipfile itself reads at most this size of a member
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
-                raise LogError(
-                    f"{self._bytes / 1e9:.3g} GB of arrays", file=self.file, element=f"array {member.filename}",
-                    expected=f"at most {TUNING.npz_bytes / 1e9:.3g} GB", do="write larger logs as Parquet",
-                )  # fmt: skip
+                got, expected = (
+                    f"{self._bytes / 1e9:.3g} GB of arrays",
+                    f"at most {TUNING.npz_bytes / 1e9:.3g} GB",
+                )
+                raise self.error(member.filename, got, expected, "write larger logs as Parquet")
             with self._archive.open(member) as data:
                 try:
                     self._arrays[name] = np.lib.format.read_array(data, allow_pickle=False)
                 except MemoryError:
                     raise ValueError(f"array {member.filename} is larger than the file says") from None
         return self._arrays[name]
+
+    def error(self, name: str, got: str, expected: str, do: str | None = None) -> LogError:
+        """Return an error about an array."""
+        return LogError(got, file=self.file, element=f"array {name}", expected=expected, do=do)
 
     def column(self, name: str) -> pa.Array:
         """Return an array as a column; a matrix becomes a column of lists."""
@@ -64,14 +67,10 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     arrays, times = NpzArrays(file), mapping.columns.t
     if TRAJECTORY not in times:
         return [_table(None, arrays, joints, mapping)]
-    tables = []
-    for name in arrays.names:
-        text = _trajectory_text(times, name)
-        if text is not None:
-            tables.append(_table(text, arrays, joints, mapping.of_trajectory(text)))
-    if not tables:
+    texts = [text for text in (_trajectory_text(times, name) for name in arrays.names) if text is not None]
+    if not texts:
         raise missing_columns([times], arrays.names, file, mapping, joints)
-    return tables
+    return [_table(text, arrays, joints, mapping.of_trajectory(text)) for text in texts]
 
 
 def npz_columns(file: Path) -> pa.Table:
@@ -97,36 +96,40 @@ def _trajectory_text(pattern: str, name: str) -> str | None:
 def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping) -> LogTable:
     """Return the table of one recording of the archive, or of the only one."""
     for quantity in mapping.quantities:
-        # a joint's column may belong to a matrix `q` (T, n)
-        pattern: str = getattr(mapping.columns, quantity)
-        matrix = pattern.replace("{joint}", "").rstrip("_")
-        if matrix in arrays.names and arrays[matrix].ndim == 2:
-            names = [mapping.log_name(joint) for joint in joints]
-            places = dict(zip(names, _matrix_columns(arrays, matrix, names), strict=True))
-            columns_of: dict[str, str] = {}
-            for joint, name in zip(joints, names, strict=True):
-                columns_of[joint] = mapping.column(quantity, joint)
-                # a joint may have the column of another one
-                for owner in (name, *names):
-                    if pattern.replace("{joint}", owner) == columns_of[joint]:
-                        columns_of[joint] = f"{matrix}[{places[owner]}]"
-            mapping = mapping.with_joint_columns({joint: {quantity: x} for joint, x in columns_of.items()})
+        mapping = _with_matrix_columns(quantity, arrays, joints, mapping)
     # names only: the type of an array is unknown before it is read
     schema = pa.schema([(name, pa.null()) for name in arrays.names])
     layout = table_layout(schema, joints, mapping, arrays.file)
     if recording is not None:
         layout = replace(layout, labels=None, recording=recording)
-    columns: dict[str, pa.Array] = {}
     samples = arrays[layout.columns[0]].shape
-    for name in stored_columns(layout, arrays.names):
+    columns = stored_columns(layout, arrays.names)
+    for name in columns:
         shape = arrays[name].shape
-        if shape[:1] != samples or len(shape) > 2 or (len(shape) == 2 and name in layout.columns):
-            raise LogError(
-                f"an array of shape {shape}", file=arrays.file, element=f"array {name}",
-                expected=f"a value for each of the {samples[0] if samples else 0} times",
-            )  # fmt: skip
-        columns[name] = arrays.column(name)
-    return layout, pa.table(columns)
+        # the elements of a matrix are columns of the layout, the matrix itself is none
+        if shape[:1] != samples or len(shape) > 1 + (name not in layout.columns):
+            expected = f"a value for each of the {samples[0] if samples else 0} times"
+            raise arrays.error(name, f"an array of shape {shape}", expected)
+    return layout, pa.table({name: arrays.column(name) for name in columns})
+
+
+def _with_matrix_columns(
+    quantity: str, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping
+) -> LogMapping:
+    """Return the mapping with the columns of a matrix such as `q` (T, n), if there is one of the quantity's name."""
+    pattern = mapping.pattern(quantity)
+    matrix = pattern.replace("{joint}", "").rstrip("_")
+    if matrix not in arrays.names or arrays[matrix].ndim != 2:
+        return mapping
+    names = [mapping.log_name(joint) for joint in joints]
+    places = dict(zip(names, _matrix_columns(arrays, matrix, names), strict=True))
+    columns: dict[str, dict[str, str | None]] = {}
+    for joint, name in zip(joints, names, strict=True):
+        column = mapping.column(quantity, joint)
+        # a joint may have the column of another one
+        owners = [x for x in (name, *names) if pattern.replace("{joint}", x) == column]
+        columns[joint] = {quantity: f"{matrix}[{places[owners[0]]}]" if owners else column}
+    return mapping.with_joint_columns(columns)
 
 
 def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str]) -> list[int]:
@@ -134,18 +137,16 @@ def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str]) -> li
     width = arrays[matrix].shape[1]
     if JOINT_NAMES not in arrays.names:
         if width != len(joints):
-            raise LogError(
-                f"{width} columns", file=arrays.file, element=f"array {matrix}",
-                expected=f"{len(joints)}, one for each joint", do=f"name them by an array {JOINT_NAMES!r}",
-            )  # fmt: skip
+            expected, do = f"{len(joints)}, one for each joint", f"name them by an array {JOINT_NAMES!r}"
+            if len(arrays[matrix]) == len(joints):
+                do = "transpose it: rows are times"
+            raise arrays.error(matrix, f"{width} columns", expected, do)
         return list(range(width))
     names = list(map(str, arrays[JOINT_NAMES].ravel()))
     for joint in joints:
         if joint not in names or len(names) != width:
-            raise LogError(
-                f"the joints {', '.join(names)}", file=arrays.file, element=f"array {JOINT_NAMES}",
-                expected=f"{joint} among the names of the {width} columns of {matrix}",
-            )  # fmt: skip
+            expected = f"{joint} among the names of the {width} columns of {matrix}"
+            raise arrays.error(JOINT_NAMES, f"the joints {', '.join(names)}", expected)
     return list(map(names.index, joints))
 
 

@@ -1,7 +1,5 @@
 """Reader of the columns of Parquet logs, and of LeRobot 3 data sets, which consist of Parquet files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
@@ -16,8 +14,7 @@ from spelgen.errors import LogError, collect
 from spelgen.files import read_json, require_regular_file
 from spelgen.logs.tables import LogFormat, LogTable, reading, stored_columns, table_layout
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
-from spelgen.settings.messages import validated
-from spelgen.settings.yaml_document import YamlDocument
+from spelgen.settings.yaml_document import YamlDocument, validated
 
 INFO = "meta/info.json"  # file in a LeRobot data set
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
@@ -42,6 +39,7 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
     """
     info = read_json(folder / INFO, LogError)
     states, actions = _motor_names(folder, info, STATE), _motor_names(folder, info, ACTION)
+    columns: dict[str, dict[str, str | None]] = {}
     for joint in joints:
         name = mapping.log_name(joint)
         for names in (states, actions):
@@ -50,8 +48,8 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
                     f"the motors {', '.join(names) or 'without names'}", file=folder / INFO, element=f"joint {joint}",
                     expected=f"{name} among them", do="write its name under 'logs', 'joints' in the robot's YAML",
                 )  # fmt: skip
-        motors = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
-        mapping = mapping.with_joint_columns({joint: motors})
+        columns[joint] = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
+    mapping = mapping.with_joint_columns(columns)
     common = mapping.columns.model_copy(update={"t": TIMESTAMP, "trajectory": "episode_index"})
     mapping = mapping.model_copy(update={"columns": common})
     files = sorted((folder / "data").rglob("*.parquet"))
@@ -73,8 +71,8 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
     tables: list[LogTable] = []
     for file in files:
         with reading(file):
-            for layout, table in read_parquet(file, joints, mapping):
-                tables.append((replace(layout, file=folder, remarks=remarks), table))
+            ((layout, table),) = read_parquet(file, joints, mapping)
+            tables.append((replace(layout, file=folder, remarks=remarks), table))
     return tables
 
 

@@ -8,10 +8,9 @@ from math import inf
 
 from spelgen.errors import Diagnostic, SettingsError, SpelgenError, collect
 from spelgen.logs.filtering import low_pass
-from spelgen.logs.rates import FAST
 from spelgen.logs.recording import earlier
 from spelgen.logs.trajectory import GAP, Trajectory, split_at_gaps
-from spelgen.logs.tuning import TUNING
+from spelgen.logs.tuning import FAST, TUNING
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,6 @@
 """Conversion of rows in SI units to trajectories: order, wraps, repeats, outliers, velocities, delay of torques."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from math import pi
 
@@ -11,12 +8,15 @@ import numpy as np
 
 from spelgen.errors import LogError
 from spelgen.labels import counted
-from spelgen.logs.jumps import centred, is_outlier, jump_count, repeated_rows, unwrapped
+from spelgen.logs.jumps import centred, is_outlier, is_stale, jump_count, repeated_rows, unwrapped
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import foreign_rows
 from spelgen.settings.log_mapping import LogMapping
+
+Repaired = tuple[np.ndarray, tuple[str, ...]]
+"""Rows of a log (T, C), and messages on their changes."""
 
 
 def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:
@@ -25,85 +25,87 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     Before the differentiation, wrapped angles and overflowed registers are unwrapped, and repeated rows are removed;
     with 'dropouts: dropped' lost rows and outliers are removed, too.
     """
-    mapping, remarks = layout.mapping, layout.remarks
-    data, wraps = _without_wraps(data, mapping.signals(layout.joints), mapping)
+    mapping = layout.mapping
+    signals = mapping.signals(layout.joints)
+    data, wraps = _without_wraps(data, signals, mapping)
     data, dropped = _without_repeats(data, len(layout.joints), mapping)
     repairs += dropped
     if mapping.dropouts == "dropped":
-        data, dropped = _without_outliers(data, mapping.signals(layout.joints))
+        data, dropped = _without_outliers(data, signals)
         repairs += dropped
-    t, columns = data[:, 0], np.split(data[:, 1:], len(mapping.quantities), axis=1)
-    signals = dict(zip(mapping.quantities, columns, strict=True))
-    q, tau = signals["q"], signals.get("tau", np.zeros((len(t), 0)))
-    qd = signals.get("qd", np.zeros_like(q))
-    if "qd" not in signals:
+    t, *columns = np.split(data, [1 + len(layout.joints) * k for k in range(len(mapping.quantities))], axis=1)
+    t, logged = t[:, 0], dict(zip(mapping.quantities, columns, strict=True))
+    q = logged["q"]
+    qd = logged.get("qd", np.zeros_like(q))
+    if "qd" not in logged:
         for rows in _pieces(t):
             qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # central differences
-    tau = earlier(t, tau, mapping.torque_delay)
-    trajectory = Trajectory(t, q, qd, tau, name, layout.file, layout.accepted, signals.get("u"), repairs)
-    return replace(trajectory, remarks=remarks + wraps, mapping=mapping)
+    tau = earlier(t, logged.get("tau", np.zeros((len(t), 0))), mapping.torque_delay)
+    return Trajectory(
+        t, q, qd, tau, name, layout.file, layout.accepted, logged.get("u"), repairs, layout.remarks + wraps, mapping
+    )  # fmt: skip
 
 
-def _without_wraps(
-    data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> Repaired:
     """Return rows (T, C) in which signals with a period are unwrapped, and remarks."""
     remarks: list[str] = []
+    if not any(mapping.word("period", *signal) for signal in signals):
+        return data, ()
+    data = data.copy()
     values = dict(zip(signals, data[:, 1:].T, strict=True))
-    for (quantity, joint), logged in values.items():
+    for (quantity, joint), column in values.items():
         period = abs(mapping.scale(quantity, joint)) * (mapping.word("period", quantity, joint) or 0.0)
         if not period:
             continue
-        count = jump_count(logged, period)
-        result = unwrapped(logged, period)
+        count = jump_count(column, period)
+        result = unwrapped(column, period)
         if quantity == "u":
             # commands are close to positions; their registers may start in different revolutions
             result = result - period * np.round(np.median(result - values["q", joint]) / period)
         # angles are centred within half a turn only if they wrap
-        elif count or abs(period - 2 * pi) > TUNING.limit_of_turn:
+        elif count or abs(period - 2 * pi) > 1e-6:
             offset = mapping.offset(quantity, joint)
             result = centred(result - offset, period) + offset
         if count:
             remarks.append(f"{quantity} of {joint!r} wraps at {period:.4g}: {counted(count, 'jump')} removed")
-        if result is not logged:
-            values[quantity, joint] = result
-    if all(column is logged for column, logged in zip(values.values(), data[:, 1:].T, strict=True)):
-        return data, ()
-    return np.column_stack([data[:, 0], *values.values()]), tuple(remarks)
+        column[:] = result
+    return data, tuple(remarks)
 
 
-def _without_repeats(
-    data: np.ndarray, positions: int, mapping: LogMapping
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _without_repeats(data: np.ndarray, positions: int, mapping: LogMapping) -> Repaired:
     """Return rows (T, C), without repeats if all rows are repeated or 'dropouts: dropped' is set, and messages."""
     # too short to distinguish motion from rest; an archive may have thousands of such recordings
     if len(data) < TUNING.jump_window:
         return data, ()
     repeats, copies = repeated_rows(data[:, 1:], positions)
     count = int(np.count_nonzero(repeats))
-    if count <= TUNING.repeats * len(data):
+    # so few have no effect on a fit
+    if count <= 0.02 * len(data):
         return data, ()
     rate = (len(data) - 1 - count) / (data[-1, 0] - data[0, 0])
-    message = f"every row is written {copies} times"
-    if copies == 1:
-        message = f"{count} rows repeat the row before in motion"
-        if mapping.dropouts == "kept":
-            return data, (f"{message}: 'dropouts: dropped' under 'logs' removes them, {rate:.3g} Hz remain",)
+    if copies > 1:
+        return data[~repeats], (
+            f"every row is written {copies} times: repeats were left out, {rate:.3g} Hz remain",
+        )
+    message = f"{count} rows repeat the row before in motion"
+    if mapping.dropouts == "kept":
+        return data, (f"{message}: 'dropouts: dropped' under 'logs' removes them, {rate:.3g} Hz remain",)
     return data[~repeats], (f"{message}: repeats were left out, {rate:.3g} Hz remain",)
 
 
-def _without_outliers(
-    data: np.ndarray, signals: Sequence[tuple[str, str]]
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> Repaired:
     """Return rows (T, C) without lost samples and outliers, and messages that list them."""
     outliers = np.zeros(len(data), bool)
     found = []
-    for (quantity, joint), values in zip(signals, data[:, 1:].T, strict=True):
-        if quantity != "u":
-            rows = outlier_rows(quantity, values)
+    columns = dict(zip(signals, data[:, 1:].T, strict=True))
+    for (quantity, joint), values in columns.items():
+        rows = outlier_rows(quantity, values)
+        if ("qd", joint) in columns:
+            rows |= stale_rows(quantity, values, data[:, 0], columns["q", joint], columns["qd", joint])
+        # commands may jump
+        if quantity != "u" and rows.any():
             outliers |= rows
-            if rows.any():
-                found.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
+            found.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
     if not found:
         return data, ()
     message = f"{counted(int(outliers.sum()), 'row')} left out as dropouts: {'; '.join(found)}"
@@ -116,6 +118,19 @@ def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
     return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
 
 
+def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+    """Return a mask (T,) of samples of "q", "qd" or "tau" of a moving joint that repeat an old value for long.
+
+    A torque at its largest or smallest value is not stale, but clipped, and the last one may be of a motor at rest.
+    """
+    if quantity == "tau":
+        stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
+        return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
+    from scipy.integrate import cumulative_trapezoid  # takes long to import
+
+    return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)  # rad, m
+
+
 def listed_times(t: np.ndarray) -> str:
     """Return a text with the first of the times (T,) [s] and the number of the others."""
     shown = ", ".join(f"{x:.4g}" for x in t[: TUNING.listed].tolist())
@@ -123,7 +138,7 @@ def listed_times(t: np.ndarray) -> str:
     return f"{shown} s" + (f" and {more} more" if more > 0 else "")
 
 
-def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[np.ndarray, tuple[str, ...]]:
+def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaired:
     """Return the values (T, C) of rows of a file with increasing times, and messages about repairs.
 
     Rows are sorted if this makes the positions smoother. Of several rows with one time the first is kept, or the times
@@ -145,13 +160,13 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
         positions = slice(1, 1 + len(layout.joints))
         # sorting must not interleave two recordings in one file
         if _roughness(ordered[:, positions]) > _roughness(data[:, positions]):
-            require_increasing_times(t, rows, layout)
+            raise _backward_times(t, rows, layout)
         data = ordered
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
-    # many rows with equal times and different values: the clock is coarse
-    if np.count_nonzero(differs) > max(TUNING.few_repeats, TUNING.coarse_clock * len(data)):
+    # many rows with equal times and different values: the clock is coarse; up to ten are accidental
+    if np.count_nonzero(differs) > max(10, 0.02 * len(data)):
         t, message = _reconstructed(data[:, 0], layout)
         return np.column_stack([t, data[:, 1:]]), (*repairs, message)
     repeats = np.count_nonzero(is_repeat)
@@ -196,21 +211,18 @@ def _roughness(positions: np.ndarray) -> float:
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
 
 
-def require_increasing_times(t: np.ndarray, rows: Sequence[int] | np.ndarray, layout: Layout) -> None:
-    """Raise LogError unless times (T,) increase; rows: their numbers in the file."""
+def _backward_times(t: np.ndarray, rows: np.ndarray, layout: Layout) -> LogError:
+    """Return the error of times (T,) that do not increase; rows: their numbers in the file."""
     backward = np.flatnonzero(np.diff(t) < TUNING.shortest_step)
-    if backward.size:
-        k = backward[0]
-        got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"
-        do = "sort the rows, drop repeats, or split recordings by a column 'trajectory'"
-        raise layout.row_error(got, rows[k + 1], layout.columns[0], "increasing times", do)
+    k = backward[0]
+    got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"
+    do = "sort the rows, drop repeats, or split recordings by a column 'trajectory'"
+    return layout.row_error(got, rows[k + 1], layout.columns[0], "increasing times", do)
 
 
 def _pieces(t: np.ndarray) -> Iterator[slice]:
     """Yield the gap-free pieces of at least two samples of times (T,)."""
-    for start, stop in pairwise(gap_ends(t)):
-        if stop - start > 1:
-            yield slice(start, stop)
+    yield from (slice(start, stop) for start, stop in pairwise(gap_ends(t)) if stop - start > 1)
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:

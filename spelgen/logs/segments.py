@@ -1,10 +1,8 @@
 """Collector of recordings from log tables: complete, or as evenly spread segments within a bound of memory."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from dataclasses import dataclass
 from math import inf
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -20,8 +18,7 @@ Piece = tuple[int, str, np.ndarray]
 """Number and name of a recording, and rows of it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Segment:
+class Segment(NamedTuple):
     """Consecutive rows of one recording.
 
     Attributes:
@@ -72,16 +69,15 @@ class LogSegments:
 
     def trajectories(self) -> Iterator[Trajectory | LogError]:
         """Yield each kept recording, or the error of its times, and remove its segments."""
+        # each segment is released once it is joined: their memory is not needed twice
         segments, self._segments = self._segments[::-1], []
         while segments:
             group = [segments.pop()]
             while segments and segments[-1].recording == group[0].recording:
                 group.append(segments.pop())
             first = group[0]
-            values, rows = first.values, first.rows
-            if len(group) > 1:
-                values = np.concatenate([x.values for x in group])
-                rows = np.concatenate([x.rows for x in group])
+            values = np.concatenate([x.values for x in group]) if len(group) > 1 else first.values
+            rows = np.concatenate([x.rows for x in group])
             try:
                 values, repairs = in_time_order(values, rows, first.layout)
                 yield make_trajectory(values, first.layout, first.name, repairs)
@@ -96,6 +92,7 @@ class LogSegments:
             if size <= self._kept_bytes or len(self._segments) + len(kept) <= 1:
                 self._count += len(pieces)
                 return kept
+            # halving keeps the rest evenly spread, for any files read before
             self.every *= 2
             self._segments = self._segments[::2]
             self._bytes = sum(x.values.nbytes for x in self._segments)

@@ -3,8 +3,6 @@
 Units that neither names nor times specify remain SI: the checks of logs detect degrees, and state the lines to write.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import re
@@ -16,11 +14,12 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
-from spelgen.logs.checks import time_unit
 from spelgen.logs.formats import FORMATS, format_of
 from spelgen.logs.parquet_files import LEROBOT, dataset_motors
 from spelgen.logs.tables import names_joint, reading
 from spelgen.logs.tuning import TUNING
+from spelgen.logs.unit_checks import time_unit
+from spelgen.settings.log_mapping import CURRENTS
 
 WORDS = {
     "t": {"t", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis"},
@@ -38,9 +37,12 @@ NOT_MEASURED = COMMANDED | {"error", "std"}
 UNITS = {
     "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "ns": "ns"},
     "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad",
-          "counts": "counts", "ticks": "counts", "turns": "turns", "mm": "mm", "m": "m"},
-    "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "rpm": "rpm", "mm/s": "mm/s"},
-    "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA"},
+          "mrad": "mrad", "counts": "counts", "ticks": "counts", "turns": "turns", "rev": "turns", "mm": "mm",
+          "m": "m"},
+    "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "mrad/s": "mrad/s", "°/s": "deg/s",
+           "rev/s": "turns/s", "rpm": "rpm", "mm/s": "mm/s"},
+    "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
+            "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
 BARE = {"s", "n", "a", "m"}  # letters that count as units only in brackets
 CURRENT = {"current", "currents", "curr", "cur"}
@@ -81,8 +83,10 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         raise LogError(got, file=file, expected="one of times, called t or time")
     # a header has the time of measurement, other columns may be times of receipt; else the shortest name is used
     clock = min(found.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
+    # loggers have orders of their own, ROS often the alphabetical one
     order = _order_in_cells(table, joints)
     by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in found.items()}
+    # velocities of some joints only are replaced by differentiated velocities of all
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)
@@ -94,38 +98,43 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     if not commands and "qd" not in by_joint:
         lines.append("velocity: differentiated")
     lines.append("joints:")
-    missing = []
     for joint in joints:
         entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
-        missing += [f"{quantity} of {joint}" for quantity in by_joint if quantity not in entries]
         lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}"]
-        if units.get("tau") in ("A", "mA"):
+        if units.get("tau") in CURRENTS:
             at_joint = "at the joint, the gear included: write its value"
             lines.append(f"    gain: 1.0 # Nm per {units['tau']} {at_joint}")
         if units.get("q") == "counts":
             lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
-    lines += [f"# no column was found for {column}" for column in missing]
-    return Suggestion("\n".join(lines) + "\n", tuple(missing))
+    used = {column.name for named in by_joint.values() for column in named.values()}
+    others = [x.name for quantity in by_joint for x in found[quantity] if x.name not in used]
+    if others:  # of a gripper, or of another arm with the same names
+        lines.append(f"# not used: {shortened(others, TUNING.listed)}")
+    missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
+    return _suggestion(lines, missing, "column")
+
+
+def _suggestion(lines: Sequence[str], missing: Sequence[str], kind: str) -> Suggestion:
+    notes = [f"# no {kind} was found for {column}" for column in missing]
+    return Suggestion("\n".join([*lines, *notes, ""]), tuple(missing))
 
 
 def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
     """Return the mapping of a data set of LeRobot: the names of its motors."""
     motors = dataset_motors(folder)
+    close = {x: [x] if x in motors else difflib.get_close_matches(x, motors, n=1) for x in joints}
     lines = [
         f"# Drafted from the motors of {json.dumps(folder.name)}: check it.",
         "# LeRobot stores degrees, 'units: {q: deg}', or -100..100 of the calibrated range:",
         "# 'units: {q: normalised}' and 'calibration:' with the content of the robot's calibration file.",
         "joints:",
+        *(
+            f"  {json.dumps(joint)}: {{name: {json.dumps(names[0])}}}"
+            for joint, names in close.items()
+            if names
+        ),
     ]
-    missing = []
-    for joint in joints:
-        close = [joint] if joint in motors else difflib.get_close_matches(joint, motors, n=1)
-        if close:
-            lines.append(f"  {json.dumps(joint)}: {{name: {json.dumps(close[0])}}}")
-        else:
-            missing.append(f"q of {joint}")
-    lines += [f"# no motor was found for {column}" for column in missing]
-    return Suggestion("\n".join(lines) + "\n", tuple(missing))
+    return _suggestion(lines, [f"q of {joint}" for joint, names in close.items() if not names], "motor")
 
 
 def _column_name(name: str) -> ColumnName:
@@ -135,7 +144,7 @@ def _column_name(name: str) -> ColumnName:
     known = set().union(*UNITS.values())
     last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s)?)", name)
     if not unit and last and last[2].lower() in known - BARE and last[2] != name[:1]:
-        base, unit = last[1], last[2]
+        base, unit = last.groups()
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", base)
     return ColumnName(name, set(re.findall(r"[a-z]+", separated.lower())), unit.strip().lower())
 
@@ -166,12 +175,12 @@ def _units(
     units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
     for quantity, named in by_joint.items():
         for column in named.values():
-            stated = UNITS["q" if quantity == "u" else quantity].get(column.unit)
+            stated = UNITS.get(quantity, {}).get(column.unit)  # commands have the units of positions
             if stated is None and quantity == "qd":
                 stated = {"deg": "deg/s", "rad": "rad/s"}.get(units.get("q", ""))
             if stated is None and quantity == "tau" and column.words & CURRENT:
                 stated = "A"
-            if stated is not None and quantity != "u":
+            if stated is not None:
                 units[quantity] = stated
     return units
 
@@ -181,22 +190,18 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
     if name not in table.schema.names:
         return None
     times = table[name].drop_null()
-    if len(times) < 3 or not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
+    if not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
         return None
     steps = np.diff(times.to_numpy())
-    return time_unit(float(np.median(steps[steps > 0]))) if (steps > 0).any() else None
+    return time_unit(float(np.median(steps[steps > 0]))) if len(steps) > 1 and (steps > 0).any() else None
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
     """Return the index per joint from cells with names of joints: a column `name0`, or a list of names per row."""
     order: dict[str, int] = {}
-    for number, name in enumerate(table.schema.names):
-        kind = table.schema.field(number).type
-        numbers = re.findall(r"\d+", name)
-        if not len(table):
-            continue
-        first = table.column(number)[0].as_py()
-        if pa.types.is_nested(kind) and isinstance(first, list):
+    for name, column in zip(table.schema.names, table.columns if len(table) else (), strict=False):
+        numbers, first = re.findall(r"\d+", name), column[0].as_py()
+        if isinstance(first, list):
             order |= {text: place for place, text in enumerate(first) if text in joints}
         elif numbers and first in joints:
             order[first] = int(numbers[-1])
@@ -206,14 +211,11 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
 def _names(table: pa.Table) -> list[str]:
     """Return the unique names of all columns, and of the elements of columns of lists."""
     names: list[str] = []
-    for number, name in enumerate(table.column_names):
-        if table.column_names.count(name) > 1:
-            continue
-        values = table.column(number).drop_null()
-        if pa.types.is_nested(values.type) and len(values):
-            names += [f"{name}[{index}]" for index in range(len(values[0]))]
-        else:
-            names.append(name)
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        values = column.drop_null()
+        is_list = pa.types.is_nested(values.type) and len(values)
+        if table.column_names.count(name) == 1:
+            names += [f"{name}[{index}]" for index in range(len(values[0]))] if is_list else [name]
     return names
 
 
@@ -222,11 +224,8 @@ def _by_joint(
 ) -> dict[str, ColumnName]:
     """Return the column per joint: by the joint's name, else by the last number, in the order of URDF or cells."""
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
-    numbered: dict[int, ColumnName] = {}
-    for column in columns:
-        numbers = re.findall(r"\d+", column.name)
-        if numbers:
-            numbered[int(numbers[-1])] = column
+    numbers = [(re.findall(r"\d+", column.name), column) for column in columns]
+    numbered = {int(found[-1]): column for found, column in numbers if found}
     if named or len(numbered) < len(joints):
         return named
     if set(order) == set(joints):

@@ -1,7 +1,5 @@
 """Result of all readers of logs: a table, and its columns for the quantities of an arm."""
 
-from __future__ import annotations
-
 import difflib
 import re
 import zipfile
@@ -11,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, starmap
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
 
@@ -35,6 +34,7 @@ class Layout:
     file: for errors and trajectories. columns: of t, then of q, qd and tau per joint; without qd if velocities are
     differentiated. labels: the column with the names of recordings; None if there is none. accepted: see `Trajectory`.
     recording: name of the recording if the format separates recordings. remarks: facts about the file.
+    header: lines of a CSV before its values.
     """
 
     file: Path
@@ -45,10 +45,11 @@ class Layout:
     accepted: tuple[str, ...]
     recording: str | None = None
     remarks: tuple[str, ...] = ()
+    header: int = 1
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about a column in a data row, counted from 0, with the line of a CSV file."""
-        line = int(row) + 2 if self.file.suffix == ".csv" else None
+        """Return an error about a column in a 0-based data row, with the line of a CSV."""
+        line = int(row) + 1 + self.header if self.file.suffix == ".csv" else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
 
@@ -56,8 +57,7 @@ class Layout:
 LogTable = tuple[Layout, pa.Table]
 
 
-@dataclass(frozen=True)
-class LogFormat:
+class LogFormat(NamedTuple):
     """A format of logs: its files and its reader.
 
     read: function of a path, the joints and the mapping that returns tables, or raises LogError. suffixes: of its
@@ -83,31 +83,26 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     if metadata.get(UNITS_KEY) == UNITS:
         mapping = mapping.in_si()
     columns = [mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))]
-    missing = []
     for name in columns:
+        element = f"column {name}"
         if columns.count(name) > 1:
             got, expected = "one column for several joints", "'{joint}' in its name under 'logs'"
-            raise LogError(got, file=file, element=f"column {name}", expected=expected)
-        if schema.names.count(name) > 1:
-            places = ", ".join(str(k) for k, other in enumerate(schema.names, start=1) if other == name)
-            got = f"the same name for the columns {places}"
-            raise LogError(
-                got, file=file, element=f"column {name}", expected="it once", do="rename one of them"
-            )
-        if name not in schema.names and not list_element(name, schema.names):
-            missing.append(name)
+            raise LogError(got, file=file, element=element, expected=expected)
+        places = [str(k) for k, other in enumerate(schema.names, start=1) if other == name]
+        if len(places) > 1:
+            got = f"the same name for the columns {', '.join(places)}"
+            raise LogError(got, file=file, element=element, expected="it once", do="rename one of them")
+    missing = [x for x in columns if x not in schema.names and not list_element(x, schema.names)]
     if missing:
         raise missing_columns(missing, schema.names, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
     # lists cannot be names of recordings
     if labels and pa.types.is_nested(schema.field(labels).type):
-        kind = schema.field(labels).type
-        raise LogError(f"values of type {kind}", file=file, element=f"column {labels}", expected="names")
+        got = f"values of type {schema.field(labels).type}"
+        raise LogError(got, file=file, element=f"column {labels}", expected="names")
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
-    elif all(mapping.unit("q", joint) for joint in joints):
-        accepted += ("degrees",)
     return Layout(file, tuple(columns), labels, tuple(joints), mapping, accepted)
 
 
@@ -121,27 +116,20 @@ def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
 
 def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
     """Return the columns of a file that contain the columns of a layout, each once."""
-    stored: dict[str, None] = {}
-    for name in layout.columns:
-        element = list_element(name, columns)
-        stored[name if element is None else element[0]] = None
-    if layout.labels:
-        stored[layout.labels] = None
-    return list(stored)
+    elements = [list_element(name, columns) or (name, 0) for name in layout.columns]
+    labels = [layout.labels] if layout.labels else []
+    return list(dict.fromkeys([name for name, _ in elements] + labels))
 
 
 def missing_columns(
     missing: Sequence[str], columns: Collection[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> LogError:
     """Return the error for missing columns, with a remedy."""
-    quantities, expected = mapping.quantities, [mapping.columns.t]
-    for quantity in quantities:
-        expected.append(getattr(mapping.columns, quantity).replace("{joint}", "<joint>"))
-    of_quantity = {x: [mapping.column(x, joint) for joint in joints] for x in quantities}
-    unlogged = []
-    for joint, *names in zip(joints, *of_quantity.values(), strict=True):
-        if set(names) <= set(missing):
-            unlogged.append(joint)
+    of_quantity = {x: [mapping.column(x, joint) for joint in joints] for x in mapping.quantities}
+    patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]
+    of_joints = dict(zip(joints, zip(*of_quantity.values(), strict=True), strict=True))
+    unlogged = [joint for joint, names in of_joints.items() if set(names) <= set(missing)]
+    # a joint without any column was not logged; a wrong name affects one of its columns
     if unlogged and len(unlogged) < len(joints):
         logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (
@@ -155,12 +143,12 @@ def missing_columns(
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
         do = _renaming(missing[0], columns, of_quantity, [mapping.log_name(joint) for joint in joints])
-    listed = TUNING.listed
-    return LogError(
-        f"only the columns {shortened(list(columns), listed)}", file=file,
-        element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, listed)}",
-        expected=", ".join(expected), do=do,
-    )  # fmt: skip
+    element = f"missing column{'s' * (len(missing) > 1)} {shortened(missing, TUNING.listed)}"
+    got, expected = (
+        f"only the columns {shortened(list(columns), TUNING.listed)}",
+        ", ".join([mapping.columns.t, *patterns]),
+    )
+    return LogError(got, file=file, element=element, expected=expected, do=do)
 
 
 def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequence[str]) -> bool:
@@ -174,13 +162,12 @@ def _renaming(
     name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
 ) -> str:
     """Return the advice to rename an unused column of the same joint, or else to write the names in the settings."""
-    joint, used = "", set(chain(*of_quantity.values()))
-    for names in of_quantity.values():
-        if name in names:
-            joint = joints[names.index(name)]
-    unused = [column for column in columns if column not in used]
+    named = [
+        joint for names in of_quantity.values() for x, joint in zip(names, joints, strict=True) if x == name
+    ]
+    unused = [column for column in columns if column not in chain(*of_quantity.values())]
     for close in difflib.get_close_matches(name, unused, n=5):
-        if names_joint(close, joint):
+        if names_joint(close, "".join(named[-1:])):
             return f"rename the column {close!r} to {name!r}?"
     return (
         "rename the columns, or write their names under 'logs' in the robot's YAML: "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -54,27 +55,27 @@ class Trajectory:
     mapping: LogMapping = IN_SI
 
     def __post_init__(self) -> None:
-        for column in ("t", *self.quantities):
+        columns = ("t", *self.quantities)
+        for column in columns:
             # the dataclass is frozen, and accepts lists and tensors
             object.__setattr__(self, column, self._as_array(column))
         if self.t.ndim != 1 or not self.t.size:
             raise self.error(f"an array of shape {self.t.shape}", "(T,), a time for each sample", column="t")
         joints = self.q.shape[1] if self.q.ndim == 2 else "n"
         for column in self.quantities:
-            shape = getattr(self, column).shape
+            shape = self.column(column).shape
             if shape != (len(self), joints):
                 expected = f"({len(self)}, {joints}), a row for each time and a column for each joint"
                 raise self.error(f"an array of shape {shape}", expected, column=column)
-        for column in ("t", *self.quantities):
-            values = getattr(self, column)
-            largest = TUNING.latest if column == "t" else TUNING.largest_value
+        for column in columns:
+            values, largest = self.column(column), TUNING.latest if column == "t" else TUNING.largest_value
             possible = np.abs(values) < largest  # False for NaN
             if not possible.all():
                 row = int(np.argwhere(~possible)[0, 0])
-                expected = (
-                    f"numbers below {largest:g}" if np.isfinite(values[row]).all() else "finite numbers"
-                )
+                is_finite = np.isfinite(values[row]).all()
+                expected = f"numbers below {largest:g}" if is_finite else "finite numbers"
                 raise self.error(f"{values[row].tolist()} at sample {row}", expected, column=column)
+        # a step of nearly zero would give infinite velocities
         backward = np.flatnonzero(np.diff(self.t) < TUNING.shortest_step)
         if backward.size:
             k = backward[0]
@@ -88,6 +89,11 @@ class Trajectory:
         """Return the recording reduced to these rows."""
         u = None if self.u is None else self.u[rows]
         return replace(self, t=self.t[rows], q=self.q[rows], qd=self.qd[rows], tau=self.tau[rows], u=u)
+
+    def column(self, name: str) -> np.ndarray:
+        """Return t, q, qd, tau or u, (T,) or (T, n); (0,) for commands that were not logged."""
+        values: np.ndarray | None = getattr(self, name)
+        return np.zeros(0) if values is None else values
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -112,9 +118,8 @@ class Trajectory:
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 
     def __repr__(self) -> str:
-        _, samples, duration, rate, _ = _summary(self)
-        joints = counted(self.q.shape[1], "joint")
-        return f"<Trajectory {self.name!r}: {samples} samples, {duration} at {rate}, {joints}>"
+        _, samples, duration, rate, joints = _summary(self)
+        return f"<Trajectory {self.name!r}: {samples} samples, {duration} at {rate}, {counted(int(joints), 'joint')}>"
 
     def _repr_html_(self) -> str:
         return trajectory_listing([self]).html()
@@ -131,9 +136,7 @@ class Trajectory:
 
     def error(self, got: str, expected: str, do: str | None = None, column: str = "") -> LogError:
         """Return an error about the recording, or about one of its columns."""
-        element = f"trajectory {self.name}"
-        if column:
-            element += f": {column}"
+        element = f"trajectory {self.name}" + (f": {column}" if column else "")
         return LogError(got, file=self.file, element=element, expected=expected, do=do)
 
 
@@ -187,28 +190,21 @@ def split_at_gaps(
 ) -> list[Trajectory]:
     """Return the gap-free pieces of at least `shortest` samples, in order; each has the name of the trajectory."""
     ends = gap_ends(trajectory.t, gap, hole)
-    pieces = [trajectory]
-    if len(ends) > 2:
-        pieces = [trajectory[start:stop] for start, stop in pairwise(ends)]
+    # a trajectory without gaps is not copied: it would be validated again
+    pieces = [trajectory[start:stop] for start, stop in pairwise(ends)] if len(ends) > 2 else [trajectory]
     return [piece for piece in pieces if len(piece) >= shortest]
 
 
 def joined_column(trajectories: Sequence[Trajectory], name: str) -> np.ndarray:
     """Return a column of all trajectories joined, (T,) or (T, n), by its name: t, q, qd, tau or u."""
-    return np.concatenate([getattr(x, name) for x in trajectories])
+    return np.concatenate([x.column(name) for x in trajectories])
 
 
 def set_aside(items: Sequence[T], numbers: np.ndarray) -> tuple[list[T], list[T]]:
     """Return two lists: the items whose indices are not in `numbers` (k,), and the others, both in order."""
-    remaining: list[T] = []
-    chosen: list[T] = []
-    chosen_numbers = set(numbers.tolist())
-    for k, item in enumerate(items):
-        if k in chosen_numbers:
-            chosen.append(item)
-        else:
-            remaining.append(item)
-    return remaining, chosen
+    chosen = set(numbers.tolist())
+    remaining = [item for k, item in enumerate(items) if k not in chosen]
+    return remaining, [item for k, item in enumerate(items) if k in chosen]
 
 
 def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
@@ -217,7 +213,7 @@ def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
     for name in ("q", "qd"):
         joints = []
         for column in joined_column(logs, name).T:
-            counts = np.histogram(column, TUNING.bins)[0].tolist()
+            counts = np.histogram(column, 24)[0].tolist()
             joints.append({"low": _rounded(column.min()), "high": _rounded(column.max()), "counts": counts})
         result[name] = joints
     return result
@@ -226,3 +222,38 @@ def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
 def _rounded(value: float) -> float:
     """Return a value to five significant digits."""
     return float(f"{value:.5g}")
+
+
+LogRows = tuple[Trajectory, slice]
+"""A part of a log: rows from start to stop."""
+
+
+def steps_between(trajectory: Trajectory, longest: float = 3.4e-3) -> int:
+    """Return the number of steps of at most ``longest`` [s] into which the interval between samples is divided."""
+    # the default: longer steps of motion under position servos bias armatures by a few per cent (measured)
+    return max(1, math.ceil(1 / (trajectory.sample_rate * longest) - 1e-6))
+
+
+def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: int) -> np.ndarray:
+    """Return the means (K, steps, n) of the delayed commands over the steps between the samples of ``rows``; delay
+    [s].
+
+    Each command is held until the next. Means are differentiable with respect to the delay; values at single times are
+    not.
+    """
+    samples = trajectory.t[rows]
+    earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)
+    # from the command that was held at that time
+    held_rows = slice(max(0, earliest - 1), latest + 1)
+    t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
+    held = np.concatenate([u[:1], u[:-1]])  # the command held until each sample
+    corners = np.concatenate(
+        [t[:1] - 1e3, t]
+    )  # [s] the first command is assumed to hold before the recording
+    integral = np.zeros((len(t) + 1, u.shape[1]))
+    integral[1:] = np.cumsum(np.diff(corners)[:, None] * held, axis=0)
+    edges = samples[:-1, None] + np.diff(samples)[:, None] * np.arange(steps) / steps
+    edges = np.append(edges.ravel(), samples[-1])
+    values = [np.interp(edges - delay, corners, column) for column in integral.T]
+    means = np.diff(values) / np.diff(edges)
+    return means.T.reshape(len(samples) - 1, steps, -1)

@@ -1,7 +1,5 @@
 """Conversion of logged columns to numbers in SI units with the URDF's signs; errors name rows without a number."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import starmap
 from typing import TypeAlias
@@ -31,22 +29,19 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         # subtracted as integers: 1.7e18 ns as a double has no microseconds
         times = pa.compute.subtract(times, start)
     logged = [_floats(times, layout.columns[0], layout, rows)]
-    for name in layout.columns[1:]:
-        logged.append(_floats(_column(table, name), name, layout, rows))
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
-    for k, (quantity, joint) in enumerate(signals, start=1):
-        sign_bit = mapping.word("sign_bit", quantity, joint)
-        if sign_bit:
-            logged[k] = signed(logged[k], sign_bit)
+    for name, signal in zip(layout.columns[1:], signals, strict=True):
+        values = _floats(_column(table, name), name, layout, rows)
+        sign_bit = mapping.word("sign_bit", *signal)
+        logged.append(signed(values, sign_bit) if sign_bit else values)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
     offsets = np.array([0.0, *starmap(mapping.offset, signals)])
     # overflows are reported below, with their rows
     with np.errstate(over="ignore", invalid="ignore"):
         data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
-    largest = np.full(data.shape[1], TUNING.largest_value)
-    largest[0] = TUNING.latest
-    bad = ~(np.abs(data) < largest)  # NaN included
+    largest = np.array([TUNING.latest, *[TUNING.largest_value] * len(signals)])
     foreign = foreign_rows(data, len(layout.joints))
+    bad = ~(np.abs(data) < largest)  # NaN included
     if not foreign.all():
         bad &= ~foreign[:, None]
     if bad.any():
@@ -59,8 +54,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
             do = "remove those rows; a gap in t is understood"
             if foreign.all():
                 do = "no row has all quantities: log them together, or resample them to the same times"
-        got += ", this is the first)"
-        raise layout.row_error(got, rows[first], layout.columns[k], expected, do)
+        raise layout.row_error(f"{got}, this is the first)", rows[first], layout.columns[k], expected, do)
     return data
 
 
@@ -75,26 +69,26 @@ def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
     first_row = table.slice(0, 1)
     times, _ = _clock(first_row, layout)
     is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
-    if pa.types.is_integer(times.type) or pa.types.is_floating(times.type):
-        first = times[0].as_py()
-        # seconds since 1970 as floating-point numbers have too few digits
-        if first is not None and (is_stamp or TUNING.longest_clock < abs(first) < np.inf):
-            return times[0]
-    return None
+    if not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
+        return None
+    # seconds since 1970 as floating-point numbers have too few digits; a clock that starts with the recording stays
+    # below 1e8 in any unit
+    first = times[0].as_py()
+    is_date = first is not None and (is_stamp or 1e8 < abs(first) < np.inf)
+    return times[0] if is_date else None
 
 
 def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
     """Return the times as plain numbers, and their unit [s]. Raises LogError for dates beyond the range of Arrow."""
     name = layout.columns[0]
     times = _column(table, name)
+    if not pa.types.is_temporal(times.type):
+        return times, TIMES[layout.mapping.units.t]
+    counted: pa.DataType = pa.timestamp("ns")
     if pa.types.is_duration(times.type):
-        counted: pa.DataType = pa.duration("ns")
+        counted = pa.duration("ns")
     elif pa.types.is_time(times.type):
         counted = pa.time64("ns")
-    elif pa.types.is_temporal(times.type):
-        counted = pa.timestamp("ns")
-    else:
-        return times, TIMES[layout.mapping.units.t]
     try:
         return times.cast(counted).cast(pa.int64()), TIMES["ns"]
     except pa.ArrowInvalid as error:

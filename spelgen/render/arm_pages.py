@@ -1,21 +1,31 @@
-"""The pages of a derived structure and of an identification by least squares."""
+"""The pages of a derived structure, an identification by least squares, a proposed motion, and logs of an arm."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from spelgen.arm.arm import Chain
+from spelgen.arm.configured_arm import Arm
 from spelgen.certificate.inspection import Inspection, range_text
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
+from spelgen.excitation.excitation import ADVICE, Excitation
 from spelgen.fitting.run_record import Content
-from spelgen.render.arm_section import arm_section, matrix
-from spelgen.render.page import render_page
+from spelgen.labels import named_joints
+from spelgen.log_checks.report import LogReport
+from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps
+from spelgen.render.arm_section import AnimatedMotion, arm_section, matrix
+from spelgen.render.charts import TUNING
 from spelgen.render.parameters import DETERMINED, base_table
+from spelgen.render.plots import JointRow, Panel, stacks
 from spelgen.structure.structure import derive
+from spelgen.templates import render_page
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import Arm
     from spelgen.certificate.formulas import Formulas
-    from spelgen.certificate.verification import Verification
+    from spelgen.certificate.verify import Verification
     from spelgen.identification.identification import Identification
 
 
@@ -52,6 +62,7 @@ def inspection_page(
 def identification_page(identification: Identification, arm: Arm) -> str:
     """Return the page: base parameters with confidence intervals, the arm, and the torque residual."""
     record: Content = identification.to_dict()
+    # from the JSON form, which is the contract that the page shows
     words = [parameter["determined"] for parameter in record["base_parameters"]]
     never = [name for name, visibility in record["identifiability"].items() if visibility == "never"]
     return render_page(
@@ -68,3 +79,72 @@ def identification_page(identification: Identification, arm: Arm) -> str:
         heading=identification.heading(),
         notes=identification.diagnostics,
     )
+
+
+def motion_page(excitation: Excitation, arm: Arm) -> str:
+    """Return the page about a motion of `arm`, approach included."""
+    motion = excitation.approach.then(excitation.motion)
+    # twice the points of a chart: the animation uses the same arrays
+    step = -(-len(motion.t) // (2 * TUNING.points))  # ceil
+    t, q, qd = (x[::step] for x in (motion.t, motion.q, motion.qd))
+    drawn = AnimatedMotion("motion", "approach and motion", t.round(3), q.round(4))
+    rows = [
+        JointRow("position", "position", "position", [("approach and motion", q, "model")]),
+        JointRow("velocity", "velocity", "velocity", [("approach and motion", qd, "model")]),
+    ]
+    return render_page(
+        "motion.html.jinja",
+        excitation=excitation,
+        table=excitation.listing(),
+        advice=ADVICE,
+        arm=arm_section(arm.chain, arm.robot.path, [drawn]),
+        panels=stacks(t, rows, named_joints(arm.chain.joint_names, arm.chain.joint_types), "motion"),
+    )
+
+
+def logs_page(report: LogReport, arm: Chain, inputs: np.ndarray) -> str:
+    """Return the page about the report. inputs: G, (n, n), joint torques = G times logged torques."""
+    return render_page(
+        "logs.html.jinja",
+        robot=report.robot,
+        heading=report.heading(),
+        tables=report.listings(),
+        findings=report.findings,
+        errors=report.errors,
+        examples=[(log.name, log_charts(log, arm, inputs)) for log in report.examples],
+    )
+
+
+def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
+    """Return charts of each joint: position; velocity with dq/dt; torque with the URDF's gravity torque.
+
+    Of position servos: position with command. inputs: G, (n, n), see `logs_page`.
+    """
+    # split first, so that dq/dt has no difference across a gap
+    segments = [segment[:: -(-len(log.t) // TUNING.points)] for segment in split_at_gaps(log)]
+    t, q = joined_column(segments, "t"), joined_column(segments, "q")
+    position = [("logged", q, "truth")]
+    rows = [JointRow("position", "position", "position", position)]
+    # position servos have no torques to compare with the URDF
+    if log.u is not None:
+        position.append(("commanded", joined_column(segments, "u"), "predicted"))
+    else:
+        derivative = np.concatenate(list(map(_derivative, segments)))
+        velocity = [("logged", joined_column(segments, "qd"), "truth"), ("dq/dt", derivative, "predicted")]
+        torque = [("logged", joined_column(segments, "tau") @ inputs.T, "truth")]
+        if any(body.inertia for body in arm.bodies):
+            # gravity only: acceleration and friction of the URDF would hide a wrong sign or unit of the torque
+            still = np.zeros_like(q)
+            gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
+            torque.append(("gravity of the URDF", gravity, "predicted"))
+        rows.append(JointRow("velocity", "velocity", "velocity", velocity))
+        rows.append(JointRow("torque", "torque", "torque", torque))
+    return stacks(t, rows, named_joints(arm.joint_names, arm.joint_types))
+
+
+def _derivative(segment: Trajectory) -> np.ndarray:
+    """Return dq/dt, (T, n) [rad/s, m/s], by differences of the subsampled positions; NaN for a single sample."""
+    if len(segment.t) < 2:
+        return np.full_like(segment.q, np.nan)
+    derivative: np.ndarray = np.gradient(segment.q, segment.t, axis=0)
+    return derivative

@@ -11,24 +11,17 @@ import numpy as np
 from markupsafe import Markup
 
 from spelgen.arm.arm import Chain
-from spelgen.baselines.names import MODEL
+from spelgen.certificate.expressions import text
 from spelgen.certificate.facts import facts
 from spelgen.certificate.formulas import formulas
-from spelgen.certificate.inspection import LETTERS
-from spelgen.certificate.printing import text
+from spelgen.certificate.inspection import cell_text
 from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
-from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
-from spelgen.render.page import json_data
+from spelgen.labels import MODEL, entry_name, joints_in_ranges
 from spelgen.render.scene import scene
-from spelgen.render.tuning import TUNING
 from spelgen.structure.nominal import working_range
 from spelgen.structure.structure import Structure
-
-PREDICATES = {"zero": "is always zero", "constant": "is constant"}
-AMPLITUDES = {"revolute": 1.2, "prismatic": 0.3}
-"""Largest amplitudes of the motion that is shown without an evaluation [rad, m]."""
-ENTRY = re.compile(r"M\d+(?:,\d+)?")
+from spelgen.templates import json_data
 
 
 @dataclass(frozen=True)
@@ -70,9 +63,8 @@ def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
     explanations = _explanations(arm, structure)
     cells = {}
     for entry in structure.entries:
-        text = LETTERS.get(entry.kind, joint_ranges(entry.joints))
-        name = entry_name(entry.row, entry.column)
-        cell = Cell(entry.kind, text, tuple(entry.joints), explanations[name])
+        explanation = explanations[entry_name(entry.row, entry.column)]
+        cell = Cell(entry.kind, cell_text(entry), tuple(entry.joints), explanation)
         cells[entry.row, entry.column] = cells[entry.column, entry.row] = cell
     joints = range(len(structure.joints))
     return [[cells[row, column] for column in joints] for row in joints]
@@ -80,19 +72,22 @@ def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
 
 def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
     """Return, by entry name, the dependence of the entry, the facts that mention it, and its formula."""
+    # the facts of `spelgen inspect`: a page and a terminal must not explain an entry differently
     every_fact = facts(arm, structure)
     closed = {formula.name: formula for formula in formulas(arm, structure).rows}
     explanations = {}
+    predicates = {"zero": "is always zero", "constant": "is constant"}
     for entry in structure.entries:
         name = entry_name(entry.row, entry.column)
         default = f"depends on {joints_in_ranges(entry.joints)} only"
-        lines = [f"{name} {PREDICATES.get(entry.kind, default)}."]
+        lines = [f"{name} {predicates.get(entry.kind, default)}."]
         for fact in every_fact:
             # joints that M does not depend on are a fact about every entry that varies
             of_all = entry.kind == "varying" and fact.statement.startswith("M does not depend")
-            if of_all or name in ENTRY.findall(fact.statement):
+            if of_all or name in re.findall(r"M\d+(?:,\d+)?", fact.statement):
                 lines.append(str(fact))
         formula = closed[name]
+        # long formulas would cover the page; the command writes them
         if formula.expression is not None:
             lines.append(f"{name} = {text(formula.expression)}")
         elif entry.kind != "zero":
@@ -118,22 +113,26 @@ def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
         # the error of a joint that hardly moves is divided by 1 % of the largest extent of the joints
         error = (example.predicted_q - example.q) / np.maximum(extent, 1e-2 * extent.max() + 1e-9)
         label = f"{example.which} prediction and measured motion ({example.trajectory})"
-        name, colour = f"prediction {example.which}", (np.abs(error) / TUNING.worst_error).round(3)
-        motions.append(AnimatedMotion(name, label, example.t, example.q, colour, example.predicted_q))
+        curves = (example.t, example.q, _colour(error), example.predicted_q)
+        motions.append(AnimatedMotion(f"prediction {example.which}", label, *curves))
     for trace in traces.torques:
         error = (trace.measured - trace.predicted[MODEL]) / np.maximum(trace.measured.std(axis=0), 1e-9)
         label = f"residual torque, {trace.which} trajectory ({trace.trajectory})"
-        colour = (np.abs(error) / TUNING.worst_error).round(3)
-        motions.append(AnimatedMotion(f"torque {trace.which}", label, trace.t, trace.q, colour))
+        motions.append(AnimatedMotion(f"torque {trace.which}", label, trace.t, trace.q, _colour(error)))
     return motions
+
+
+def _colour(error: np.ndarray) -> np.ndarray:
+    """Return relative errors (T, n) on the scale of colours, on which an error of 0.5 has the last one."""
+    return np.asarray((np.abs(error) / 0.5).round(3))
 
 
 def _sweep(arm: Chain) -> AnimatedMotion:
     """Return sines of all joints about the middle of their ranges, with three different periods."""
     t = np.linspace(0, 12, 121)
     low, high = np.array(list(map(working_range, arm.coordinates))).T
-    # some URDFs have limits of 100 turns, at which the picture would be a blur
-    largest = [AMPLITUDES[coordinate.joint_type] for coordinate in arm.coordinates]
+    # amplitudes of at most 1.2 rad and 0.3 m: at the limits of 100 turns of some URDFs the picture would be a blur
+    largest = [0.3 if coordinate.joint_type == "prismatic" else 1.2 for coordinate in arm.coordinates]
     joint = np.arange(len(low))
     # periods of 12, 6 and 4 s, so that the motion of neighbouring joints is distinguishable and the whole is periodic
     phase = 2 * np.pi / 12 * t[:, None] * (1 + joint % 3) + joint

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.render.tuning import TUNING
 from spelgen.templates import render
 
 Values = Sequence[float] | np.ndarray
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
@@ -34,6 +32,32 @@ MARGINS = Margins()
 
 
 @dataclass(frozen=True)
+class RenderTuning:
+    """Limits of the charts and the 3D view of a page."""
+
+    # [1] Points of a line: at 400 pixels more are not visible and only make the page larger.
+    points: int = 300
+    # [1] Decades of a logarithmic axis, counted from the largest value.
+    decades: float = 8.0
+    # [1] Baselines with an error beyond this multiple of the model's error are cut off, so that the others are
+    # distinguishable.
+    outlier: float = 100.0
+    # [1] Ratio of root mean square to median above which a few starts dominate; a normal distribution has 1.5.
+    dominated: float = 2.0
+    # [1] Quantile of the measured friction that sets the axis: outliers are cut off.
+    bulk: float = 0.995
+    # [1] An entry of M below this fraction of the largest entry is a rounding error.
+    zero: float = 1e-9
+    # [1] Faces of all links together, so that a page stays below 1 MB.
+    faces: int = 4000
+    # [1] Radius of the tube that represents a link without a mesh, relative to the extent of the arm.
+    tube_radius: float = 0.028
+
+
+TUNING = RenderTuning()
+
+
+@dataclass(frozen=True)
 class Axis:
     """Linear or logarithmic scale: the values low..high lie at the pixels start..end."""
 
@@ -46,9 +70,8 @@ class Axis:
     def pixels(self, values: np.ndarray) -> np.ndarray:
         """Return the pixels (T,) of values (T,); a value outside the axis lies on its edge."""
         # Clipped first: browsers limit the range of coordinates.
-        clipped, low, high = np.clip(values, self.low, self.high), self.low, self.high
-        if self.log:
-            clipped, low, high = np.log(clipped), math.log(low), math.log(high)
+        scale = np.log if self.log else np.asarray
+        low, high, clipped = map(scale, (self.low, self.high, np.clip(values, self.low, self.high)))
         pixels: np.ndarray = self.start + (clipped - low) / (high - low) * (self.end - self.start)
         return pixels
 
@@ -239,11 +262,8 @@ def _spaced(pixels: np.ndarray) -> str:
 def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
     """Return the finite values of all columns (T,), for `positive` the positive ones only, (K,)."""
     values = np.concatenate([np.zeros(0), *columns])
-    drawable = np.isfinite(values)
-    if positive:
-        drawable &= values > 0
-    finite: np.ndarray = values[drawable]
-    return finite
+    drawable: np.ndarray = values[np.isfinite(values) & ((values > 0) | (not positive))]
+    return drawable
 
 
 def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool) -> Axis:
@@ -267,8 +287,8 @@ def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
     powers = range(first, last + 1, max(1, (last - first) // 5 + 1))
     if len(powers) >= 3:
-        labels = [f"10{str(power).translate(_SUPERSCRIPTS)}" for power in powers]
-        return 10.0 ** np.array(powers), labels
+        superscripts = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+        return 10.0 ** np.array(powers), [f"10{str(power).translate(superscripts)}" for power in powers]
     values = np.outer(10.0 ** np.arange(first - 1, last + 1), [1, 2, 5]).ravel()
     values = values[(values >= low) & (values <= high)]
     if len(values) < 3:

@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from spelgen.comparison.arms import ArmInputs
 from spelgen.comparison.figures import SimulatedFigures
-from spelgen.comparison.inputs import ArmInputs
 from spelgen.comparison.study import Study
 from spelgen.comparison.tables import ArmResults, comparison_sentence
 from spelgen.evaluation.plain import array
-from spelgen.evaluation.truth import true_mass
+from spelgen.evaluation.rollout import true_mass
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import counted, named_joints
 from spelgen.render.charts import Chart, Line, line_chart
-from spelgen.render.page import render_page
 from spelgen.render.plots import Panel, mass_panels, trajectory_panels
+from spelgen.templates import render_page
 
 STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 
@@ -62,6 +62,7 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
     for result in section.results:
         if result.simulated is not None:
             first.setdefault(result.preset, result.simulated)
+    # one style per preset in all charts of the page
     styles = dict(zip(first, STYLES, strict=False))
     # Reversed, so that the first run of a preset is the one that remains.
     folders = {job.preset: job.folder for job in reversed(study.jobs) if job.arm == section.name}
@@ -74,6 +75,7 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
         # all presets have the same test logs, and therefore the same example
         along = next(iter(examples.values()))
         true = true_mass(truth, torch.from_numpy(along.q), arm.joint_names).numpy()
+        # M is symmetric: its lower triangle is enough
         rows, columns = np.tril_indices(len(arm.joint_types))
         entries = {name: m[:, rows, columns].T for name, m in {"true": true, **learned}.items()}
         mass = mass_panels(along.t, entries, {"true": "truth", **styles}, arm.joint_types, width=400)
@@ -85,6 +87,7 @@ def _losses(folders: Mapping[str, Path], styles: Mapping[str, str]) -> Chart:
     lines = []
     for name, style in styles.items():
         records = RunFolder(folders[name]).read_metrics()
+        # a preset whose run failed has no metrics
         if records:
             steps, losses = array([(record["step"], record["best"]) for record in records]).T
             lines.append(Line(name, steps, losses, style))

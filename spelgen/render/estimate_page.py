@@ -13,8 +13,8 @@ from spelgen.labels import named_joints
 from spelgen.live.noise import NoiseLevels
 from spelgen.live.replay import LogEstimate, payload_sentence
 from spelgen.render.charts import Band, Chart, Line, Mark, line_chart
-from spelgen.render.page import render_page
 from spelgen.render.plots import JointRow, Panel, stacks
+from spelgen.templates import render_page
 
 
 def write_estimate(fit: Fit, levels: NoiseLevels, results: Sequence[LogEstimate], path: Path) -> Path:
@@ -30,6 +30,7 @@ def write_estimate(fit: Fit, levels: NoiseLevels, results: Sequence[LogEstimate]
 def mass_chart(result: LogEstimate) -> Chart | None:
     """Return the mass of the payload with its interval over time; None if no payload was found."""
     mass = np.array([state.payload.mass for state in result.states])
+    # a chart of zeros would suggest a measurement
     if not mass.any():
         return None
     low, high = np.array([state.payload.mass_interval for state in result.states]).T
@@ -53,6 +54,7 @@ def joint_panels(fit: Fit, result: LogEstimate) -> list[Panel]:
         ("threshold of contact", threshold, "hold"),
         ("threshold, other direction", -threshold, "hold"),
     ]
+    # as a change in per cent: a drift of some per cent is not visible on an axis from zero
     scale = 100 * (np.array([state.friction_scale for state in result.states]) - 1)
     rows = [
         JointRow("external torque", "external torque", "torque", torque),

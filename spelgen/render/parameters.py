@@ -21,8 +21,7 @@ from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.intervals import Interval
 from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
-from spelgen.runtime.constant_mass import ConstantMass
-from spelgen.runtime.derived_mass import DerivedMass
+from spelgen.runtime.derived_mass import ConstantMass, DerivedMass
 from spelgen.runtime.network_dynamics import NetworkDynamics
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
@@ -67,8 +66,7 @@ def parameter_tables(
 
 def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
     """Return the inertial parameters in the order of ``Body.inertia``, (bodies, 10) [kg, kg m, kg m^2]."""
-    values: np.ndarray = model.inertial_parameters.detach().numpy()
-    return values
+    return np.asarray(model.inertial_parameters.detach())
 
 
 def base_table(
@@ -77,13 +75,10 @@ def base_table(
     """Return the base parameters by least squares, from the URDF and of a rigid-body model, with 95 % intervals."""
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
+    # derived again instead of stored: the combinations belong to the URDF and the friction model, not to the logs
     base = base_parameters(arm.chain, friction, arm.actuation.drives().speeds)
     parameters = identified["base_parameters"]
-    names, determined, formulas = [], [], []
-    for parameter in parameters:
-        names.append(parameter["name"])
-        determined.append(parameter["determined"])
-        formulas.append("" if parameter["formula"] == parameter["name"] else parameter["formula"])
+    names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
     nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
     # no URDF has friction and drives in this form, and some have no inertials
     nominal[base.bodies :] = np.nan
@@ -102,6 +97,7 @@ def base_table(
             "squares has no column for"
         )
     elif isinstance(model, RigidBodyDynamics):
+        # the first columns of every friction model are bodies and armatures, which the model has as well
         common = np.concatenate([body_parameters(model).ravel(), model.armature.detach().numpy()])
         learned = base.combination[:, : len(common)] @ common
         for k in range(base.bodies, len(names)):
@@ -109,26 +105,19 @@ def base_table(
                 learned[k] = np.nan
         columns["model"] = list(map(_number, learned))
     columns["least squares, 95 %"] = list(map(_interval, parameters))
-    columns["determined"], columns["made of"] = determined, formulas
-    sure: list[tuple[str, ...]] = []
-    unsure: list[tuple[str, ...]] = []
-    for row in zip(*columns.values(), strict=True):
-        if row[-2] in DETERMINED:
-            sure.append(row)
-        else:
-            unsure.append(row)
-    return ParameterTable(
-        "Base parameters: identifiable combinations",
-        tuple(columns),
-        tuple(sure),
-        f"{note}.",
-        folded=tuple(unsure),
-        folded_title=f"{len(unsure)} more, not significantly different from zero",
-    )
+    columns["determined"] = determined
+    # a parameter of one body is its own formula
+    columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
+    rows = list(zip(*columns.values(), strict=True))
+    sure = tuple(row for row in rows if row[-2] in DETERMINED)
+    unsure = tuple(row for row in rows if row[-2] not in DETERMINED)
+    title = "Base parameters: identifiable combinations"
+    folded_title = f"{len(unsure)} more, not significantly different from zero"
+    return ParameterTable(title, tuple(columns), sure, f"{note}.", folded=unsure, folded_title=folded_title)
 
 
 def _number(value: float) -> str:
-    """Return four digits; "" for NaN."""
+    """Return the text of a number with four digits; "" for NaN."""
     return f"{value:.4g}".replace("nan", "")
 
 
@@ -168,6 +157,7 @@ def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None
 
 def _about_center(body: np.ndarray) -> tuple[str, str, str]:
     """Return mass, centre of mass and principal moments about it, as text; body: inertial parameters, (10,)."""
+    # without mass there is no centre of mass; the URDF may have such bodies
     if body[0] <= 0:
         return f"{body[0]:.4g}", "", ""
     mass, center, tensor = about_center(body)
@@ -186,6 +176,7 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
     columns = {"joint": list(model.joint_names)}
     note = "Viscous and Coulomb friction are fitted to the model's friction law."
     if posterior is not None:
+        # numbers with their intervals: they replace the nearest friction, which has none
         columns |= posterior.drive_columns
         note += " Intervals are of 95 %."
     else:
@@ -213,6 +204,7 @@ def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]
     count = len(mass.raw_constants)
     # dM / d constant, (constants, n, n): M is linear in its functions and constants
     functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
+    # unit vectors of the constants give the basis of each one
     zeros = torch.zeros(functions, count, dtype=torch.float64)
     units = torch.eye(count, dtype=torch.float64)
     rows = []

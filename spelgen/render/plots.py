@@ -8,20 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.baselines.names import (
+from spelgen.evaluation.drawn_motions import PredictedMotion
+from spelgen.evaluation.traces import Growth, Quantiles
+from spelgen.labels import (
     CONSTANT_VELOCITY,
     LEAST_SQUARES,
     LEAST_SQUARES_WITH_MEMORY,
     MODEL,
+    UNITS,
     URDF,
     URDF_WITH_DRIVES,
+    NamedJoint,
+    entry_name,
     observed,
 )
-from spelgen.evaluation.drawn_motions import PredictedMotion
-from spelgen.evaluation.traces import Growth, Quantiles
-from spelgen.labels import UNITS, NamedJoint, entry_name
-from spelgen.render.charts import MARGINS, Band, Chart, Line, Mark, Values, line_chart
-from spelgen.render.tuning import TUNING
+from spelgen.render.charts import MARGINS, TUNING, Band, Chart, Line, Mark, Values, line_chart
 
 STYLES = defaultdict(
     lambda: "c6",
@@ -64,22 +65,6 @@ class JointRow:
     columns: Sequence[tuple[str, np.ndarray, str]]
     height: int = 130
 
-    def chart(self, t: Values, joint: NamedJoint, k: int, time: str = "", motion: str = "") -> Chart:
-        """Return the chart of joint k.
-
-        Args:
-            t: Times, (T,) [s].
-            joint: Name and units of joint k.
-            k: Index of the joint, from 0.
-            time: Label of the time axis; "": neither label nor numbers.
-            motion: See `line_chart`.
-        """
-        lines = [Line(label, t, values[:, k], style) for label, values, style in self.columns]
-        # The plot areas of all charts of a column have the same height.
-        height = self.height + (MARGINS.bottom - MARGINS.bare if time else 0)
-        axis = joint.axis(self.quantity, self.axis) if self.quantity else self.axis
-        return line_chart(lines, f"{self.title} of {joint.name}", time, axis, motion=motion, height=height)
-
 
 def stacks(
     t: Values, rows: Sequence[JointRow], joints: Sequence[NamedJoint], motion: str = ""
@@ -94,8 +79,16 @@ def stacks(
     """
     panels = []
     for k, joint in enumerate(joints):
-        charts = [row.chart(t, joint, k, motion=motion) for row in rows[:-1]]
-        charts.append(rows[-1].chart(t, joint, k, "t [s]", motion))
+        charts = []
+        for row in rows:
+            lines = [Line(label, t, values[:, k], style) for label, values, style in row.columns]
+            # one time axis per column; the plot areas of all its charts have the same height
+            time, height = "", row.height
+            if row is rows[-1]:
+                time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare
+            axis = joint.axis(row.quantity, row.axis) if row.quantity else row.axis
+            title = f"{row.title} of {joint.name}"
+            charts.append(line_chart(lines, title, time, axis, motion=motion, height=height))
         panels.append(Panel(joint.name, tuple(charts)))
     return panels
 
@@ -124,16 +117,9 @@ def growth_panels(
                 marks.append(Band(f"{name}, 10 to 90 %", growth.seconds, error.low, error.high, styles[name]))
         if marks:
             chart = line_chart(
-                marks,
-                f"{title}: error by horizon",
-                "horizon [s]",
-                label,
-                log=True,
-                log_x=True,
-                limits=_error_limits(errors),
-                width=520,
-                height=260,
-            )
+                marks, f"{title}: error by horizon", "horizon [s]", label, log=True, log_x=True,
+                limits=_error_limits(errors), width=520, height=260,
+            )  # fmt: skip
             panels.append(Panel(title, (chart,)))
     return panels
 
@@ -167,22 +153,23 @@ def trajectory_panels(
         motion: See `line_chart`.
     """
     measured = next(iter(predictions.values()))
+    # a replayed log of position servos has no velocities
     positions = {name: x.predicted_q for name, x in predictions.items()}
     velocities = {name: x.predicted_qd for name, x in predictions.items() if x.predicted_qd is not None}
     rows = []
-    for quantity, values, predicted in (
-        ("position", measured.q, positions),
-        ("velocity", measured.qd, velocities),
-    ):
+    quantities = ("position", measured.q, positions), ("velocity", measured.qd, velocities)
+    for quantity, values, predicted in quantities:
         if values is None:
             continue
         lines, errors = [("measured", values, "truth")], []
+        # first, so that the measured curve is drawn above it
         if measured.u is not None:
             lines.insert(0, ("commanded", measured.u, "hold"))
         for name, curve in predicted.items():
             lines.append((name, curve, styles[name]))
             errors.append((name, curve - values, styles[name]))
         rows.append(JointRow(quantity, quantity, quantity, lines))
+        # a chart of its own: next to the motion the error would be a flat line
         rows.append(JointRow(f"Error of the {quantity}", "error", quantity, errors, 100))
     return stacks(measured.t, rows, joints, motion)
 
@@ -207,13 +194,11 @@ def mass_panels(
     # rounding errors of entries that are always zero are below this bound
     zero = TUNING.zero * max(np.nanmax(np.abs(mass)) for mass in masses.values())
     for number, (i, j) in enumerate(np.argwhere(np.tri(len(joint_types))).tolist()):
-        entries = {label: mass[number] for label, mass in masses.items()}
-        if np.nanmax(np.abs(list(entries.values()))) > zero:
-            lines = [Line(label, t, entry, styles[label]) for label, entry in entries.items()]
+        lines = [Line(label, t, mass[number], styles[label]) for label, mass in masses.items()]
+        if np.nanmax(np.abs([line.heights for line in lines])) > zero:
             name = entry_name(i, j)
-            unit = "kg m"
-            if joint_types[i] == joint_types[j]:
-                unit = UNITS[joint_types[i]].inertia
+            # an entry of a revolute and a prismatic joint is a first moment
+            unit = UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
             chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=width)
             panels.append(Panel(name, (chart,)))
     return panels

@@ -6,66 +6,62 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spelgen.baselines.names import LEAST_SQUARES, MODEL
-from spelgen.evaluation.drawn_motions import TorqueTrace
+from spelgen.evaluation.drawn_motions import PredictedMotion, TorqueTrace
 from spelgen.evaluation.plain import array
 from spelgen.evaluation.traces import FrictionTrace, Traces
 from spelgen.evaluation.verdict import Limits
 from spelgen.fitting.run_record import Content
-from spelgen.labels import NamedJoint, named_joints, thousandths
+from spelgen.labels import LEAST_SQUARES, MODEL, NamedJoint, named_joints, thousandths
 from spelgen.listing import number
-from spelgen.render.charts import Band, Chart, Dots, Line, Mark, line_chart
-from spelgen.render.plots import (
-    STYLES,
-    JointRow,
-    Panel,
-    growth_panels,
-    mass_panels,
-    stacks,
-    trajectory_panels,
-)
-from spelgen.render.tuning import TUNING
+from spelgen.render import plots
+from spelgen.render.charts import TUNING, Band, Chart, Dots, Line, Mark, line_chart
+from spelgen.render.plots import JointRow, Panel
 from spelgen.spec import ModelSpec
 
 
 def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
     """Return the charts of each section of the report; None, or no charts, for a section without traces."""
     joints = named_joints(spec.joint_names, spec.joint_types)
+    # the template tests for None, and an undefined name would be an error in it
     drawn: dict[str, object] = dict.fromkeys(("growth", "mass", "friction", "energy"))
     growth, mass = traces.growth, traces.mass
     if growth is not None:
         growths = {name: (growth, name) for name in growth.relative}
         # the bands of all predictors would overlap
-        drawn["growth"] = growth_panels(growths, STYLES, (MODEL, LEAST_SQUARES))
+        drawn["growth"] = plots.growth_panels(growths, plots.STYLES, (MODEL, LEAST_SQUARES))
     if mass is not None and mass.by:
         entries = {name: curves.entries for name, curves in mass.by.items()}
-        drawn["mass"] = mass_panels(mass.t, entries, STYLES, spec.joint_types)
+        drawn["mass"] = plots.mass_panels(mass.t, entries, plots.STYLES, spec.joint_types)
     if traces.friction is not None:
         drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
     if traces.torques:  # one trajectory shows the shares of the energy
         drawn["energy"] = energy_chart(traces.torques[0])
-    torques = {}
+    torques, trajectories = {}, {}
     for trace in traces.torques:
         torques[f"{trace.which.capitalize()} trajectory: {trace.trajectory}"] = torque_panels(trace, joints)
-    trajectories = {}
     for example in traces.trajectories:
-        which = example.which.capitalize()
-        if example.start is None:
-            distance = None if example.error is None else 1000 * example.error
-            off = f"{number(distance)} {thousandths(spec.joint_types)} off"
-            title = f"{which} log replayed: {example.trajectory}, {off}"
-        else:
-            title = f"{which} prediction: {example.trajectory}, {example.start:.3g} s into it, "
-            title += f"relative error {number(example.error)}"
         motion, lines = f"prediction {example.which}", {"predicted": example}
-        trajectories[title] = trajectory_panels(lines, {"predicted": "predicted"}, joints, motion)
+        panels = plots.trajectory_panels(lines, {"predicted": "predicted"}, joints, motion)
+        trajectories[_motion_title(example, spec)] = panels
     return drawn | {"torques": torques, "trajectories": trajectories}
+
+
+def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
+    """Return the title of a predicted motion, or of a replayed log, with its error."""
+    which = example.which.capitalize()
+    if example.start is None:
+        distance = None if example.error is None else 1000 * example.error
+        off = f"{number(distance)} {thousandths(spec.joint_types)} off"
+        return f"{which} log replayed: {example.trajectory}, {off}"
+    start = f"{example.trajectory}, {example.start:.3g} s into it"
+    return f"{which} prediction: {start}, relative error {number(example.error)}"
 
 
 def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
     """Return training and validation loss over the epochs, with the epoch of the best model."""
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
     epochs, *losses = array(columns).T
+    # a vertical line over the whole range; the axis is logarithmic, so it cannot start at 0
     ends = (np.nanmin(losses), np.nanmax(losses))
     lines = [
         Line("training loss", epochs, losses[0], "train"),
@@ -82,10 +78,11 @@ def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Pane
     components = [(name, torque, name.lower()) for name, torque in trace.parts.items()]
     rows = [
         JointRow("Torque", "torque", "torque", curves, 160),
+        # residual and components have their own scales: the residual is small if the model is good
         JointRow("Residual", "residual", "torque", [("residual", measured - predicted, "model")], 100),
         JointRow("Components of the torque", "components", "torque", components, 162),
     ]
-    return stacks(trace.t, rows, joints, f"torque {trace.which}")
+    return plots.stacks(trace.t, rows, joints, f"torque {trace.which}")
 
 
 def friction_panels(
@@ -112,15 +109,10 @@ def friction_panels(
                 marks.append(Line("measured, over time", qd, measured, "loop"))
                 marks.append(Line("model, over time", qd, modelled, "loop model"))
         for name, curves in friction.by.items():
-            marks.append(Line(name, friction.qd[k], curves[k], STYLES[name]))
-        chart = line_chart(
-            marks,
-            f"Friction of {joint.name}",
-            joint.axis("velocity"),
-            f"friction [{joint.units.torque}]",
-            limits=_friction_limits(np.concatenate(values), curve),
-            height=220,
-        )
+            marks.append(Line(name, friction.qd[k], curves[k], plots.STYLES[name]))
+        limits, axis = _friction_limits(np.concatenate(values), curve), joint.axis("torque", "friction")
+        title = f"Friction of {joint.name}"
+        chart = line_chart(marks, title, joint.axis("velocity"), axis, limits=limits, height=220)
         panels.append(Panel(joint.name, (chart,)))
     return panels
 
@@ -140,10 +132,8 @@ def coverage_panels(
     traces: Traces, identified: Content | None, joints: Sequence[NamedJoint], limits: Limits
 ) -> list[Panel]:
     """Return per joint the histograms of position and velocity in training and test logs, with the position limits."""
-    logs: dict[str, Content | None] = {
-        "training": (identified or {}).get("coverage"),
-        "test": traces.coverage,
-    }
+    logs: dict[str, Content | None] = {"training": (identified or {}).get("coverage")}
+    logs["test"] = traces.coverage
     panels = []
     for k, joint in enumerate(joints):
         charts = []
@@ -156,9 +146,8 @@ def coverage_panels(
             if key == "q":
                 for bound in limits[k] or ():
                     marks.append(Line("joint limits", (bound, bound), (0.0, top), "hold"))
-            title, height = f"{quantity} of {joint.name}", 130
-            label = "fraction of samples"
-            charts.append(line_chart(marks, title, joint.axis(quantity), label, width=300, height=height))
+            title, labels = f"{quantity} of {joint.name}", (joint.axis(quantity), "fraction of samples")
+            charts.append(line_chart(marks, title, *labels, width=300, height=130))
         panels.append(Panel(joint.name, tuple(charts)))
     return panels
 
@@ -176,8 +165,7 @@ def _histogram(name: str, histogram: Content) -> Band:
 def energy_chart(trace: TorqueTrace) -> Chart:
     """Return the terms of the energy balance along a trajectory."""
     styles = ("truth", "urdf", "friction", "model")
-    lines = []
-    for (name, energy), color in zip(trace.energy.items(), styles, strict=True):
-        lines.append(Line(name, trace.t, energy, color))
+    terms = zip(trace.energy.items(), styles, strict=True)
+    lines = [Line(name, trace.t, energy, style) for (name, energy), style in terms]
     motion = f"torque {trace.which}"
     return line_chart(lines, "Energy", "t [s]", "energy [J]", motion=motion, width=560, height=250)

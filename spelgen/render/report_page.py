@@ -1,101 +1,35 @@
-"""The page of a run. Files that the run folder does not have are named on the page."""
+"""The pages of a run and of several runs. Files that a run folder does not have are named on the page."""
 
 from __future__ import annotations
 
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from jinja2 import TemplateError
 
-from spelgen.arm.configured_arm import Arm
-from spelgen.emission.specify import arm_of_spec
 from spelgen.emission.text import description
-from spelgen.errors import RunError, SpelgenError, in_one_line
-from spelgen.evaluation.measurements import Verdict
+from spelgen.errors import RunError, in_one_line
 from spelgen.evaluation.results import Results
-from spelgen.evaluation.tables import result_tables
+from spelgen.evaluation.tables import figures, joined, result_tables
 from spelgen.evaluation.traces import Traces
-from spelgen.evaluation.verdict import Limits
 from spelgen.files import write_json, write_text
-from spelgen.fitting.posterior import Posterior, posterior_of
-from spelgen.fitting.run_folder import RunFolder, fitted_model
-from spelgen.fitting.run_record import Content, Record
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.report import servo_summary
-from spelgen.labels import UNITS, named_joints
+from spelgen.labels import MODEL, UNITS, listed, named_joints
+from spelgen.render import run_facts
 from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
-from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
+from spelgen.render.plots import growth_panels
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
-from spelgen.render.run_facts import (
-    best_epoch,
-    commands,
-    head_numbers,
-    outlier_note,
-    settings,
-    training_facts,
-)
+from spelgen.render.run_facts import Run, open_run
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-from spelgen.spec import ModelSpec
 from spelgen.structure.structure import derive
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
+from spelgen.templates import render_page
 
 SCHEMA = 1
 """Version of the JSON form of a report."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """The content of a run folder; None for files that it does not have.
-
-    config: the record of the fit. baselines: content of least_squares.json, {} without one. arm: None also if its URDF
-    cannot be read: the page is written without it.
-    """
-
-    folder: RunFolder
-    spec: ModelSpec
-    config: Record | None
-    results: Results | None
-    baselines: Content
-    arm: Arm | None
-
-    @property
-    def limits(self) -> Limits:
-        """Position limits of the joints [rad, m]; None for a joint without limits."""
-        if self.arm is None:
-            return [None] * len(self.spec.joints)
-        return [joint.limits for joint in self.arm.chain.coordinates]
-
-    @property
-    def verdict(self) -> Verdict | None:
-        """Assessment of the model; None before its evaluation."""
-        return None if self.results is None else self.results.assessment
-
-
-def open_run(path: Path | str) -> Run:
-    """Return the content of a run folder. Raises RunError or ModuleError."""
-    folder = RunFolder(path)
-    evaluation = _record(folder, folder.evaluation)
-    arm = None
-    spec = folder.read_spec()
-    if folder.urdf.exists():
-        with suppress(SpelgenError):
-            arm = arm_of_spec(spec, folder.urdf)
-    return Run(
-        folder,
-        spec,
-        folder.read_record() if folder.config.is_file() else None,
-        None if evaluation is None else Results.from_dict(evaluation),
-        folder.read_baselines(),
-        arm,
-    )
-
-
-def _record(folder: RunFolder, path: Path) -> Content | None:
-    return folder.read_json(path) if path.is_file() else None
 
 
 def write_report(
@@ -113,6 +47,7 @@ def write_report(
     """
     folder = Path(folder)
     path = Path(output or folder / "report.html")
+    # the suffix decides, so that a script needs no further option
     if path.suffix == ".json":
         return write_json(path, report_data(folder))
     return write_text(path, render_report(folder, robot))
@@ -121,70 +56,50 @@ def write_report(
 def report_data(folder: Path | str) -> Content:
     """Return the data of the page for programs: assessment, evaluation, baselines and parameters."""
     run = open_run(folder)
-    model = _trained(run)
-    posterior = _posterior(run, model)
+    tables = parameter_tables(run.model, run.arm, run.baselines, run.posterior)
+    bodies = body_parameters(run.model).tolist() if isinstance(run.model, RigidBodyDynamics) else None
     return {
         "schema": SCHEMA,
         "verdict": None if run.verdict is None else asdict(run.verdict),
-        "bodies": body_parameters(model).tolist() if isinstance(model, RigidBodyDynamics) else None,
-        "tables": list(map(asdict, parameter_tables(model, run.arm, run.baselines, posterior))),
-        "posterior": None if posterior is None else posterior.to_dict(),
-        "evaluation": _record(run.folder, run.folder.evaluation),
+        "bodies": bodies,
+        "tables": list(map(asdict, tables)),
+        "posterior": None if run.posterior is None else run.posterior.to_dict(),
+        "evaluation": None if run.results is None else run.folder.read_json(run.folder.evaluation),
         "least_squares": run.baselines or None,
     }
-
-
-def _trained(run: Run) -> ArmModel | None:
-    """Return the trained model; None of a run without weights."""
-    return fitted_model(run.folder).requires_grad_(False).eval() if run.folder.weights.is_file() else None
-
-
-def _posterior(run: Run, model: ArmModel | None) -> Posterior | None:
-    """Return the posterior of a trained model; None if its checkpoint has none."""
-    if model is None or run.config is None or not run.folder.checkpoint.is_file():
-        return None
-    content = run.folder.load_checkpoint().posterior
-    if content is None:
-        return None
-    return posterior_of(model, content, run.config.preprocessing.torque_delay or 0.0, run.folder.checkpoint)
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
     """Return the page about a run as HTML, deterministically. robot: see ``write_report``."""
     folder = Path(folder)
     if not RunFolder(folder).path.is_dir():
-        raise RunError(
-            "no run", file=folder, expected="a folder with spec.json", do="make one with `spelgen train`"
-        )
+        expected = "a folder with spec.json"
+        raise RunError("no run", file=folder, expected=expected, do="make one with `spelgen train`")
     # the files of a run folder are untrusted: each of them may have any content
     try:
         return _rendered(open_run(folder), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
-        raise RunError(
-            f"files without the data of a report ({in_one_line(error)})",
-            file=folder,
-            do="run `spelgen evaluate` again",
-        ) from error
+        got = f"files without the data of a report ({in_one_line(error)})"
+        raise RunError(got, file=folder, do="run `spelgen evaluate` again") from error
 
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
-    spec, record, metrics = run.spec, run.config, run.folder.read_metrics()
-    model = _trained(run)
+    spec, record = run.spec, run.config
+    # the page of a run that is not evaluated has the same sections, which state that they are empty
     traces, tables = Traces({}), []
     if run.results is not None:
         traces, tables = run.results.traces, result_tables(run.results)
     sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses"))
     sections |= evaluation_charts(traces, spec)
     if run.arm is not None:
-        sections["arm"] = arm_section(
-            run.arm.chain, Path(robot or run.arm.robot.path), evaluated_motions(traces)
-        )
+        urdf = Path(robot or run.arm.robot.path)
+        sections["arm"] = arm_section(run.arm.chain, urdf, evaluated_motions(traces))
         sections["cells"] = matrix(run.arm.chain, derive(run.arm.chain, spec.options.assume))
     if record is not None:
-        sections["training"] = training_facts(record, metrics, run.baselines, model)
-        sections["settings"] = settings(record)
-    if metrics:
-        sections["losses"] = loss_chart(metrics, best_epoch(metrics))
+        sections["training"] = run_facts.training_facts(run, record)
+        sections["settings"] = run_facts.settings(record)
+    if run.metrics:
+        sections["losses"] = loss_chart(run.metrics, run_facts.best_epoch(run.metrics))
     joints = named_joints(spec.joint_names, spec.joint_types)
     return render_page(
         "report.html.jinja",
@@ -192,16 +107,79 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         spec=spec,
         about=description(spec),
         units=UNITS,
-        numbers=head_numbers(model, record, metrics, run.results),
+        numbers=run_facts.head_numbers(run),
         verdict=run.verdict,
-        outliers=None if run.results is None else outlier_note(run.results),
+        outliers=None if run.results is None else run_facts.outlier_note(run.results),
         config=record,
         evaluation=run.results,
         tables=tables,
         coverage=coverage_panels(traces, run.baselines, joints, run.limits),
-        trained=model is not None,
+        trained=run.model is not None,
         under_servos=record is not None and record.mapping.input == "position",
         summary=None if record is None else servo_summary(record.servo),
-        parameters=parameter_tables(model, run.arm, run.baselines, _posterior(run, model)),
-        commands=commands(run.folder, spec, run.config),
+        parameters=parameter_tables(run.model, run.arm, run.baselines, run.posterior),
+        commands=run_facts.commands(run.folder, spec, run.config),
     )
+
+
+STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
+
+
+def write_runs(folders: Sequence[Path], output: Path) -> Path:
+    """Write the page; return its path. Raises RunError for a folder that is not a run, or a run without evaluation."""
+    return write_text(output, render_runs(folders))
+
+
+def render_runs(folders: Sequence[Path]) -> str:
+    """Return the page as HTML."""
+    # all runs are read before anything is written: an error names the run
+    runs: dict[str, Run] = {}
+    results: dict[str, Results] = {}
+    for name, folder in zip(_names(folders), folders, strict=True):
+        RunFolder(folder).read_record()  # raises an error if there is no run
+        run = open_run(folder)
+        if run.results is None:
+            raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
+        runs[name], results[name] = run, run.results
+    growths = {name: (x.traces.growth, MODEL) for name, x in results.items() if x.traces.growth}
+    return render_page(
+        "runs.html.jinja",
+        runs=runs,
+        verdict=_verdict(results),
+        robots=sorted({run.spec.robot for run in runs.values()}),
+        tables=joined(results),
+        # more runs than styles repeat the styles
+        growth=growth_panels(growths, dict(zip(runs, STYLES * len(runs), strict=False)), runs),
+    )
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """Return the shortest distinct ends of the folders' paths; complete paths would disclose home folders."""
+    # resolved: `.` has no name, and two links to one folder are the same run
+    paths = list(map(Path.resolve, folders))
+    names: list[str] = []
+    for count in range(1, max(len(path.parts) for path in paths) + 1):
+        names = ["/".join(path.parts[-count:]) for path in paths]
+        if len(set(names)) == len(names):
+            break
+    return names
+
+
+def _verdict(runs: Mapping[str, Results]) -> str:
+    """Return a sentence that states, for each figure that all runs have, the run with the smallest error."""
+    # the first element decides which run is the smallest
+    errors: dict[str, list[tuple[float, str, str]]] = {}
+    for run, results in runs.items():
+        for figure in figures(results):
+            text = f"{figure.label} ({figure.text()})"
+            errors.setdefault(figure.label, []).append((figure.value, run, text))
+    smallest: dict[str, list[str]] = {}
+    for of_runs in errors.values():
+        if len(of_runs) == len(runs):
+            _, name, text = min(of_runs)
+            smallest.setdefault(name, []).append(text)
+    # runs with other horizons or logs cannot be ranked
+    if not smallest:
+        return "These runs have no common horizons or logs."
+    sentences = [f"{name} has the smallest {listed(labels)}." for name, labels in smallest.items()]
+    return " ".join(sentences)

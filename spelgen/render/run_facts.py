@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.baselines.names import MODEL
+from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.parameters import used_parameter_count
-from spelgen.errors import shortened
+from spelgen.emission.specify import arm_of_spec
+from spelgen.errors import SpelgenError, shortened
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
-from spelgen.fitting.run_folder import RunFolder
+from spelgen.evaluation.verdict import Limits, Verdict
+from spelgen.fitting.posterior import Posterior, posterior_of
+from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.report import terms_in_use
-from spelgen.labels import counted, share
+from spelgen.labels import MODEL, counted, share
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.render.tuning import TUNING
-from spelgen.runtime.residual_dynamics import ResidualDynamics
+from spelgen.render.charts import TUNING
+from spelgen.runtime.residual_terms import ResidualDynamics
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
 from spelgen.spec import ModelSpec, Options
@@ -30,28 +35,83 @@ if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
 
-def head_numbers(
-    model: ArmModel | None, record: Record | None, metrics: Sequence[Content], results: Results | None
-) -> list[tuple[str, str]]:
-    """Return the most important figures with their labels.
+@dataclass(frozen=True)
+class Run:
+    """The content of a run folder; None for files that it does not have.
 
-    Args:
-        model: The trained model; None before it is trained.
-        record: Record of the fit; None before the fit.
-        metrics: Records of the epochs; empty for a fit without epochs.
-        results: Evaluation of the model; None before it is evaluated.
+    config: the record of the fit. baselines: content of least_squares.json, {} without one. arm: None also if its URDF
+    cannot be read: the page is written without it.
     """
+
+    folder: RunFolder
+    spec: ModelSpec
+    config: Record | None
+    results: Results | None
+    baselines: Content
+    arm: Arm | None
+
+    @property
+    def limits(self) -> Limits:
+        """Position limits of the joints [rad, m]; None for a joint without limits."""
+        if self.arm is None:
+            return [None] * len(self.spec.joints)
+        return [joint.limits for joint in self.arm.chain.coordinates]
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Assessment of the model; None before its evaluation."""
+        return None if self.results is None else self.results.assessment
+
+    @cached_property
+    def metrics(self) -> list[Content]:
+        """Records of the epochs; empty for a fit without epochs."""
+        return self.folder.read_metrics()
+
+    @cached_property
+    def model(self) -> ArmModel | None:
+        """The trained model; None of a run without weights."""
+        if not self.folder.weights.is_file():
+            return None
+        return fitted_model(self.folder).requires_grad_(False).eval()
+
+    @cached_property
+    def posterior(self) -> Posterior | None:
+        """Posterior of the trained model; None if its checkpoint has none."""
+        if self.model is None or self.config is None or not self.folder.checkpoint.is_file():
+            return None
+        content = self.folder.load_checkpoint().posterior
+        # the delay is a parameter of the posterior: it shifts the torques of the fit
+        delay = self.config.preprocessing.torque_delay or 0.0
+        return None if content is None else posterior_of(self.model, content, delay, self.folder.checkpoint)
+
+
+def open_run(path: Path | str) -> Run:
+    """Return the content of a run folder. Raises RunError or ModuleError."""
+    folder = RunFolder(path)
+    spec, arm, results = folder.read_spec(), None, None
+    if folder.evaluation.is_file():
+        results = Results.from_dict(folder.read_json(folder.evaluation))
+    if folder.urdf.exists():
+        # a page without the picture of the arm is better than none: the results do not depend on the URDF
+        with suppress(SpelgenError):
+            arm = arm_of_spec(spec, folder.urdf)
+    record = folder.read_record() if folder.config.is_file() else None
+    return Run(folder, spec, record, results, folder.read_baselines(), arm)
+
+
+def head_numbers(run: Run) -> list[tuple[str, str]]:
+    """Return the most important figures with their labels."""
     numbers = []
-    if results is not None:
-        numbers = [(figure.text(), figure.label) for figure in figures(results)]
-    summary = None if record is None else servo_summary(record.servo)
+    if run.results is not None:
+        numbers = [(figure.text(), figure.label) for figure in figures(run.results)]
+    summary = None if run.config is None else servo_summary(run.config.servo)
     if summary is not None:
         numbers.append(summary.headline)
-    elif model is not None:
-        numbers.append((f"{used_parameter_count(model):,}", "trained parameters"))
-    if metrics:
-        label = f"of training, {metrics[-1]['step']:,} steps"
-        numbers.append((_duration(metrics[-1]["seconds"]), label))
+    # parameters that the fit switched off are not counted: the number states the size of the model in use
+    elif run.model is not None:
+        numbers.append((f"{used_parameter_count(run.model):,}", "trained parameters"))
+    for last in run.metrics[-1:]:
+        numbers.append((_duration(last["seconds"]), f"of training, {last['step']:,} steps"))
     return numbers
 
 
@@ -64,10 +124,8 @@ def outlier_note(results: Results) -> str:
     rms = last.errors[MODEL].mean_relative_rms
     if rms is None or not rms > TUNING.dominated * median:
         return ""
-    return (
-        f"After {last.name} the median error is {share(median, 'the motion')}, and the root mean square "
-        f"{share(rms, 'the motion')}: few starts dominate it."
-    )
+    text = f"After {last.name} the median error is {share(median, 'the motion')}, and the root mean square "
+    return f"{text}{share(rms, 'the motion')}: few starts dominate it."
 
 
 def best_epoch(metrics: Sequence[Content]) -> int:
@@ -77,9 +135,7 @@ def best_epoch(metrics: Sequence[Content]) -> int:
     return next((epoch["epoch"] for epoch in metrics if epoch["validation"] == best), 0)
 
 
-def training_facts(
-    record: Record, metrics: Sequence[Content], baselines: Content, model: ArmModel | None
-) -> dict[str, str]:
+def training_facts(run: Run, record: Record) -> dict[str, str]:
     """Return the logs, the preprocessing and the length of a fit as text, by label."""
     preprocessing = record.preprocessing
     facts = {
@@ -89,25 +145,23 @@ def training_facts(
         "windows": f"{record.training_windows:,} for training, {record.validation_windows:,} for validation",
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
-    if "samples" in baselines:
-        count = f"{baselines['samples']:,}"
+    # least squares needs accelerations, and so fewer samples than the model
+    if "samples" in run.baselines:
+        count = f"{run.baselines['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
-    if isinstance(model, ResidualDynamics):
-        facts["residual terms"] = "; ".join(terms_in_use(model)) or "none selected"
+    if isinstance(run.model, ResidualDynamics):
+        facts["residual terms"] = "; ".join(terms_in_use(run.model)) or "none selected"
     # fits to torques have no epochs
-    if metrics:
-        last, best = metrics[-1], best_epoch(metrics)
-        origin = f"epoch {best}"
-        if not best:
-            origin = "the start: no epoch was better"
+    if run.metrics:
+        last, best = run.metrics[-1], best_epoch(run.metrics)
+        origin = f"epoch {best}" if best else "the start: no epoch was better"
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         if record.options.get("solver", "rk4") == "rk4":
             facts["integrator"] = f"rk4, {counted(last['substeps'], 'step')} between samples"
-    if record.warnings:
-        facts["warnings"] = "; ".join(record.warnings)
-    if record.notes:
-        facts["notes"] = "; ".join(record.notes)
+    for label, remarks in (("warnings", record.warnings), ("notes", record.notes)):
+        if remarks:
+            facts[label] = "; ".join(remarks)
     if record.options.get("momentum_steps"):
         facts["start"] = f"{record.options['momentum_steps']:,} steps on the momentum along the logs"
     return facts
@@ -120,12 +174,12 @@ def settings(record: Record) -> dict[str, str]:
 
 
 def _names(trajectories: Sequence[str]) -> str:
-    if not trajectories:
-        return "none"
-    return f"{counted(len(trajectories), 'trajectory')}: {shortened(trajectories, 5)}"
+    count = counted(len(trajectories), "trajectory")
+    return f"{count}: {shortened(trajectories, 5)}" if trajectories else "none"
 
 
 def _duration(seconds: float) -> str:
+    # three digits at most: times of training vary by more
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = seconds / 60
@@ -134,14 +188,14 @@ def _duration(seconds: float) -> str:
 
 def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str]:
     """Return the commands that reproduce a run, with LOGS in place of the logs, whose paths are not recorded."""
+    # only options that differ from their defaults: the command remains short enough to be read
     options = asdict(spec.options)
     if spec.options.design is not None:  # the run folder has no copy of the YAML file
         options["preset"] += ".yaml"
     # without its folder, which may be one of another machine
     robot, option = shlex.quote(Path(spec.urdf).name), ""
     if run.urdf.exists():
-        robot = f"RUN/{run.urdf.name}"
-        option = f" --robot {robot}"
+        robot, option = f"RUN/{run.urdf.name}", f" --robot RUN/{run.urdf.name}"
     build = f"spelgen build {robot}"
     for key, value in _changed(options, asdict(Options())).items():
         words = ",".join(value) if isinstance(value, (list, tuple)) else str(value)
@@ -156,6 +210,7 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
         options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
+        # the mapping on the command line replaces the settings of the robot
         if run.mapping.exists():
             train += f" --mapping RUN/{run.mapping.name}"
         lines.append(train)

@@ -9,17 +9,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
 
 import numpy as np
+from pydantic import PlainSerializer, PlainValidator
 from scipy.spatial.transform import Rotation
 
 from spelgen.dynamics.constraint import Constraint, mimic_constraint
 from spelgen.evaluation.plain import Curve
-from spelgen.render.shapes import Shape, joined, triangles, tube
-from spelgen.render.tuning import TUNING
-from spelgen.urdf.geometry import link_shapes
+from spelgen.render.charts import TUNING
+from spelgen.urdf.geometry import LinkShape, link_shapes
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot, UrdfJoint
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +63,14 @@ def scene(urdf: Path, joints: Sequence[str]) -> Scene:
     """Return the scene of the arm with these moving joints. Raises the errors of ``read_urdf``."""
     robot = read_urdf(urdf)
     constraint = mimic_constraint(robot, joints)
+    # other branches of the robot (a second arm, a base with wheels) are not drawn
     names = _links(robot, joints)
     visual = link_shapes(urdf, "visual", names, TUNING.faces)
     tubes = f" Drawn as tubes, since meshes were not read: {visual.unread_text}." if visual.unread else ""
     if not visual.shapes:
         tubes = " No meshes were read; links are drawn as tubes."
     lengths = [np.linalg.norm(joint.xyz) for name, joint in robot.joint_above.items() if name in names]
+    # a sum and not the largest distance: it does not depend on the configuration
     extent = max(float(sum(lengths)), 1e-3)  # positive even if all joints lie in one point
     links = []
     for name in names:
@@ -130,6 +136,7 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
         if carried.type == "prismatic":  # a thin tube along its travel
             travel = max(abs(carried.lower or 0.0), abs(carried.upper or 0.0))
             meshes += tube(end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius)
+    # a last link without children would not be visible otherwise
     if not below and inertial is not None:
         meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
@@ -143,11 +150,61 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
 def _axis(joint: UrdfJoint) -> np.ndarray:
     """Return the unit vector of the axis, (3,)."""
     axis = np.array(joint.axis, dtype=float)
-    unit: np.ndarray = axis / (np.linalg.norm(axis) or 1.0)
-    return unit
+    return np.asarray(axis / (np.linalg.norm(axis) or 1.0))
 
 
 def _rotation(joint: UrdfJoint) -> np.ndarray:
     """Return the rotation matrix (3, 3) of roll, pitch and yaw about fixed axes."""
-    matrix: np.ndarray = Rotation.from_euler("xyz", joint.rpy).as_matrix()
-    return matrix
+    return np.asarray(Rotation.from_euler("xyz", joint.rpy).as_matrix())
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """Vertices (V, 3) [m] in the link frame; triangles as vertex indices (F, 3), counterclockwise from outside."""
+
+    vertices: Curve
+    faces: Annotated[np.ndarray, PlainValidator(np.array), PlainSerializer(np.ndarray.tolist)]
+
+
+def joined(meshes: Sequence[Trimesh]) -> Shape:
+    """Return one shape with the triangles of all meshes."""
+    import trimesh
+
+    if not meshes:
+        return Shape(np.zeros((0, 3)), np.zeros((0, 3), dtype=int))
+    mesh = cast("Trimesh", trimesh.util.concatenate(meshes))
+    return Shape(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def tube(start: np.ndarray, end: np.ndarray, radius: float, sides: int = 10) -> list[Trimesh]:
+    """Return a closed prism, or nothing if it would be shorter than half its radius.
+
+    Args:
+        start: First end of the axis, (3,) [m].
+        end: Last end of the axis, (3,) [m].
+        radius: Radius of the circumscribed cylinder [m].
+        sides: Number of sides.
+    """
+    import trimesh
+
+    # axes that nearly intersect would give discs in place of tubes
+    if np.linalg.norm(end - start) <= radius / 2:
+        return []
+    return [trimesh.creation.cylinder(radius, segment=[start, end], sections=sides)]
+
+
+def triangles(shape: LinkShape) -> Trimesh:
+    """Return the triangles of a shape in the frame of its link."""
+    from trimesh import Trimesh, creation
+
+    # 12 sides and 8 x 10 faces: coarse, since pages must remain small and edges are not visible at this size
+    if shape.mesh is not None:
+        mesh = Trimesh(*shape.mesh, process=False)
+    elif shape.kind == "box":
+        mesh = creation.box(extents=shape.size)
+    elif shape.kind == "cylinder":
+        mesh = creation.cylinder(radius=shape.size[0], height=shape.size[1], sections=12)
+    else:
+        mesh = creation.uv_sphere(shape.size[0], count=[8, 10])
+    mesh.apply_transform(shape.pose)
+    return mesh

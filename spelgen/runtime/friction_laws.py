@@ -11,12 +11,6 @@ from torch import Tensor, nn
 from spelgen.runtime.parts import Row
 from spelgen.runtime.rows import Joint, vector
 
-# Smoothing velocity of dry friction at joints without bristles, relative to the typical speed. A wider
-# transition between the directions would be confounded with hysteresis.
-SHARP_VELOCITY = 0.001
-# Below this fraction of typical friction the magnitude of a gravity torque is rounded, because |x| has no
-# derivative at zero.
-MIN_LOAD = 0.01
 # Initial velocity over which dry friction changes its direction, relative to the typical speed.
 SMOOTHING_VELOCITY = 0.006
 
@@ -146,9 +140,13 @@ class FrictionLaws(nn.Module):
             # Exponentials keep the constants positive; at zero they have the typical magnitude of the
             # joint.
             constants.append(initial * units[unit] * getattr(self, name).exp())
-        load = MIN_LOAD * torch.where(friction > 0, friction, 1.0)
+        # Below 1 % of typical friction the magnitude of a gravity torque is rounded: |x| has no derivative
+        # at zero.
+        load = 0.01 * torch.where(friction > 0, friction, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
-        rounding, sharp = self.stribeck_rounding, SHARP_VELOCITY * speed
+        # Dry friction without bristles: a wider transition between the directions would be confounded with
+        # hysteresis.
+        rounding, sharp = self.stribeck_rounding, 0.001 * speed
         return FrictionConstants._make(
             [*constants, rounding, sharp, load, fractions, self.reach, self.memoryless]
         )

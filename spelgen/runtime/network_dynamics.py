@@ -1,17 +1,18 @@
-"""A port-Hamiltonian model whose functions of q are networks."""
+"""A port-Hamiltonian model whose functions of q are networks, and friction from networks."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import JointEncoding
-from spelgen.runtime.parts import Friction, Inputs, Intermediates, Mass, Network, Parameters
+from spelgen.runtime.networks import JointEncoding, MaskedNetwork
+from spelgen.runtime.parts import Inputs, Intermediates, Layers, Mass, Parameters
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
-from spelgen.runtime.rows import Joint
+from spelgen.runtime.rows import Joint, vector
 
 
 class NetworkConfiguration(NamedTuple):
@@ -31,9 +32,9 @@ class NetworkDynamics(PortHamiltonian):
         *,
         joints: Sequence[Joint],
         mass: Mass,
-        potential: Network,
+        potential: MaskedNetwork,
         potential_scale: float,
-        friction: Friction,
+        friction: NetworkFriction,
         inputs: Inputs | None = None,
     ) -> None:
         super().__init__(joints, inputs)
@@ -104,7 +105,7 @@ class NetworkDynamics(PortHamiltonian):
 class DenseInputDynamics(NetworkDynamics):
     """G(q) is diagonal: a network with an output for each of the three axes of a joint, of which z moves."""
 
-    def __init__(self, *, input_network: Network, **parts: Any) -> None:
+    def __init__(self, *, input_network: MaskedNetwork, **parts: Any) -> None:
         super().__init__(**parts)
         self.moving = nn.Buffer(torch.eye(3 * self.n).double()[2::3])
         self.input_network = input_network
@@ -128,3 +129,92 @@ class DenseInputDynamics(NetworkDynamics):
     def input_torque(self, cache: NetworkConfiguration, force: Tensor) -> Tensor:
         """Return the inputs, (..., n), that give this force."""
         return force / self._gains(cache)
+
+
+class NetworkFriction(nn.Module):
+    """Friction by a network, in units of typical friction and typical speed."""
+
+    prepare: Callable[[], Parameters]  # all that depends on the parameters only
+    # D(q, qd) right, (..., n, k), of the encoding, qd, the parameters and right, (..., n, k)
+    forward: Callable[[Tensor, Tensor, Parameters, Tensor], Tensor]
+
+    def __init__(self, joints: Sequence[Joint], network: MaskedNetwork) -> None:
+        super().__init__()
+        self.speed = nn.Buffer(vector(joint.speed for joint in joints))
+        self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
+        self.network = network
+
+
+class JointFrictionParameters(NamedTuple):
+    """All that depends on the parameters only."""
+
+    layers: Layers
+    viscous: Tensor  # (n,) [Nm s/rad, N s/m]
+    smoothing: Tensor  # squared smoothing velocity, (n,)
+
+
+class JointFriction(NetworkFriction):
+    """A diagonal D(q, qd), positive for all parameters: viscous constants, and a network for dry friction."""
+
+    parameter_groups = (
+        ("raw_viscous", "sizes", "Nm s/rad, N s/m"),
+        ("raw_smoothing", "velocities", "rad/s, m/s"),
+    )
+
+    def __init__(self, joints: Sequence[Joint], network: MaskedNetwork) -> None:
+        super().__init__(joints, network)
+        self.raw_smoothing = nn.Parameter(torch.zeros_like(self.speed))
+        self.raw_viscous = nn.Parameter(torch.full_like(self.speed, -2.0))
+
+    def viscous(self) -> Tensor:
+        """Return the viscous coefficients, (n,) [Nm s/rad, N s/m]."""
+        return self.nominal * F.softplus(self.raw_viscous) / self.speed
+
+    def prepare(self) -> JointFrictionParameters:
+        """Return the parameter cache."""
+        # velocity below which dry friction goes to zero, relative to the typical speed: at first 0.03
+        smoothing = self.speed**2 * (0.001**2 + (0.03 * self.raw_smoothing.exp()) ** 2)
+        start = torch.full_like(self.speed, -2.0)
+        layers = self.network.prepare(torch.diag(0 * start + 1), start)
+        return JointFrictionParameters(layers, self.viscous(), smoothing)
+
+    def forward(
+        self, encoded: Tensor, qd: Tensor, parameters: JointFrictionParameters, right: Tensor
+    ) -> Tensor:
+        """Return D(q, qd) right, (..., n, k)."""
+        layers, viscous, smoothing = parameters
+        smooth_speed = torch.sqrt(qd * qd + smoothing)
+        inputs = torch.cat([encoded, qd, qd / smooth_speed], dim=-1)
+        # dry friction relative to its typical magnitude
+        dry = F.softplus(self.network.forward(inputs, layers)[0])
+        diagonal: Tensor = viscous + self.nominal * dry / smooth_speed
+        return diagonal.unsqueeze(-1) * right
+
+
+class DenseFriction(NetworkFriction):
+    """D(q, qd) = L L^T, with ``axes`` rows of L for each joint.
+
+    A joint moves along the last of its axes only, so only those rows of L are computed.
+    """
+
+    def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:
+        super().__init__(joints, network)
+        rows = axes * len(joints)
+        row, column = torch.tril_indices(rows, rows)
+        # from the entries of a lower triangle, rows in sequence, to the matrix: (rows, rows, entries)
+        spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
+        self.entries = nn.Buffer(spread[axes - 1 :: axes])
+        # initial diagonal of L, relative to the root of typical friction per typical speed
+        self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
+
+    def prepare(self) -> Layers:
+        """Return the layers that give the rows of L."""
+        size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
+        output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)
+        return self.network.prepare(output_map, (size * self.initial).flatten())
+
+    def forward(self, encoded: Tensor, qd: Tensor, layers: Layers, right: Tensor) -> Tensor:
+        """Return D(q, qd) right, (..., n, k)."""
+        rows = self.network.forward(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
+        factor = rows.reshape(*qd.shape[:-1], *self.initial.shape)
+        return factor @ (factor.mT @ right)

@@ -19,22 +19,6 @@ Configuration = Any  # configuration cache: all that depends on q only
 Position = Any  # q, (..., n), or the configuration at q
 
 
-class Network(Protocol):
-    """Learned functions y of the encoded positions, with explicit derivatives."""
-
-    def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return the layers of offset (rows,) + output_map (rows, outputs) y."""
-
-    def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
-        """Return offset + output_map y, (..., rows), and the intermediates of ``vjp`` and ``jvp``."""
-
-    def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
-        """Return cotangent, (..., rows), times the Jacobian with respect to the encoding."""
-
-    def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
-        """Return the Jacobian with respect to the encoding times a tangent, (..., rows)."""
-
-
 class Mass(Protocol):
     """The mass matrix M(q) and its derivatives."""
 
@@ -49,16 +33,6 @@ class Mass(Protocol):
 
     def jvp(self, rate: Tensor, intermediates: Intermediates) -> Tensor:
         """Return dM/dt, (..., n, n), for this rate of the encoding."""
-
-
-class Friction(Protocol):
-    """The dissipation matrix D(q, qd)."""
-
-    def prepare(self) -> Parameters:
-        """Return the parameter cache: all that depends on the parameters only."""
-
-    def forward(self, encoded: Tensor, qd: Tensor, parameters: Parameters, right: Tensor) -> Tensor:
-        """Return D(q, qd) right, (..., n, k)."""
 
 
 class Inputs(Protocol):

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import JointEncoding
-from spelgen.runtime.parts import Entries, Intermediates, Layers, Network
+from spelgen.runtime.networks import JointEncoding, MaskedNetwork
+from spelgen.runtime.parts import Entries, Intermediates, Layers
 from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidConfiguration, RigidParameters
 from spelgen.runtime.rows import Joint, vector
 
 # Number of B-splines over the range of a joint.
@@ -21,10 +22,6 @@ SPLINES = 34
 HARMONICS = 64
 # Bound of the logarithm of the friction factor: the factor stays between 0.1 and 10.
 LARGEST = math.log(10.0)
-# Largest fraction of the armature that the residual of M may subtract.
-PART = 0.9
-# Bound of a function in an entry of M that does not contain it.
-NEVER = 1e30
 
 
 class ResidualParameters(NamedTuple):
@@ -78,8 +75,8 @@ class ResidualTerms(nn.Module):
         *,
         functions: int,
         constants: int,
-        network: Network | None = None,
-        potential: Network | None = None,
+        network: MaskedNetwork | None = None,
+        potential: MaskedNetwork | None = None,
         potential_scale: float = 1.0,
     ) -> None:
         super().__init__()
@@ -108,9 +105,10 @@ class ResidualTerms(nn.Module):
         self.mass, self.potential = network, potential
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
-        # one divided by the coefficient of each function and constant in an entry; NEVER if it is zero
-        self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, NEVER))
-        self.part = PART / float((size > 0).sum(dim=(0, 2)).max())  # divided among all terms in a row of M
+        # one divided by the coefficient of each function and constant in an entry; no bound if it is zero
+        self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
+        # at most 90 % of the armature may be subtracted
+        self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())  # divided among all terms in a row of M
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
@@ -219,3 +217,53 @@ class ResidualTerms(nn.Module):
     def _distances(self, q: Tensor) -> Tensor:
         """Return the distance of q from the middle of each spline, in spacings, (..., n, SPLINES)."""
         return (q.unsqueeze(-1) - self.middles) / self.spacing
+
+
+class ResidualDynamics(RigidBodyDynamics):
+    """Rigid bodies with residual terms in M, V and friction; ``residuals`` is None if they were removed."""
+
+    residuals: ResidualTerms | None
+
+    def __init__(self, *, residuals: ResidualTerms, **rigid: Any) -> None:
+        super().__init__(**rigid)
+        self.residuals = residuals
+
+    def prepare(self) -> RigidParameters:
+        """Return the parameter cache; valid until a parameter changes."""
+        prepared = super().prepare()
+        if self.residuals is None:
+            return prepared
+        return prepared._replace(residual=self.residuals.prepare(prepared.armature))
+
+    def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
+        """Return all that depends on q, (..., n), only."""
+        cache = super().configuration(q, prepared)
+        if self.residuals is None:
+            return cache
+        residual = self.residuals.at(q, prepared.residual)
+        return cache._replace(mass=cache.mass + residual.mass, varied=residual.friction, residual=residual)
+
+    def potential_energy(self, q: Tensor | RigidConfiguration, z: Tensor | None = None) -> Tensor:
+        """Return V(q) and the elastic energy of the bristles, (...) [J]."""
+        cache: RigidConfiguration = self.at(q)
+        energy = super().potential_energy(cache, z)
+        return energy if self.residuals is None else energy + self.residuals.energy(cache.residual)
+
+    def gravity(self, q: Tensor | RigidConfiguration) -> Tensor:
+        """Return dV/dq, (..., n) [Nm, N]."""
+        cache: RigidConfiguration = self.at(q)
+        if self.residuals is None:
+            return cache.gravity
+        return cache.gravity - self.residuals.gradient(cache.residual, 0 * cache.gravity)
+
+    def lagrangian_gradient(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
+        """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        cache: RigidConfiguration = self.at(q, qd)
+        gradient = super().lagrangian_gradient(cache, qd)
+        return gradient if self.residuals is None else gradient + self.residuals.gradient(cache.residual, qd)
+
+    def nonlinear_effects(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
+        """Return Coriolis, centrifugal and gravity torque, (..., n)."""
+        cache: RigidConfiguration = self.at(q, qd)
+        torque = super().nonlinear_effects(cache, qd)
+        return torque if self.residuals is None else torque + self.residuals.nonlinear(cache.residual, qd)

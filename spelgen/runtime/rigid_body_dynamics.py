@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.body_chain import ChainConfiguration, chain_of_links
+from spelgen.runtime.body_chain import ChainConfiguration, InertialParameters, chain_of_links
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws, turning
+from spelgen.runtime.motors import PositionServo
 from spelgen.runtime.parts import Configuration, Inputs, Parameters, Row, Rows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
-from spelgen.runtime.position_servo import PositionServo
-from spelgen.runtime.rigid_body import InertialParameters
 from spelgen.runtime.rows import Joint, Link, vector
 
 
@@ -84,7 +83,7 @@ class RigidBodyDynamics(PortHamiltonian):
         self.register_buffer("loads", None if motors is None else torch.linalg.inv(motors))
 
     @property
-    def input_quantity(self) -> str:
+    def input_quantity(self) -> Literal["torque", "position"]:
         """``torque``, or ``position`` for inputs that are commands of position servos."""
         return "torque" if self.servo is None else "position"
 

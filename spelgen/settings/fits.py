@@ -3,8 +3,6 @@
 `OWNERS` lists the objectives of each option; an option of another objective is an `OptionError`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
@@ -12,8 +10,8 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from spelgen.errors import OptionError, SettingsError, suggestion
-from spelgen.settings.messages import validated
 from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
+from spelgen.settings.yaml_document import validated
 
 Objective = Literal["torque", "momentum", "rollout", "servo"]
 Optimizer = Literal["adamw", "lbfgs"]
@@ -98,6 +96,7 @@ class FitConfig(Group):
     @classmethod
     def _refuse_foreign(cls, options: object) -> object:
         for name in options if isinstance(options, Mapping) else ():
+            # an option of another objective has a message of its own, since it exists
             if name not in cls.model_fields:
                 owners = OWNERS.get(name)
                 if owners is None:
@@ -116,6 +115,7 @@ class FitConfig(Group):
 
     def require(self, *, rigid_bodies: bool) -> None:
         """Raise OptionError if an option was set that does not apply to this type of model."""
+        # rigid bodies are fitted to torques directly, without the weak form
         if rigid_bodies and self.objective == "momentum":
             raise OptionError(
                 "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
@@ -127,8 +127,9 @@ class FitConfig(Group):
 
     def record(self, *, rigid_bodies: bool) -> dict[str, object]:
         """Return the options that apply, for config.json."""
-        unused = self.unused(rigid_bodies=rigid_bodies)
-        return self.model_dump(mode="json", exclude_none=True, exclude=set(unused))
+        return self.model_dump(
+            mode="json", exclude_none=True, exclude=set(self.unused(rigid_bodies=rigid_bodies))
+        )
 
     @classmethod
     def unused(cls, *, rigid_bodies: bool) -> tuple[str, ...]:
@@ -190,13 +191,13 @@ class OnWindows(FitConfig):
 
     def resolved(self, windows: int) -> Self:
         """Return the configuration with optimizer, batch, learning rate and weight decay for a number of windows."""
+        # L-BFGS with all windows per step converges in few steps, but each one takes all windows
         optimizer = self.optimizer or ("lbfgs" if windows <= DEFAULTS.few_windows else "adamw")
         update: dict[str, object] = {"optimizer": optimizer, "batch": None, "learning_rate": None}
         decay = DEFAULTS.lbfgs_decay
         if optimizer == "adamw":
-            update["batch"] = self.batch or DEFAULTS.batch
+            decay, update["batch"] = DEFAULTS.adamw_decay, self.batch or DEFAULTS.batch
             update["learning_rate"] = self.learning_rate or DEFAULTS.learning_rate
-            decay = DEFAULTS.adamw_decay
         if self.weight_decay is None:
             update["weight_decay"] = decay
         return self.model_copy(update=update)
@@ -243,18 +244,11 @@ class ServoFit(FitConfig):
 
 
 WindowConfig = MomentumFit | Rollout
-CONFIGS: dict[str, type[FitConfig]] = {
-    "torque": TorqueFit,
-    "momentum": MomentumFit,
-    "rollout": Rollout,
-    "servo": ServoFit,
-}
-
-
+CONFIGS: dict[str, type[FitConfig]] = {x.objective: x for x in (TorqueFit, MomentumFit, Rollout, ServoFit)}
 OWNERS: dict[str, list[str]] = {}
-for _objective, _config in CONFIGS.items():
+for _config in CONFIGS.values():
     for _name in _config.model_fields:
-        OWNERS.setdefault(_name, []).append(_objective)
+        OWNERS.setdefault(_name, []).append(_config.objective)
 
 
 def fit_config(
@@ -278,6 +272,7 @@ def fit_config(
     for name, (condition, _, excluded) in UNLESS.items():
         if options.get(condition, settings.get(condition)) == excluded:
             settings.pop(name, None)
+        # an option of the caller implies the choice that it depends on
         elif name in options and condition not in options and settings.get(condition) == excluded:
             settings.pop(condition)
     config = validated(config_type, settings | options)

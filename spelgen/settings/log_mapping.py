@@ -19,32 +19,32 @@ from spelgen.settings.values import Group, Number, Positive
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
 # factors to SI units; SI units themselves are not listed
-LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mm": _MILLI}
+LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mrad": _MILLI, "mm": _MILLI}
 SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
-CURRENTS = ("A", "mA")
+# of a torque that only a gain converts: currents, and parts of a torque that the log does not state
+CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
 # -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
 NORMALISED = "normalised"
-SERVO_TURN = 4096  # counts in a revolution of the servos that LeRobot calibrates
 ONLY = {  # units that a joint of this type cannot have
-    "revolute": ("m", "mm", "m/s", "mm/s", "N"),
-    "prismatic": ("normalised", "rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
+    "revolute": {"m", "mm", "m/s", "mm/s", "N"},
+    "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", *LENGTHS, *SPEEDS} - {"mm", "mm/s"},
 }
 
 LONGEST_DELAY = 1.0  # s
 
 Accepted = Literal[
     "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",
-    "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "joint-sense", "joint-order", "joint-zero",
-    "gravity", "gravity-compensated", "torque-clipped",
+    "velocity-is-no-derivative", "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "motion-order",
+    "joint-sense", "joint-order", "joint-unit", "joint-zero", "gravity", "gravity-compensated", "torque-clipped",
 ]  # fmt: skip
 """Codes of errors of `spelgen logs` that a user can accept."""
 
 Time = Literal["s", "ms", "us", "ns"]
-Position = Literal["rad", "deg", "turns", "counts", "normalised", "m", "mm"]
-Velocity = Literal["rad/s", "deg/s", "turns/s", "rpm", "counts/s", "m/s", "mm/s"]
-Effort = Literal["Nm", "mNm", "N", "A", "mA"]
+Position = Literal["rad", "deg", "turns", "mrad", "counts", "normalised", "m", "mm"]
+Velocity = Literal["rad/s", "deg/s", "turns/s", "mrad/s", "rpm", "counts/s", "m/s", "mm/s"]
+Effort = Literal["Nm", "mNm", "N", "A", "mA", "percent", "permille"]
 
 
 class LogColumns(Group):
@@ -229,6 +229,7 @@ class LogMapping(Group):
     @property
     def quantities(self) -> tuple[str, ...]:
         """Required quantities of a log."""
+        # fits of position servos compare positions only: velocities are not needed
         if self.input == "position":
             return ("q", "u")
         # Velocities are computed from the positions: no column is read for them.
@@ -251,12 +252,17 @@ class LogMapping(Group):
     def column(self, quantity: str, joint: str) -> str:
         """Return the column of "q", "qd", "tau" or "u" of a joint."""
         name: str | None = getattr(self.joint(joint).columns, quantity)
-        pattern: str = getattr(self.columns, quantity)
-        return name or pattern.replace("{joint}", self.log_name(joint))
+        return name or self.pattern(quantity).replace("{joint}", self.log_name(joint))
+
+    def pattern(self, quantity: str) -> str:
+        """Return the name of the columns of a quantity, with `{joint}`."""
+        name: str = getattr(self.columns, quantity)
+        return name
 
     def of_trajectory(self, text: str) -> LogMapping:
         """Return the mapping for one recording of a file: `{trajectory}` in the columns' names is its text."""
-        named = {key: name.replace("{trajectory}", text) for key, name in self.columns.model_dump().items()}
+        # without a pattern in a name the column is common to all recordings
+        named = {key: name.replace("{trajectory}", text) for key, name in self.columns}
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
@@ -272,6 +278,7 @@ class LogMapping(Group):
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
+            # a stated period may belong to a register, and is then larger than a turn
             unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
             turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
             period = logged.period.model_copy(update=turns)
@@ -280,6 +287,7 @@ class LogMapping(Group):
 
     def in_si(self) -> LogMapping:
         """Return the mapping of a file in SI units with default names; only input and periods of one turn are kept."""
+        # angles of turning joints may be logged in any interval of one turn, also in files of spelgen
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
@@ -291,6 +299,7 @@ class LogMapping(Group):
     def unit(self, quantity: str, joint: str) -> str | None:
         """Return the unit of "q", "qd", "tau" or "u" of a joint, None without a setting; u has the unit of q."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
+        # commands and positions come from one controller
         if unit is None and quantity == "u":
             return self.unit("q", joint)
         return unit
@@ -301,10 +310,12 @@ class LogMapping(Group):
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain
+        # -100..100 covers the calibrated range, and drive_mode 1 reverses it
         elif unit == NORMALISED:
             motor = self.calibration[self.log_name(joint)]
             counts = (motor.range_max - motor.range_min) / 200
-            factor = (1 - 2 * motor.drive_mode) * counts * 2 * pi / (logged.counts_per_turn or SERVO_TURN)
+            # counts in a revolution of the servos that LeRobot calibrates
+            factor = (1 - 2 * motor.drive_mode) * counts * 2 * pi / (logged.counts_per_turn or 4096)
         elif unit in COUNTS:
             turn = logged.counts_per_turn
             factor = 2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0)
@@ -320,17 +331,18 @@ class LogMapping(Group):
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
         """Return the errors of the mapping for these joints: missing keys, and units of the wrong joint type."""
         errors = []
-        kinds: Sequence[str | None] = joint_types or [None] * len(joints)
-        for joint, kind in zip(joints, kinds, strict=True):
-            for quantity in self.quantities:
-                unit = self.unit(quantity, joint)
-                expected = self._missing(unit, self.log_name(joint), self.joint(joint), kind)
-                if expected:
-                    where = f"logs: joint {joint!r}, {quantity}"
-                    errors.append(SettingsError(f"the unit {unit}", element=where, expected=expected))
+        kinds: dict[str, str | None] = dict.fromkeys(joints)
+        kinds.update(zip(joints, joint_types or (), strict=joint_types is not None))
+        for joint, quantity in product(joints, self.quantities):
+            unit = self.unit(quantity, joint)
+            expected = self._missing(unit, self.log_name(joint), self.joint(joint), kinds[joint])
+            if expected:
+                where = f"logs: joint {joint!r}, {quantity}"
+                errors.append(SettingsError(f"the unit {unit}", element=where, expected=expected))
         return errors
 
     def _missing(self, unit: str | None, joint: str, logged: JointLog, kind: str | None) -> str | None:
+        # a motor current has no torque without its motor constant
         if unit in CURRENTS and logged.gain is None:
             return "a gain beside it"
         if unit == NORMALISED and joint not in self.calibration:
@@ -341,6 +353,6 @@ class LogMapping(Group):
             in_metres = logged.counts_per_metre if kind != "revolute" else None
             if not (in_turns or in_metres):
                 return f"{'counts_per_metre' if kind == 'prismatic' else 'counts_per_turn'} beside it"
-        if unit in ONLY.get(kind or "", ()):
+        if unit in ONLY.get(kind or "", set()):
             return f"one of a {kind} joint"
         return None

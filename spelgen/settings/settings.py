@@ -5,23 +5,85 @@ An error in a group of keys that only one step reads is raised by that step only
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from spelgen.errors import Diagnostic, SettingsError, SpelgenError, SpelgenErrors, collect
-from spelgen.settings.joint import JointSettings, MotorCoupling
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.messages import unknown_name, validated
 from spelgen.settings.simulation import SimulationSettings, TrackingSettings
 from spelgen.settings.training import ComparisonSettings, TrainingSettings
-from spelgen.settings.values import Group, Number
-from spelgen.settings.yaml_document import Location, YamlDocument, read_document
+from spelgen.settings.values import Group, Inputs, NonNegative, Number, Positive
+from spelgen.settings.yaml_document import Location, YamlDocument, read_document, unknown_name, validated
 
 OF_A_STEP = ("simulation", "tracking", "training", "comparison", "logs")
 """Groups that only one step reads; all others belong to the arm."""
+
+
+class JointSettings(Group):
+    """Drive of one joint. A prismatic joint has m in place of rad, N in place of Nm and kg in place of kg m^2.
+
+    Attributes:
+        rotor_inertia: Rotor inertia of the motor, before the gear [kg m^2].
+        gear: Motor revolutions per joint revolution.
+        viscous: Viscous friction coefficient, after the gear [Nm s/rad].
+        coulomb: Coulomb friction torque for qd > 0 and for qd < 0, after the gear, e.g. [0.395, -0.435] [Nm].
+        actuated: False for a passive joint, which has no input.
+        kp: Known stiffness of a position servo; without a value it is trained [Nm/rad].
+        gain: "trained" if the factor from logged motor torques to joint torques is trained, with `gear` as its initial
+            value.
+        inputs: Torques of this joint in random-inputs simulations, in place of `simulation.inputs` [Nm].
+    """
+
+    rotor_inertia: NonNegative = 0.0
+    gear: Positive = 1.0
+    viscous: NonNegative = 0.0
+    coulomb: tuple[Number, Number] = (0.0, 0.0)
+    actuated: bool = True
+    kp: Positive | None = None
+    gain: Literal["known", "trained"] = "known"
+    inputs: Inputs | None = None
+
+    @property
+    def armature(self) -> float:
+        """Rotor inertia on the joint side of the gear [kg m^2]."""
+        # a rotor turns gear times as fast, and its torque acts gear times as strongly
+        return self.rotor_inertia * self.gear**2
+
+    @field_validator("coulomb")
+    @classmethod
+    def _resists(cls, value: tuple[float, float]) -> tuple[float, float]:
+        # friction of the opposite sense would drive the joint
+        if value[0] < 0 or value[1] > 0:
+            raise ValueError("the torque for qd > 0 (not negative), then for qd < 0 (not positive)")
+        return value
+
+
+class MotorCoupling(Group):
+    """Joints that are driven by the same motors: joint torques = `matrix` times motor torques.
+
+    Attributes:
+        joints: Names of the n coupled joints.
+        matrix: Rows of the invertible (n, n) matrix, one row per joint and one column per motor.
+    """
+
+    joints: Annotated[tuple[str, ...], Field(min_length=2)]
+    matrix: tuple[tuple[Number, ...], ...]
+
+    @model_validator(mode="after")
+    def _invertible(self) -> MotorCoupling:
+        if {len(self.matrix), *map(len, self.matrix)} != {len(self.joints)}:
+            raise ValueError("as many rows, and as many numbers in each, as joints")
+        rows = np.array(self.matrix)
+        # the rank is tested after scaling each row, as the motors of different joints may have different units
+        largest = np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
+        if np.linalg.matrix_rank(rows / np.where(largest > 0, largest, 1.0)) < len(self.joints):
+            raise ValueError("a matrix with an inverse: as many independent motors as joints")
+        return self
 
 
 class Unusable:
@@ -31,6 +93,7 @@ class Unusable:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> NoReturn:
+        # names with underscores are asked for by copy and pickle, which must not fail
         if not name.startswith("__"):
             collect(self.errors)
         raise AttributeError(name)
@@ -73,14 +136,17 @@ class Settings(Group):
     @field_validator("joints", mode="before")
     @classmethod
     def _by_name(cls, joints: object) -> object:
+        # a frequent confusion, for which the message of pydantic would not name the other key
         if isinstance(joints, list):
             raise ValueError("settings by the name of a joint; `moving_joints` lists the joints that move")
         return joints
 
     @model_validator(mode="after")
     def _drives(self) -> Settings:
+        # both define the last joint, and could contradict each other
         if self.tip is not None and self.moving_joints is not None:
             raise ValueError("'tip' or 'moving_joints', not both")
+        # a position servo commands a joint, and its logs have no torques
         if self.input == "position" and (self.torque == "motor" or self.couplings):
             raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
         # A joint in two couplings would have two different motor torques.
@@ -104,7 +170,7 @@ class Settings(Group):
         return self.joints.get(name, JointSettings())
 
 
-def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) -> Settings:
+def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) -> Settings:
     """Return the settings of a URDF (`arm.yaml` for `arm.urdf`); the defaults if the file does not exist.
 
     Args:
@@ -124,11 +190,12 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
         return Settings()
     document = read_document(path)
     content = document.value()
-    joint_names = None if joints is None else list(joints)
-    unusable: dict[str, Unusable] = {}
+    unusable: dict[str, tuple[SpelgenError, ...]] = {}
     while True:
         try:
-            settings = _read(document, content, joint_names).model_copy(update=unusable)
+            settings = validated(Settings, content, document)
+            if joints is not None:
+                _require_joints(_joint_names(settings), joints, document)
             break
         except SpelgenError as error:
             errors = error.errors if isinstance(error, SpelgenErrors) else (error,)
@@ -136,37 +203,35 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
         for each in errors:
             group = (each.element or "").partition(".")[0]
             if group not in OF_A_STEP:
-                collect([*errors, *(x for placeholder in unusable.values() for x in placeholder.errors)])
-            previous = unusable.get(group, Unusable(()))
-            unusable[group] = Unusable((*previous.errors, each))
+                collect([*errors, *chain(*unusable.values())])
+            unusable[group] = (*unusable.get(group, ()), each)
             # Read again without the group: its errors may have hidden errors of other groups.
             content.pop(group, None)
+    update: dict[str, object] = {group: Unusable(group_errors) for group, group_errors in unusable.items()}
     # the logs have the input of the arm, so that a file states it only once
-    if settings.input == "position" and not isinstance(settings.logs, Unusable):
-        logs = settings.logs.model_copy(update={"input": "position"})
-        settings = settings.model_copy(update={"logs": logs})
-    return settings
+    if settings.input == "position" and "logs" not in unusable:
+        update["logs"] = settings.logs.model_copy(update={"input": "position"})
+    return settings.model_copy(update=update)
 
 
-def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
+def load_mapping(path: Path | str, joints: Collection[str]) -> LogMapping:
     """Return the mapping of logs in a separate YAML file, which has the keys of `logs` in the settings.
 
     Raises SettingsError as `load_settings` does, and for joints that are not among `joints`.
     """
-    document, joint_names = read_document(Path(path)), list(joints)
+    document = read_document(Path(path))
     mapping = validated(LogMapping, document.value(), document)
-    unknown = [name for name in mapping.joints if name not in joint_names]
-    collect([unknown_name(("joints", name), "joint", name, joint_names, document) for name in unknown])
+    _require_joints(((("joints", name), name) for name in mapping.joints), joints, document)
     return mapping
 
 
-def _read(document: YamlDocument, content: object, joint_names: list[str] | None) -> Settings:
-    """Return the settings in ``content``. Raises the errors of `validated`, and SettingsError for unknown joints."""
-    settings = validated(Settings, content, document)
-    if joint_names is not None:
-        unknown = [(location, name) for location, name in _joint_names(settings) if name not in joint_names]
-        collect([unknown_name(location, "joint", name, joint_names, document) for location, name in unknown])
-    return settings
+def _require_joints(
+    found: Iterable[tuple[Location, str]], names: Collection[str], document: YamlDocument
+) -> None:
+    """Raise SettingsError, or SpelgenErrors, for the joints of a file that are not among `names`."""
+    collect(
+        [unknown_name(place, "joint", name, names, document) for place, name in found if name not in names]
+    )
 
 
 def _joint_names(settings: Settings) -> Iterator[tuple[Location, str]]:

@@ -1,10 +1,10 @@
 """The settings file of `spelgen init`: the main keys with their defaults, commented out and explained."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
+
+from spelgen.labels import UNITS
 
 ARM = """\
 ## Settings of the arm {urdf}. Each line that begins with one # and a space is a default:
@@ -49,10 +49,6 @@ ARM = """\
 ## Defaults of `spelgen train`: its options, with _ in place of -.
 # training: {{validation_fraction: 0.25, seed: 0}}
 """
-UNITS = {
-    "revolute": {"q": "rad", "qd": "rad/s", "tau": "Nm"},
-    "prismatic": {"q": "m", "qd": "m/s", "tau": "N"},
-}
 
 
 class StarterJoint(NamedTuple):
@@ -72,13 +68,11 @@ def starter(urdf: str, joints: Sequence[StarterJoint], tip: str) -> str:
             "rotor_inertia": 0.0, "gear": 1.0, "viscous": joint.damping,
             "coulomb": [joint.friction, -joint.friction], "actuated": True, "gain": "known",
         }  # fmt: skip
+        units = UNITS[joint.joint_type]
         log = {
-            "name": joint.name,
-            "sign": 1,
-            "offset": 0.0,
-            "torque_offset": 0.0,
-            "units": UNITS[joint.joint_type],
-        }
+            "name": joint.name, "sign": 1, "offset": 0.0, "torque_offset": 0.0,
+            "units": {"q": units.position, "qd": units.velocity, "tau": units.torque},
+        }  # fmt: skip
         drives += f"#   {json.dumps(joint.name)}: {_flow(drive)}\n"
         logs += f"#     {json.dumps(joint.name)}: {_flow(log)}\n"
     names = json.dumps([joint.name for joint in joints])

@@ -1,22 +1,24 @@
-"""Read YAML with the line of each value; unsafe or ambiguous constructs of YAML are errors."""
+"""Read YAML with the line of each value, and check it key by key; unsafe or ambiguous constructs are errors."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar, get_args
 
 import yaml
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 from yaml.composer import ComposerError
 
-from spelgen.errors import SettingsError
+from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.files import read_bytes
 
 Location: TypeAlias = tuple[int | str, ...]
 """Keys and numbers of list items that lead to a place in a file."""
 
-MAX_BYTES = 256 * 1024  # 300 joints, each with every key, take 60 kB
-MAX_DEPTH = 16
+EXPECTED = {"missing": "a value", "model_type": "keys with values", "dict_type": "keys with values"}
+
+Checked = TypeVar("Checked", bound=BaseModel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +72,15 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     def compose_node(self, parent: yaml.Node | None, index: object) -> yaml.Node:
         event = self.peek_event()
         mark = event.start_mark
+        # aliases of aliases expand a small file to gigabytes
         if self.check_event(yaml.AliasEvent):
             raise ComposerError(None, None, "an alias", mark)
         is_tagged = isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag is not None
         if is_tagged:  # a tag may contradict its value, as in "!!bool maybe"
             raise ComposerError(None, None, f"the tag {event.tag}", mark)
-        if self.depth == MAX_DEPTH:
-            raise ComposerError(None, None, f"more than {MAX_DEPTH} levels", mark)
+        # settings have six levels at most; the parser is recursive
+        if self.depth == 16:
+            raise ComposerError(None, None, "more than 16 levels", mark)
         self.depth += 1
         node = super().compose_node(parent, index)
         self.depth -= 1
@@ -88,6 +92,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 raise ComposerError(None, None, "a key that is no plain word", key.start_mark)
+            # YAML would silently keep the last one
             if key.value in seen:
                 raise ComposerError(None, None, f"the key {key.value!r} a second time", key.start_mark)
             seen.add(key.value)
@@ -96,7 +101,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
 
 def read_document(path: Path) -> YamlDocument:
     """Return the content of a small YAML file with one document. Raises SettingsError for any other file."""
-    content = read_bytes(path, SettingsError, "a YAML file", MAX_BYTES)
+    content = read_bytes(path, SettingsError, "a YAML file", 256 * 1024)  # 300 joints with all keys: 60 kB
     try:
         return YamlDocument(path, _Loader(content.decode("utf-8")).get_single_node())
     except UnicodeDecodeError as error:
@@ -111,3 +116,79 @@ def _yaml_error(error: yaml.YAMLError, path: Path) -> SettingsError:
         # PyYAML begins the second half of some sentences with "but"
         problem, mark = error.problem.removeprefix("but "), error.problem_mark
     return SettingsError(f"not plain YAML: {problem}", file=path, line=mark.line + 1 if mark else None)
+
+
+def validated(group: type[Checked], content: object, document: YamlDocument | None = None) -> Checked:
+    """Return the content of a file, or arguments of a caller, as a group of settings; None: the defaults.
+
+    Raises SettingsError, or SpelgenErrors for several errors; see `explain`.
+    """
+    try:
+        return group.model_validate({} if content is None else content)
+    except ValidationError as error:
+        collect([explain(detail, document, group) for detail in error.errors(include_url=False)])
+        raise
+
+
+def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[BaseModel]) -> SettingsError:
+    """Return one of pydantic's `ValidationError.errors` as an error with its line and the expected value.
+
+    document: None for values of the command line, which have no lines.
+    """
+    location, error_type = detail["loc"], detail["type"]
+    # misspelt keys are the most frequent error: the closest known key is named
+    if error_type == "extra_forbidden":
+        names = _group_at(group, location[:-1]).model_fields
+        return unknown_name(location, "key", str(location[-1]), names, document)
+    message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    expected = EXPECTED.get(error_type, message)
+    # this is pydantic's location of an invalid key of a dict
+    if location[-1:] == ("[key]",):
+        location, expected = location[:-1], "a name; write it in quotes"
+        if error_type == "string_pattern_mismatch":
+            expected = "a name of letters, digits, '.', '_' and '-'"
+    got = repr(detail["input"])
+    if error_type == "missing" and isinstance(detail["input"], Mapping):
+        got = "nothing"
+    elif error_type == "value_error" and not location:
+        got = "these settings"
+    if len(got) > 60:
+        got = got[:57] + "..."
+    error = _error_at(location, document, got)
+    error.expected = expected
+    return error
+
+
+def unknown_name(
+    location: Location, noun: str, name: str, names: Iterable[str], document: YamlDocument | None
+) -> SettingsError:
+    """Return the error for a name that is not among `names`, with the nearest known name; noun: key or joint."""
+    error = _error_at(location, document, f"unknown {noun} {name!r}")
+    error.element, error.do = dotted(location[:-1]), suggestion(name, names)
+    return error
+
+
+def dotted(location: Location) -> str | None:
+    """Return the location in a file as `joints.joint1.gear`; None for the whole file."""
+    return ".".join(map(str, location)) or None
+
+
+def _error_at(location: Location, document: YamlDocument | None, got: str) -> SettingsError:
+    if document is None:
+        return SettingsError(got, element=dotted(location))
+    return SettingsError(got, file=document.path, line=document.line(location), element=dotted(location))
+
+
+def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
+    """Return the group of keys at a location; the location may contain keys of dicts and indices of lists."""
+    for key in map(str, location):
+        if key in group.model_fields:
+            group = _first_group(group.model_fields[key].annotation) or group
+    return group
+
+
+def _first_group(annotation: object) -> type[BaseModel] | None:
+    """Return the first group of keys in an annotation such as `dict[str, Group] | None`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_first_group, get_args(annotation))), None)

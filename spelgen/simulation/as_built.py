@@ -18,6 +18,7 @@ from spelgen.errors import SpelgenError
 from spelgen.excitation.bounds import SPEEDS, motion_bounds
 from spelgen.files import write_bytes, write_text
 from spelgen.simulation.tuning import AS_BUILT
+from spelgen.structure.nominal import parameters_of, pseudo_inertia
 from spelgen.urdf.document import urdf_bytes
 
 ABOUT = "The arm as built, from seed {}: the ground truth of simulated logs. `spelgen simulate` on it makes more logs."
@@ -40,13 +41,17 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
     arm_dynamics(arm.chain, arm.settings)  # reports missing inertials with the name of the user's file
-    settings, sidecar = _settings(arm, seed), path.with_suffix(".yaml")
+    settings = _settings(arm, seed)
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
     # magnitudes of friction and armature follow from the perturbed rigid bodies, without drives
-    write_text(sidecar, _yaml(settings))
-    bodies = load_arm(path, angle_tolerance=arm.angle_tolerance)
+    bodies = _with_settings(path, settings, arm)
     settings["joints"] = _drives(arm, bodies, np.random.default_rng([seed, 1]))
-    write_text(sidecar, _yaml(settings))
+    return _with_settings(path, settings, arm)
+
+
+def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
+    """Return the arm of a URDF after writing its settings, with the angles rounded as for ``arm``."""
+    write_text(path.with_suffix(".yaml"), yaml.safe_dump(settings, sort_keys=False, allow_unicode=True))
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
 
 
@@ -66,6 +71,7 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
         return settings
     bounds = motion_bounds(arm.chain, 1.0, 1.0, arm.robot.joint)
     ranges = np.stack([bounds.low, bounds.high], axis=1).tolist()
+    positions = dict(zip(names, ranges, strict=True)) | carried.get("simulation", {}).get("positions", {})
     settings["simulation"] = {
         "protocol": "prescribed",
         "trajectories": 2,
@@ -74,8 +80,7 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
         "test_fraction": 0.5,
         "presliding": AS_BUILT.presliding,
         "torque_noise": AS_BUILT.torque_noise,
-        "positions": dict(zip(names, ranges, strict=True))
-        | carried.get("simulation", {}).get("positions", {}),
+        "positions": positions,
         "seed": seed,
     }
     settings["tracking"] = {"paths": "excitation", "resolution": AS_BUILT.resolution}
@@ -111,34 +116,18 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
     drives: dict[str, dict[str, object]] = {}
     for k, joint in enumerate(joints):
         drive = arm.settings.joint(joint.name)
+        forward, backward = coulomb[k] * (1 + asymmetry[k]), coulomb[k] * (1 - asymmetry[k])
+        numbers = (armature[k] / drive.gear**2, viscous[k], forward, backward)
+        rotor, damping, forward, backward = (float(f"{x:.6g}") for x in numbers)
         unchanged = drive.model_dump(
             mode="json", include={"gear", "actuated", "kp", "inputs"}, exclude_none=True
         )
         drives[joint.name] = unchanged | {
-            "rotor_inertia": _rounded(armature[k] / drive.gear**2),
-            "viscous": _rounded(viscous[k]),
-            "coulomb": [
-                _rounded(coulomb[k] * (1 + asymmetry[k])),
-                _rounded(-coulomb[k] * (1 - asymmetry[k])),
-            ],
+            "rotor_inertia": rotor,
+            "viscous": damping,
+            "coulomb": [forward, -backward],
         }
     return drives
-
-
-def _rounded(value: float) -> float:
-    """Return a number with six significant digits."""
-    return float(f"{value:.6g}")
-
-
-def _yaml(settings: dict[str, object]) -> str:
-    text: str = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)
-    return text
-
-
-MASSLESS = 1e-9
-"""Links of at most this mass [kg] are placeholders and stay unchanged."""
-MIN_SPREAD = 0.01
-"""Smallest principal second moment of mass, relative to the largest, that replaces a negative one."""
 
 
 def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
@@ -161,8 +150,7 @@ def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
     rng = np.random.default_rng(seed)
     for inertial in tree.iterfind(".//link/inertial"):
         _perturb(inertial, error * rng.normal(size=2), error * rng.normal(size=3))
-    text: bytes = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
-    return text
+    return bytes(etree.tostring(tree, xml_declaration=True, encoding="utf-8"))
 
 
 def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np.ndarray) -> None:
@@ -174,7 +162,7 @@ def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np
         displacement: (3,) shift of the centre of mass, relative to the radius of gyration.
     """
     mass, tensor = inertial.find("mass"), inertial.find("inertia")
-    if mass is None or float(mass.get("value", "0")) <= MASSLESS:
+    if mass is None or float(mass.get("value", "0")) <= AS_BUILT.massless:
         return
     mass_factor, inertia_factor = np.exp(log_factors).tolist()
     kilograms, trace = float(mass.get("value")), 0.0
@@ -199,14 +187,11 @@ def _make_consistent(tensor: etree._Element) -> None:
     The second moments are S = trace(I)/2 1 - I; a body has S >= 0 (Wensing, Kim, Slotine, IEEE RA-L 3:60, 2018).
     """
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    upper = np.triu_indices(3)
-    inertia = np.zeros((3, 3))
-    inertia[upper] = [float(tensor.get(name, "0")) for name in names]
-    inertia = inertia + np.triu(inertia, 1).T
-    moments, axes = np.linalg.eigh(np.trace(inertia) / 2 * np.eye(3) - inertia)
-    if moments.min() >= -1e-9 * np.abs(moments).max():
+    pseudo = pseudo_inertia(np.array([1.0, 0, 0, 0, *(float(tensor.get(name, "0")) for name in names)]))
+    moments, axes = np.linalg.eigh(pseudo[:3, :3])
+    largest = np.abs(moments).max()
+    if moments.min() >= -1e-9 * largest:
         return
-    second = (axes * np.maximum(moments, MIN_SPREAD * np.abs(moments).max())) @ axes.T
-    inertia = np.trace(second) * np.eye(3) - second
-    for name, value in zip(names, inertia[upper].tolist(), strict=True):
+    pseudo[:3, :3] = (axes * np.maximum(moments, AS_BUILT.min_spread * largest)) @ axes.T
+    for name, value in zip(names, parameters_of(pseudo)[4:].tolist(), strict=True):
         tensor.set(name, repr(value))

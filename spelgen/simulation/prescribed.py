@@ -6,7 +6,8 @@ bristles an integrator would resolve by microseconds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +23,9 @@ from spelgen.excitation.trajectory import Motion
 from spelgen.files import require_regular_file
 from spelgen.logs.csv_files import csv_columns
 from spelgen.settings.settings import Settings
-from spelgen.simulation.protocol import SimulatedLogs, make_friction, paths, sample_times
+from spelgen.simulation.protocol import Progress, SimulatedLogs, make_friction, paths, sample_times, silent
 from spelgen.simulation.tracking import Recording, measured, quantized
-from spelgen.simulation.tuning import AS_BUILT
-
-MIN_SAMPLES = 20
+from spelgen.simulation.tuning import AS_BUILT, TUNING
 
 
 def read_motion(file: Path, joints: Sequence[str]) -> Motion:
@@ -41,33 +40,26 @@ def read_motion(file: Path, joints: Sequence[str]) -> Motion:
     """
     require_regular_file(file, LogError)
     columns = ["t", *(f"{quantity}_{joint}" for quantity in ("q", "qd", "qdd") for joint in joints)]
-    do = "`spelgen excite` writes such files for the same arm"
+    refused = partial(LogError, file=file, do="`spelgen excite` writes such files for the same arm")
     try:
         table = csv_columns(file)
         missing = [name for name in columns if name not in table.column_names]
         if missing:
-            raise LogError(
-                f"no column {', '.join(missing[:3])}",
-                file=file,
-                expected="t, q_, qd_ and qdd_ per joint",
-                do=do,
-            )
+            raise refused(f"no column {', '.join(missing[:3])}", expected="t, q_, qd_ and qdd_ per joint")
         values = np.stack([table[name].cast(pa.float64()).to_numpy() for name in columns], axis=1)
     except (pa.ArrowException, UnicodeError) as error:
-        raise LogError(
-            f"unreadable ({in_one_line(error)})", file=file, expected="CSV of numbers", do=do
-        ) from error
-    if len(values) < MIN_SAMPLES or not np.isfinite(values).all():
-        got = f"{len(values)} rows" if len(values) < MIN_SAMPLES else "a value that is no finite number"
-        raise LogError(got, file=file, expected=f"{MIN_SAMPLES} rows of numbers or more", do=do)
+        raise refused(f"unreadable ({in_one_line(error)})", expected="CSV of numbers") from error
+    few = len(values) < TUNING.min_samples
+    if few or not np.isfinite(values).all():
+        got = f"{len(values)} rows" if few else "a value that is no finite number"
+        raise refused(got, expected=f"{TUNING.min_samples} rows of numbers or more")
     t = values[:, 0]
     steps = np.diff(t)
     if steps.min() <= 0 or np.ptp(steps) > 0.01 * steps.mean():
         row = int(np.argmax(np.abs(steps - np.median(steps))))
-        raise LogError(
-            f"a step of {steps[row]:g} s after {t[row]:g} s", file=file, line=row + 3, element="t",
-            expected=f"equal steps (most are {np.median(steps):g} s)", do=do,
-        )  # fmt: skip
+        expected = f"equal steps (most are {np.median(steps):g} s)"
+        step = f"a step of {steps[row]:g} s after {t[row]:g} s"
+        raise refused(step, line=row + 3, element="t", expected=expected)
     return Motion(t - t[0], *np.split(values[:, 1:], 3, axis=1))
 
 
@@ -77,7 +69,7 @@ def prescribed(
     drives: Drives | None = None,
     *,
     motions: Sequence[Motion] = (),
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = silent,
 ) -> SimulatedLogs:
     """Return one recording per motion; the last `test_fraction` of them are for testing.
 

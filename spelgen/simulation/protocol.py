@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -16,6 +16,13 @@ from spelgen.logs.trajectory import Trajectory, trajectory_listing
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import SimulationSettings
 from spelgen.simulation.tuning import TUNING as SIMULATION
+
+Progress = Callable[[int, int], None]
+"""Is called with (trajectories done, all) after each trajectory."""
+
+
+def silent(done: int, total: int) -> None:
+    """Show no progress."""
 
 
 class SimulatedLogs(list[Trajectory]):
@@ -61,16 +68,12 @@ def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarra
     positions = settings.simulation.positions or {}
     ranges, errors = [], []
     for joint in arm.coordinates:
-        if joint.name in positions:
-            ranges.append(positions[joint.name])
-        elif joint.continuous:
-            ranges.append((-np.pi, np.pi))
-        elif joint.lower is not None and joint.upper is not None and joint.lower < joint.upper:
-            ranges.append((joint.lower, joint.upper))
-        else:
-            # exporters write 0 to 0 for an unknown range
+        limits = (-np.pi, np.pi) if joint.continuous else joint.limits
+        # exporters write 0 to 0 for an unknown range
+        if joint.name not in positions and (limits is None or limits[0] >= limits[1]):
             message = "the joint has no range: give its lowest and highest initial position"
             errors.append(SettingsError(message, element=f"simulation.positions.{joint.name}"))
+        ranges.append(positions.get(joint.name, limits))
     collect(errors)
     lowest, highest = np.array(ranges, dtype=float).T
     return lowest, highest
@@ -88,16 +91,15 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
         t: Times (T,) [s].
     """
     count = settings.simulation.trajectories
-    seeds = np.random.SeedSequence(settings.simulation.seed).spawn(count)
     # Independent generators: the first trajectories are the same for any number of them.
-    randoms = list(map(np.random.default_rng, seeds))
+    randoms = np.random.default_rng(settings.simulation.seed).spawn(count)
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
         # moderate: the middle of the ranges at moderate speeds, as for the first motion of an unknown arm
         middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
-        speeds = []
-        for joint in arm.coordinates:
-            speeds.append(min(SIMULATION.used_range * (joint.velocity or np.inf), SPEEDS[joint.joint_type]))
+        speeds = [
+            min(SIMULATION.used_range * (x.velocity or np.inf), SPEEDS[x.joint_type]) for x in arm.coordinates
+        ]
         bounds = MotionBounds(middle - half, middle + half, np.array(speeds))
         motions = ExcitationTrajectory(float(t[-1]), EXCITATION.min_harmonics, bounds)
         return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]

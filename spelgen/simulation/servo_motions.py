@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from spelgen.arm.actuation import Drives
@@ -11,16 +9,19 @@ from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
-from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction, sample_times
+from spelgen.simulation.protocol import (
+    Progress,
+    SimulatedLogs,
+    initial_range,
+    make_friction,
+    sample_times,
+    silent,
+)
 from spelgen.simulation.tuning import TUNING
 
 
 def servo_motions(
-    arm: Chain,
-    settings: Settings,
-    drives: Drives | None = None,
-    *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    arm: Chain, settings: Settings, drives: Drives | None = None, *, progress: Progress = silent
 ) -> SimulatedLogs:
     """Return trajectories under random commands; the same settings give the same logs.
 
@@ -34,8 +35,8 @@ def servo_motions(
     is_revolute = np.array([x.joint_type == "revolute" for x in arm.coordinates])
     encoder = np.where(is_revolute, resolution, resolution / 10)  # [rad], [m]
     logs: list[Trajectory] = []
-    for number, seed in enumerate(np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories)):
-        u = middle + width * _commands(np.random.default_rng(seed), t, len(middle))
+    for number, random in enumerate(np.random.default_rng(protocol.seed).spawn(protocol.trajectories)):
+        u = middle + width * _commands(random, t, len(middle))
         q = _positions(arm, settings, t, u)
         q = np.round(q / encoder) * encoder
         qd, tau = np.gradient(q, t, axis=0), np.zeros((len(t), 0))
@@ -69,9 +70,8 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
     """
     dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
     limit = np.array([coordinate.effort or TUNING.servo_effort for coordinate in arm.coordinates])
-    kp = 2 * limit
-    for joint, coordinate in enumerate(arm.coordinates):
-        kp[joint] = settings.joint(coordinate.name).kp or kp[joint]
+    known = [settings.joint(coordinate.name).kp for coordinate in arm.coordinates]
+    kp = np.array([gain or 2 * effort for gain, effort in zip(known, limit, strict=True)])
     kd = TUNING.servo_lag * kp
     interval = t[1] - t[0]
     steps = int(np.ceil(interval / TUNING.servo_step))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,24 +14,26 @@ from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError
 from spelgen.excitation.trajectory import Motion
 from spelgen.logs.trajectory import Trajectory, set_aside
-from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, SimulationSettings
-from spelgen.settings.yaml_document import YamlDocument
+from spelgen.settings.yaml_document import YamlDocument, validated
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.prescribed import prescribed
-from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction, sample_times
+from spelgen.simulation.protocol import (
+    Progress,
+    SimulatedLogs,
+    initial_range,
+    make_friction,
+    sample_times,
+    silent,
+)
 from spelgen.simulation.servo_motions import servo_motions
 from spelgen.simulation.tracking import track
 from spelgen.simulation.tuning import TUNING
 
 
 def random_inputs(
-    arm: Chain,
-    settings: Settings,
-    drives: Drives | None = None,
-    *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    arm: Chain, settings: Settings, drives: Drives | None = None, *, progress: Progress = silent
 ) -> SimulatedLogs:
     """Return trajectories under random inputs; the same settings give the same logs.
 
@@ -54,11 +56,10 @@ def random_inputs(
         is_driven = joint.actuated and not coordinate.passive
         torques.append(np.array(joint.inputs or protocol.inputs) if is_driven else np.zeros(1))
     t = sample_times(protocol)
-    # one seed per trajectory: the first trajectories do not depend on their number
-    split_seed, *seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories + 1)
+    # one generator per trajectory: the first trajectories do not depend on their number
+    split, *randoms = np.random.default_rng(protocol.seed).spawn(protocol.trajectories + 1)
     trajectories = []
-    for number, seed in enumerate(seeds):
-        random = np.random.default_rng(seed)
+    for number, random in enumerate(randoms):
         start = np.concatenate([random.uniform(lowest, highest), np.zeros(lowest.size)])
         tau = np.stack([random.choice(choices, size=t.size) for choices in torques], axis=1)
         effect = tau if drives is None else tau @ drives.inputs.T
@@ -68,7 +69,7 @@ def random_inputs(
         progress(number + 1, protocol.trajectories)
     # at least one trajectory remains for training
     count = protocol.trajectories
-    order = np.random.default_rng(split_seed).permutation(count)
+    order = split.permutation(count)
     tests = min(round(protocol.test_fraction * count), count - 1)
     return SimulatedLogs(*set_aside(trajectories, order[:tests]))
 
@@ -85,7 +86,7 @@ def simulate(
     test_fraction: float | None = None,
     seed: int | None = None,
     motions: Sequence[Motion] = (),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> SimulatedLogs:
     """Return simulated logs of the arm: all trajectories, and their split into `train` and `test`.
 
@@ -112,7 +113,7 @@ def simulate(
     changed = validated(SimulationSettings, values, YamlDocument(Path("simulate"), None))
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
     drives = arm.actuation.drives()
-    progress = progress or (lambda done, total: None)
+    progress = progress or silent
     if motions:
         if settings.input == "position":
             raise SettingsError(

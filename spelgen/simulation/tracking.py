@@ -6,7 +6,6 @@ public. Values that the paper does not state are chosen here: gains, phases, enc
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +22,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.simulation.integration import rollout
-from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction, paths
+from spelgen.simulation.protocol import Progress, SimulatedLogs, initial_range, make_friction, paths, silent
 from spelgen.simulation.tuning import TUNING
 
 
@@ -51,11 +50,7 @@ class Recording:
 
 
 def track(
-    arm: Chain,
-    settings: Settings,
-    drives: Drives | None = None,
-    *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    arm: Chain, settings: Settings, drives: Drives | None = None, *, progress: Progress = silent
 ) -> SimulatedLogs:
     """Return logs of the arm under feedback control along paths.
 

@@ -13,6 +13,8 @@ class SimulationTuning:
     rtol: float = 1e-13
     # [rad, rad/s] Absolute tolerance of the integration.
     atol: float = 1e-14
+    # [1] Fewest rows of a file with a motion.
+    min_samples: int = 20
     # [1] Steps of the integrator while a torque is constant; an integration that needs more does not end.
     most_steps: int = 100_000
     # [1] Factor on the tolerances of simulations with encoders: 1e-11 is below their resolution.
@@ -52,6 +54,10 @@ class AsBuiltTuning:
 
     # Relative standard deviation of masses, inertias and, by the radius of gyration, centres of mass.
     inertial_error: float = 0.3
+    # Links of at most this mass [kg] are placeholders and stay unchanged.
+    massless: float = 1e-9
+    # Smallest principal second moment of mass, relative to the largest, that replaces a negative one.
+    min_spread: float = 0.01
     # Coulomb friction, relative to the rigid-body torque of moderate motion, and its asymmetry between directions.
     coulomb: tuple[float, float] = (0.04, 0.12)
     asymmetry: float = 0.1

@@ -6,9 +6,8 @@ Gautier and Khalil, *Direct calculation of minimum set of inertial parameters of
 and Automation 6(3), 1990, derive the same parameters by symbolic rules.
 """
 
-from __future__ import annotations
-
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -21,9 +20,6 @@ from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, parameter_name
 from spelgen.structure import field
 from spelgen.structure.recursion import Position, coefficients
 from spelgen.structure.sampling import regressor_rows
-
-# Random rational numbers have numerators and denominators below this bound.
-_GRID = 1000
 
 
 @dataclass(frozen=True)
@@ -57,25 +53,20 @@ def base_parameter_count(arm: Chain) -> int:
 @lru_cache(maxsize=16)  # least squares, checks of logs and closed forms use the same arm
 def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     """Return the base parameters of ``arm``, in the order of the bodies from the root."""
-    order: list[int] = []
-    for body in range(len(arm.bodies)):
-        order += [10 * body + INERTIAL_PARAMETERS.index(name) for name in BASE_ORDER]
+    places = [INERTIAL_PARAMETERS.index(name) for name in BASE_ORDER]
+    order = [10 * body + place for body in range(len(arm.bodies)) for place in places]
     result = []
     for row in _reduced_rows(arm, order):
-        weights = []
-        for index, coefficient in zip(order, row, strict=True):
-            if coefficient:
-                weights.append((index, Fraction(int(coefficient.p), int(coefficient.q))))
+        pairs = zip(order, row, strict=True)
+        weights = tuple((index, Fraction(int(x.p), int(x.q))) for index, x in pairs if x)
         # The pivot of a row of the reduced echelon form is 1.
         first, _ = weights[0]
-        name = parameter_name(first)
-        if len(weights) > 1:
-            name += "R"
-        result.append(BaseParameter(name, first, tuple(weights), _value(arm, weights)))
+        name = parameter_name(first) + "R" * (len(weights) > 1)
+        result.append(BaseParameter(name, first, weights, _value(arm, weights)))
     return tuple(result)
 
 
-def _value(arm: Chain, weights: list[tuple[int, Fraction]]) -> Fraction | None:
+def _value(arm: Chain, weights: Sequence[tuple[int, Fraction]]) -> Fraction | None:
     """Return the value of a base parameter from the URDF; None if a body has no inertial."""
     total = Fraction(0)
     for index, coefficient in weights:
@@ -108,8 +99,7 @@ def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
     parameters = 10 * len(arm.bodies)
     positions = []
     for _ in arm.coordinates:
-        t = fmpq(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
-        value = fmpq(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
+        t, value = (fmpq(generator.randrange(1, 1000), generator.randrange(1, 1000)) for _ in range(2))
         # t is the tangent of half the angle: cosine and sine are rational.
         norm = 1 + t * t
         positions.append(Position((1 - t * t) / norm, 2 * t / norm, value))

@@ -7,19 +7,17 @@ entries of M before sums of entries. Independent functionals are the independent
 greedy selection is optimal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import combinations
 from math import gcd
+from typing import NamedTuple
 
 import numpy as np
 
 from spelgen.structure import field
 from spelgen.structure.sampling import Spans
-from spelgen.structure.tuning import TUNING
 
 Weights = tuple[tuple[int, int, Fraction], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
@@ -46,8 +44,7 @@ class Term:
     basis: Weights
 
 
-@dataclass(frozen=True)
-class _Functional:
+class _Functional(NamedTuple):
     """A linear functional of M, (n(n+1)/2,), in the prime field (``weights``) and in double precision (``values``)."""
 
     joints: tuple[int, ...]
@@ -136,16 +133,14 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
     """Yield sets of joints that M depends on: sets close to the tip first, small sets before large ones."""
+    # An arm with many joints has too many subsets: only sets of consecutive joints are tried.
+    all_subsets_up_to = 8
     active = [k for k in range(spans.n) if len(spans.change_bases[k])]
     for position in reversed(range(len(active))):
         first, later = active[position], active[position + 1 :]
         for size in range(len(later) + 1):
-            if spans.n <= TUNING.all_subsets_up_to:
-                for tail in combinations(later, size):
-                    yield frozenset((first, *tail))
-            else:
-                # An arm with many joints has too many subsets: only sets of consecutive joints are tried.
-                yield frozenset((first, *later[:size]))
+            tails = combinations(later, size) if spans.n <= all_subsets_up_to else [later[:size]]
+            yield from (frozenset((first, *tail)) for tail in tails)
 
 
 def _candidates(
@@ -197,16 +192,13 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     width = matrix.shape[1]
     # The triangular factor of [A, B] has the same normal equations and far fewer rows.
     factor = np.asarray(np.linalg.qr(np.concatenate([matrix, right], axis=1), mode="r"))
-    result: np.ndarray = np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0]
-    return result
+    return np.asarray(np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0])
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
     """Return the nonzero elements of a vector over the lower triangle, (entries,), as fractions."""
-    weights = []
-    for index in np.flatnonzero(exact).tolist():
-        weights.append((*spans.keys[index], _fraction(int(exact[index]), float(values[index]))))
-    return tuple(weights)
+    nonzero = np.flatnonzero(exact).tolist()
+    return tuple((*spans.keys[k], _fraction(int(exact[k]), float(values[k]))) for k in nonzero)
 
 
 def _fraction(element: int, value: float) -> Fraction:
@@ -218,14 +210,11 @@ def _fraction(element: int, value: float) -> Fraction:
     """
     # Extended Euclidean algorithm for (PRIME, element), stopped early: numerator = denominator * element modulo
     # PRIME.
-    bound = 2**30
     previous, current = (field.PRIME, 0), (element, 1)
-    while current[0] > bound:
+    while current[0] > 2**30:
         quotient = previous[0] // current[0]
-        previous, current = (
-            current,
-            (previous[0] - quotient * current[0], previous[1] - quotient * current[1]),
-        )
+        remainder = previous[0] - quotient * current[0], previous[1] - quotient * current[1]
+        previous, current = current, remainder
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         candidate = Fraction(numerator, denominator)

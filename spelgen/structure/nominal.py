@@ -2,9 +2,11 @@
 
 They affect the training of a model, not its structure. Links of 1 kg replace a URDF whose inertials are absent or
 physically inconsistent.
-"""
 
-from __future__ import annotations
+Ten parameters (m, h, I) of a body are physically consistent, that is, belong to a distribution of mass, if and only if
+its pseudo-inertia J = [[S, h], [h^T, m]] with S = tr(I)/2 1 - I is positive definite (Wensing, Kim and Slotine, IEEE
+RA-L 3:60, 2018).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,9 +19,6 @@ from spelgen.arm.arm import Chain, Coordinate
 from spelgen.structure.basis import Term, row_of
 from spelgen.structure.sampling import float_energies
 from spelgen.structure.structure import Structure
-from spelgen.structure.tuning import TUNING
-
-_DIGITS = 6
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
     # A fixed seed: these numbers are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = list(map(working_range, arm.coordinates))
-    q = np.stack([rng.uniform(lower, upper, TUNING.points) for lower, upper in ranges], axis=-1)
+    q = np.stack([rng.uniform(lower, upper, 512) for lower, upper in ranges], axis=-1)
     from_urdf = arm.inertials_complete and _gives_usable_mass(arm, q)
     inertias = nominal_inertias(arm, from_urdf)
     # Averages over the workspace: at zero position many couplings vanish.
@@ -64,8 +63,8 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
     outputs = mass @ output_rows.T
     constants = constant_rows @ means
     # An output that hardly varies for the nominal parameters may vary for the true ones: a lower bound of its scale.
-    output_floor = TUNING.min_scale * (np.abs(output_rows) @ typical)
-    constant_floor = TUNING.min_scale * (np.abs(constant_rows) @ typical)
+    output_floor = 0.05 * (np.abs(output_rows) @ typical)
+    constant_floor = 0.05 * (np.abs(constant_rows) @ typical)
     # Friction of drives scales with the torque that they carry.
     torque = _gravity_torque(arm, q, inertias)
     inertial = np.sqrt((mass[:, diagonal] ** 2).mean(axis=0))
@@ -75,11 +74,11 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
         constants=_rounded(constants),
         constant_scales=_rounded(np.maximum(np.abs(constants), constant_floor), zero_below=0.0),
         # V is determined up to a constant: its scale is its variation.
-        potential_scale=_round(max(float(potential.std()), 1e-3), _DIGITS),
+        potential_scale=_round(max(float(potential.std()), 1e-3)),
         joint_torque=_rounded(np.hypot(torque, inertial)),
         mass_sensitivities=_sensitivities(_mass_changes(arm, q, inertias, mass, typical)),
         potential_sensitivities=_sensitivities(torque),
-        min_eigenvalue=_round(_min_eigenvalue(mass), _DIGITS),
+        min_eigenvalue=_round(_min_eigenvalue(mass)),
         from_urdf=from_urdf,
     )
 
@@ -126,7 +125,7 @@ def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | 
 
 def _default_inertia(arm: Chain, index: int) -> list[float]:
     """Return a ball of 1 kg half-way to the next joint; of the last body: 0.1 m from the joint along x and z."""
-    gyration = TUNING.default_gyration
+    gyration = 0.1  # [m] radius of gyration
     center = np.zeros(3)
     for body in reversed(arm.bodies):
         if body.parent == index:
@@ -143,17 +142,17 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
 
     mass: lower triangles of M, (S, n(n+1)/2).
     """
-    triangles = np.concatenate([mass, mass.mean(axis=0, keepdims=True)])
-    n = isqrt(2 * triangles.shape[1])
-    matrices = np.zeros((len(triangles), n, n))
+    n = isqrt(2 * mass.shape[1])
+    matrices = np.zeros((len(mass), n, n))
     rows, columns = np.tril_indices(n)
-    matrices[:, rows, columns] = matrices[:, columns, rows] = triangles
-    samples, reference = matrices[:-1], matrices[-1]
+    matrices[:, rows, columns] = matrices[:, columns, rows] = mass
+    reference = np.zeros((n, n))
+    reference[rows, columns] = reference[columns, rows] = mass.mean(axis=0)
     if np.linalg.eigvalsh(reference)[0] <= 0:
         return 0.0
     # Generalised eigenvalues (relative to the mean of M) have no unit; eigenvalues of M would mix kg and kg m2.
     whitening = np.linalg.inv(np.linalg.cholesky(reference))
-    eigenvalues = np.linalg.eigvalsh(whitening @ samples @ whitening.T)
+    eigenvalues = np.linalg.eigvalsh(whitening @ matrices @ whitening.T)
     return float(eigenvalues.min())
 
 
@@ -164,8 +163,7 @@ def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> n
     _, forward = float_energies(arm, q + shifts, inertias)
     _, backward = float_energies(arm, q - shifts, inertias)
     gradient = (forward - backward) / (2 * step)
-    result: np.ndarray = np.sqrt((gradient**2).mean(axis=1))
-    return result
+    return np.asarray(np.sqrt((gradient**2).mean(axis=1)))
 
 
 def _mass_changes(
@@ -184,23 +182,22 @@ def _mass_changes(
     for index in range(q.shape[1]):
         moved[index, :, index] = np.roll(q[:, index], 1)  # the position in another sample
     moved_mass, _ = float_energies(arm, moved, inertias)
-    result: np.ndarray = np.sqrt((((moved_mass - mass) / typical) ** 2).mean(axis=(1, 2)))
-    return result
+    return np.asarray(np.sqrt((((moved_mass - mass) / typical) ** 2).mean(axis=(1, 2))))
 
 
 def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
     """Return magnitudes (n,) relative to the largest, with a lower bound that retains every joint as an input."""
     if magnitudes.max() <= 0:
         return (1.0,) * len(magnitudes)
-    return _rounded(np.maximum(magnitudes / magnitudes.max(), TUNING.min_sensitivity), 3)
+    return _rounded(np.maximum(magnitudes / magnitudes.max(), 0.02), 3)
 
 
-def _rounded(values: np.ndarray, digits: int = _DIGITS, zero_below: float = 1e-12) -> tuple[float, ...]:
+def _rounded(values: np.ndarray, digits: int = 6, zero_below: float = 1e-12) -> tuple[float, ...]:
     """Return values (n,) with n significant digits; see ``_round``."""
     return tuple(_round(value, digits, zero_below) for value in values.tolist())
 
 
-def _round(value: float, digits: int, zero_below: float = 1e-12) -> float:
+def _round(value: float, digits: int = 6, zero_below: float = 1e-12) -> float:
     """Return a number with n significant digits, equal on every machine; 0 for a magnitude of at most ``zero_below``.
 
     Scales are divisors, and may be small for an arm of 1e-12 kg: their ``zero_below`` is 0.
@@ -208,3 +205,50 @@ def _round(value: float, digits: int, zero_below: float = 1e-12) -> float:
     if abs(value) <= zero_below:
         return 0.0
     return round(value, digits - 1 - floor(log10(abs(value))))
+
+
+def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
+    """Return J (..., 4, 4) of (m, h, I), (..., 10), in the order of ``Body.inertia``."""
+    values = np.asarray(parameters, dtype=float)
+    tensor = np.zeros((*values.shape[:-1], 3, 3))
+    rows, columns = np.triu_indices(3)
+    tensor[..., rows, columns] = tensor[..., columns, rows] = values[..., 4:]
+    pseudo = np.zeros((*values.shape[:-1], 4, 4))
+    # The second moments of mass S from the inertia tensor I = tr(S) 1 - S.
+    pseudo[..., :3, :3] = _trace(tensor) / 2 * np.eye(3) - tensor
+    pseudo[..., :3, 3] = pseudo[..., 3, :3] = values[..., 1:4]
+    pseudo[..., 3, 3] = values[..., 0]
+    return pseudo
+
+
+def parameters_of(pseudo: np.ndarray) -> np.ndarray:
+    """Return the inverse of ``pseudo_inertia``: (..., 4, 4) -> (..., 10)."""
+    second_moment = pseudo[..., :3, :3]
+    tensor = _trace(second_moment) * np.eye(3) - second_moment
+    mass, first_moment = pseudo[..., 3, 3:], pseudo[..., :3, 3]
+    return np.concatenate([mass, first_moment, tensor[..., *np.triu_indices(3)]], axis=-1)
+
+
+def _trace(matrices: np.ndarray) -> np.ndarray:
+    """Return traces (..., 1, 1) of (..., 3, 3)."""
+    return np.asarray(np.trace(matrices, axis1=-2, axis2=-1)[..., None, None])
+
+
+def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return the Cholesky factor of a consistent pseudo-inertia, and whether the parameters are consistent.
+
+    Args:
+        parameters: (m, h, I) of a body, (10,) [kg, kg m, kg m2].
+
+    Returns:
+        C (4, 4) with C C^T = J. If the parameters are inconsistent, the smallest eigenvalues of J are raised.
+    """
+    pseudo = pseudo_inertia(parameters)
+    values, vectors = np.linalg.eigh(pseudo)
+    # relative to the largest eigenvalue: a smallest eigenvalue below the square of it is raised to it (slender body)
+    fraction = 1e-4
+    min_eigenvalue = fraction * values[-1]
+    is_consistent = bool(values[0] > min_eigenvalue * fraction)
+    if not is_consistent:
+        pseudo = (vectors * np.maximum(values, min_eigenvalue)) @ vectors.T
+    return np.linalg.cholesky(pseudo), is_consistent

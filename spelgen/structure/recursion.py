@@ -6,29 +6,28 @@ and polynomials (``expansion``). Each body has ten inertial parameters (m, h = m
 frame), in which M and V are linear. A body rotates about, or translates along, the z axis of its joint's frame.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
-from itertools import combinations_with_replacement
+from itertools import combinations, combinations_with_replacement
 from math import cos, lcm, sin, tan
-from typing import Any
+from typing import Any, NamedTuple
 
 from spelgen.arm.arm import Body, Chain
 
 Element = Any
 """An element of the ring: an object with +, - and *, with other elements and with integers."""
 
-Vector = tuple[Element, Element, Element]
+Number = Callable[[Fraction], Element]
+"""Conversion of the exact constants of an arm to elements of the ring."""
+
+Vector = tuple[Element, ...]
 Terms = tuple[tuple[int, Element], ...]
 
 TENSOR = tuple(combinations_with_replacement(range(3), 2))
 """Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
 
 
-@dataclass(frozen=True)
-class Position:
+class Position(NamedTuple):
     """The position of a coordinate: cosine and sine of its base angle (see ``base_denominators``), and its value."""
 
     cos: Element
@@ -36,25 +35,14 @@ class Position:
     value: Element
 
 
-@dataclass(frozen=True)
-class _JointMotion:
-    """The motion of the joint of a body: cosine and sine of its angle, or its displacement."""
-
-    cos: Element = 1
-    sin: Element = 0
-    slide: Element = 0
-
-
-@dataclass(frozen=True)
-class Energies:
+class Energies(NamedTuple):
     """The lower triangle of the mass matrix, {(row, column): element} from 0, and the potential energy."""
 
     mass: dict[tuple[int, int], Element]
     potential: Element
 
 
-@dataclass(frozen=True)
-class _Inertia:
+class _Inertia(NamedTuple):
     """A composite inertia: mass, first moment, and inertia tensor about the origin of the frame."""
 
     mass: Element
@@ -62,20 +50,15 @@ class _Inertia:
     tensor: tuple[Element, ...]
 
 
-@dataclass(frozen=True)
-class _Wrench:
-    """A force and its moment about the origin of the frame."""
+class _Pose(NamedTuple):
+    """The pose of a body in its parent, or the motion of a joint: sparse, with the elements 1 and -1 as integers."""
 
-    force: Vector
-    moment: Vector
-
-
-@dataclass(frozen=True)
-class _Pose:
-    """The constant pose of a body in its parent: sparse, with the elements 1 and -1 as integers."""
-
-    rotation: tuple[Terms, Terms, Terms]
+    rotation: tuple[Terms, ...]
     translation: Terms
+
+
+_Wrench = tuple[Vector, Vector]
+"""A force, and its moment about the origin of the frame."""
 
 
 def triangle(n: int) -> list[tuple[int, int]]:
@@ -84,10 +67,7 @@ def triangle(n: int) -> list[tuple[int, int]]:
 
 
 def energies(
-    arm: Chain,
-    positions: Sequence[Position],
-    inertias: Sequence[Sequence[Element]],
-    number: Callable[[Fraction], Element],
+    arm: Chain, positions: Sequence[Position], inertias: Sequence[Sequence[Element]], number: Number
 ) -> Energies:
     """Return the mass matrix and the potential energy of ``arm``.
 
@@ -100,16 +80,27 @@ def energies(
     V is zero for a mass at the origin of the root link and increases against ``arm.gravity``.
     """
     motions = _motions(arm, positions, number)
-    poses = [_pose(body, number) for body in arm.bodies]
+    poses = [
+        _Pose(tuple(_terms(row, number) for row in body.rotation), _terms(body.translation, number))
+        for body in arm.bodies
+    ]
     composites = [_Inertia(ten[0], tuple(ten[1:4]), tuple(ten[4:10])) for ten in inertias]
     total = _Inertia(0, (0, 0, 0), (0,) * 6)
     mass: dict[tuple[int, int], Element] = dict.fromkeys(triangle(len(arm.coordinates)), 0)
     # Parents precede children: in reverse order a composite is complete before its column of M is computed.
-    for index in reversed(range(len(arm.bodies))):
+    for index, body in reversed(list(enumerate(arm.bodies))):
         for ancestor, entry in _column(arm, poses, motions, index, composites[index]):
-            _add_entry(mass, arm.bodies[index], arm.bodies[ancestor], entry, number)
-        body = arm.bodies[index]
-        moved = _posed_inertia(poses[index], _moved_inertia(body, motions[index], composites[index]))
+            first, second = body.coordinate, ancestor.coordinate
+            # The rate of a mimic joint is a multiple of its leader's.
+            multiplier = body.multiplier * ancestor.multiplier
+            if multiplier != 1:
+                entry = number(multiplier) * entry
+            # Two bodies of one coordinate contribute twice to its diagonal entry, as (i, j) and as (j, i).
+            if first == second and body is not ancestor:
+                entry = entry + entry
+            key = max(first, second), min(first, second)
+            mass[key] = mass[key] + entry
+        moved = _posed_inertia(poses[index], _moved_inertia(motions[index], composites[index]))
         if body.parent < 0:
             total = _sum(total, moved)
         else:
@@ -120,7 +111,7 @@ def energies(
 
 
 def coefficients(
-    arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Callable[[Fraction], Element]
+    arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Number
 ) -> list[Element]:
     """Return the coefficients of the inertial parameters in the entries of M, row after row, and then in V.
 
@@ -131,10 +122,8 @@ def coefficients(
     return [*result.mass.values(), result.potential]
 
 
-def _motions(
-    arm: Chain, positions: Sequence[Position], number: Callable[[Fraction], Element]
-) -> list[_JointMotion]:
-    """Return the motion of the joint of each body at these positions of the coordinates."""
+def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
+    """Return the motion of the joint of each body, about or along z, at these positions of the coordinates."""
     bases = base_denominators(arm)
     motions = []
     for body in arm.bodies:
@@ -145,14 +134,14 @@ def _motions(
                 slide = number(body.multiplier) * slide
             if body.offset:
                 slide = slide + number(Fraction(str(body.offset)))
-            motions.append(_JointMotion(slide=slide))
+            motions.append(_Pose((((0, 1),), ((1, 1),), ((2, 1),)), ((2, slide),)))
         else:
             factor = int(body.multiplier * bases[body.coordinate])
             c, s = _multiple_angle(position.cos, position.sin, factor)
             if body.offset:
                 c0, s0 = map(number, circle_point(body.offset))
                 c, s = c0 * c - s0 * s, s0 * c + c0 * s
-            motions.append(_JointMotion(c, s))
+            motions.append(_Pose((((0, c), (1, -s)), ((0, s), (1, c)), ((2, 1),)), ()))
     return motions
 
 
@@ -192,113 +181,68 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
 
 
 def _column(
-    arm: Chain, poses: Sequence[_Pose], motions: Sequence[_JointMotion], index: int, inertia: _Inertia
-) -> list[tuple[int, Element]]:
-    """Return the entries of the mass matrix of the bodies' joints: of joint ``index`` with itself and its ancestors."""
+    arm: Chain, poses: Sequence[_Pose], motions: Sequence[_Pose], index: int, inertia: _Inertia
+) -> Iterator[tuple[Body, Element]]:
+    """Yield the entries of the mass matrix of the bodies' joints: of joint ``index`` with itself and its ancestors."""
     body = arm.bodies[index]
     # The wrench that accelerates the composite body about (or along) its z axis at unit rate: force z x h and moment
     # I z, or force m z and moment h x z. Its component along the axis of an ancestor is the entry of M (Featherstone,
     # table 6.2).
     (hx, hy, _), tensor = inertia.moment, inertia.tensor
-    if body.joint_type == "revolute":
-        wrench = _Wrench((-hy, hx, 0), (tensor[2], tensor[4], tensor[5]))
-    else:
-        wrench = _Wrench((0, 0, inertia.mass), (hy, -hx, 0))
-    entries = [(index, _along(body, wrench))]
-    while body.parent >= 0:
-        wrench = _posed_wrench(poses[index], _moved_wrench(body, motions[index], wrench))
-        index = body.parent
-        body = arm.bodies[index]
-        entries.append((index, _along(body, wrench)))
-    return entries
-
-
-def _along(body: Body, wrench: _Wrench) -> Element:
-    return wrench.moment[2] if body.joint_type == "revolute" else wrench.force[2]
-
-
-def _add_entry(
-    mass: dict[tuple[int, int], Element],
-    first: Body,
-    second: Body,
-    entry: Element,
-    number: Callable[[Fraction], Element],
-) -> None:
-    """Add an entry of two bodies to the entry of their coordinates; the rate of a mimic joint is a multiple of its
-    leader's.
-    """
-    multiplier = first.multiplier * second.multiplier
-    if multiplier != 1:
-        entry = number(multiplier) * entry
-    row, column = max(first.coordinate, second.coordinate), min(first.coordinate, second.coordinate)
-    # Two bodies of one coordinate contribute twice to its diagonal entry, as (i, j) and as (j, i).
-    twice = first is not second and row == column
-    mass[row, column] = mass[row, column] + (entry + entry if twice else entry)
+    wrench: _Wrench = (-hy, hx, 0), (tensor[2], tensor[4], tensor[5])
+    if body.joint_type == "prismatic":
+        wrench = (0, 0, inertia.mass), (hy, -hx, 0)
+    while True:
+        force, moment = wrench
+        yield body, moment[2] if body.joint_type == "revolute" else force[2]
+        if body.parent < 0:
+            return
+        wrench = _posed_wrench(poses[index], _posed_wrench(motions[index], wrench))
+        index, body = body.parent, arm.bodies[body.parent]
 
 
 def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
-    moment = (a.moment[0] + b.moment[0], a.moment[1] + b.moment[1], a.moment[2] + b.moment[2])
+    moment = tuple(x + y for x, y in zip(a.moment, b.moment, strict=True))
     return _Inertia(a.mass + b.mass, moment, tuple(x + y for x, y in zip(a.tensor, b.tensor, strict=True)))
 
 
-def _moved_inertia(body: Body, motion: _JointMotion, inertia: _Inertia) -> _Inertia:
+def _moved_inertia(motion: _Pose, inertia: _Inertia) -> _Inertia:
     """Return the inertia in the joint's frame at q = 0 after the joint has moved about or along z."""
-    if body.joint_type == "prismatic":
-        return _translated(((2, motion.slide),), inertia)
-    c, s = motion.cos, motion.sin
+    if motion.translation:
+        return _translated(motion.translation, inertia)
+    (_, s), (_, c) = motion.rotation[1]
     hx, hy, hz = inertia.moment
     xx, xy, xz, yy, yz, zz = inertia.tensor
     # sin^2 = 1 - cos^2 is substituted here, so that polynomials need no reduction.
     cc, cs, difference = c * c, c * s, xx - yy
     # R I R^T for a rotation about z. Ixx + Iyy is invariant, so the second diagonal entry needs no products.
     turned_xx = yy + cc * difference - 2 * (cs * xy)
-    return _Inertia(
-        inertia.mass,
-        (c * hx - s * hy, s * hx + c * hy, hz),
-        (
-            turned_xx,
-            cs * difference + 2 * (cc * xy) - xy,
-            c * xz - s * yz,
-            xx + yy - turned_xx,
-            s * xz + c * yz,
-            zz,
-        ),
-    )
-
-
-def _moved_wrench(body: Body, motion: _JointMotion, wrench: _Wrench) -> _Wrench:
-    (fx, fy, fz), (mx, my, mz) = wrench.force, wrench.moment
-    if body.joint_type == "prismatic":
-        return _Wrench(wrench.force, (mx - motion.slide * fy, my + motion.slide * fx, mz))
-    c, s = motion.cos, motion.sin
-    return _Wrench((c * fx - s * fy, s * fx + c * fy, fz), (c * mx - s * my, s * mx + c * my, mz))
+    turned_xy = cs * difference + 2 * (cc * xy) - xy
+    tensor = (turned_xx, turned_xy, c * xz - s * yz, xx + yy - turned_xx, s * xz + c * yz, zz)
+    return _Inertia(inertia.mass, (c * hx - s * hy, s * hx + c * hy, hz), tensor)
 
 
 def _posed_inertia(pose: _Pose, inertia: _Inertia) -> _Inertia:
-    x, y, z = pose.rotation
     xx, xy, xz, yy, yz, zz = inertia.tensor
     columns = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
     # R I first, then (R I) R^T: rows of R are sparse, as most joints are at right angles.
-    half = []
-    for row in (x, y, z):
-        half.append([_dot(row, column) for column in columns])
+    half = [[_dot(row, column) for column in columns] for row in pose.rotation]
     tensor = tuple(_dot(pose.rotation[j], half[i]) for i, j in TENSOR)
     return _translated(pose.translation, _Inertia(inertia.mass, _turned(pose, inertia.moment), tensor))
 
 
 def _posed_wrench(pose: _Pose, wrench: _Wrench) -> _Wrench:
-    force, moment = _turned(pose, wrench.force), _turned(pose, wrench.moment)
+    force, moment = (_turned(pose, vector) for vector in wrench)
     lever: list[Element] = list(moment)
     for axis, length in pose.translation:
         following, last = (axis + 1) % 3, (axis + 2) % 3
         lever[following] = lever[following] - length * force[last]
         lever[last] = lever[last] + length * force[following]
-    return _Wrench(force, (lever[0], lever[1], lever[2]))
+    return force, tuple(lever)
 
 
 def _turned(pose: _Pose, vector: Vector) -> Vector:
-    x, y, z = pose.rotation
-    return _dot(x, vector), _dot(y, vector), _dot(z, vector)
+    return tuple(_dot(row, vector) for row in pose.rotation)
 
 
 def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
@@ -317,19 +261,12 @@ def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
                 tensor[k, k] = tensor[k, k] + double
                 pair = (min(axis, k), max(axis, k))
                 tensor[pair] = tensor[pair] - length * inertia.moment[k]
-    lengths = dict(offset)
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        if i in lengths and j in lengths:
-            tensor[i, j] = tensor[i, j] - lengths[i] * lengths[j] * inertia.mass
-    return _Inertia(inertia.mass, (moment[0], moment[1], moment[2]), tuple(tensor[key] for key in TENSOR))
+    for (i, x), (j, y) in combinations(offset, 2):
+        tensor[i, j] = tensor[i, j] - x * y * inertia.mass
+    return _Inertia(inertia.mass, tuple(moment), tuple(tensor.values()))
 
 
-def _pose(body: Body, number: Callable[[Fraction], Element]) -> _Pose:
-    x, y, z = (_terms(row, number) for row in body.rotation)
-    return _Pose((x, y, z), _terms(body.translation, number))
-
-
-def _terms(row: Sequence[Fraction], number: Callable[[Fraction], Element]) -> Terms:
+def _terms(row: Sequence[Fraction], number: Number) -> Terms:
     # Products with the integers 1 and -1 cost nothing, unlike those with elements of the ring.
     return tuple((i, int(x) if abs(x) == 1 else number(x)) for i, x in enumerate(row) if x)
 
@@ -338,5 +275,9 @@ def _dot(terms: Terms, vector: Sequence[Element]) -> Element:
     total: Element = 0
     for index, coefficient in terms:
         value = vector[index]
-        total = total + (value if coefficient == 1 else -value if coefficient == -1 else coefficient * value)
+        if not isinstance(coefficient, int) or abs(coefficient) != 1:
+            value = coefficient * value
+        elif coefficient < 0:
+            value = -value
+        total = total + value
     return total

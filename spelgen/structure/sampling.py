@@ -9,22 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from fractions import Fraction
 from functools import cached_property
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spelgen.arm.arm import Chain
 from spelgen.structure import field
-from spelgen.structure.field import (
-    PRIME,
-    Residues,
-    difference,
-    random_circle_points,
-    random_residues,
-    residue,
-)
+from spelgen.structure.field import PRIME, Residues, difference, random_residues, residue
 from spelgen.structure.recursion import Element, Position, base_denominators, coefficients, energies, triangle
-from spelgen.structure.tuning import TUNING
 
 if TYPE_CHECKING:
     from spelgen.urdf.robot import Assume
@@ -42,17 +35,15 @@ def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray,
     positions = []
     for index in range(n):
         # Cosine and sine of an angle and a displacement are algebraically independent, so each is random by itself.
-        c, s = random_circle_points(rng, 2 * samples)
+        c, s = field.random_circle_points(rng, 2 * samples)
         value = random_residues(rng, (2 * samples,))
         moved = [Residues(_one_moved(x, index, 1 + n)) for x in (c, s, value)]
         positions.append(Position(*moved))
-    inertias: list[Ten] = []
-    for body in arm.bodies:
+    if assume == "kinematics":
         # A rank or zero for random inertial parameters holds for all values of the parameters.
-        if assume == "kinematics":
-            inertias.append(list(map(Residues, random_residues(rng, (10, samples)))))
-        else:
-            inertias.append(list(map(residue, body.inertia or (Fraction(0),) * 10)))
+        inertias: list[Ten] = [list(map(Residues, random_residues(rng, (10, samples)))) for _ in arm.bodies]
+    else:
+        inertias = [list(map(residue, body.inertia or (Fraction(0),) * 10)) for body in arm.bodies]
     # One pass of the recursion computes all samples: its elements are arrays.
     result = energies(arm, positions, inertias, residue)
     shape = (1 + n, samples)
@@ -70,7 +61,7 @@ def regressor_rows(arm: Chain, points: int) -> np.ndarray:
     parameters = 10 * len(arm.bodies)
     positions = []
     for _ in arm.coordinates:
-        c, s = random_circle_points(rng, points)
+        c, s = field.random_circle_points(rng, points)
         value = random_residues(rng, (points,))
         columns = [Residues(x[:, None]) for x in (c, s, value)]
         positions.append(Position(*columns))
@@ -87,12 +78,9 @@ def float_samples(arm: Chain, assume: Assume, samples: int, seed: int = 2) -> np
     rng = np.random.default_rng(seed)
     n = len(arm.coordinates)
     q = [_one_moved(rng.uniform(-3.0, 3.0, 2 * samples), index, 1 + n) for index in range(n)]
-    inertias: list[Ten] = []
-    for body in arm.bodies:
-        if assume == "kinematics":
-            inertias.append(list(rng.normal(size=(10, samples))))
-        else:
-            inertias.append(list(map(float, body.inertia or (0,) * 10)))
+    inertias: list[Ten] = [list(rng.normal(size=(10, samples))) for _ in arm.bodies]
+    if assume == "inertials":
+        inertias = [list(map(float, body.inertia or (0,) * 10)) for body in arm.bodies]
     mass, _ = float_energies(arm, np.stack(q, axis=-1), inertias)
     return mass
 
@@ -144,8 +132,8 @@ class Spans:
     def __init__(self, arm: Chain, assume: Assume):
         self.n = len(arm.coordinates)
         self.keys = triangle(self.n)
-        # d samples span a space of dimension d; additional samples would reveal a larger dimension.
-        count = len(self.keys) + TUNING.spare_samples
+        # d samples span a space of dimension d; four additional samples would reveal a larger dimension.
+        count = len(self.keys) + 4
         mass, potential = field_samples(arm, assume, count)
         self._arm, self._assume, self._count = arm, assume, count
         self.mass = mass[0]
@@ -172,9 +160,7 @@ class Spans:
     def varying(self) -> np.ndarray:
         """Basis of U, (dim U, entries): an echelon form for columns in ``order``."""
         echelon = field.row_basis(np.concatenate(self.change_bases)[:, self.order])
-        basis = np.zeros_like(echelon)
-        basis[:, self.order] = echelon
-        return basis
+        return echelon[:, np.argsort(self.order)]
 
     @cached_property
     def floats(self) -> np.ndarray:
@@ -218,15 +204,18 @@ class Spans:
     @cached_property
     def _nearer_root(self) -> list[np.ndarray]:
         """For each joint, a basis (m, dim U) of the changes of M with earlier joints, in the basis of U."""
-        bases = [self._coordinates[0][:0]]
-        for rows in self._coordinates[:-1]:
-            bases.append(field.row_basis(np.concatenate([bases[-1], rows])))
-        return bases
+        return _sums(self._coordinates)
 
     @cached_property
     def _nearer_tip(self) -> list[np.ndarray]:
         """For each joint, a basis (m, dim U) of the changes of M with later joints, in the basis of U."""
-        bases = [self._coordinates[0][:0]]
-        for rows in reversed(self._coordinates[1:]):
-            bases.insert(0, field.row_basis(np.concatenate([bases[0], rows])))
-        return bases
+        return _sums(self._coordinates[::-1])[::-1]
+
+
+def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return for each of these bases (m, dim U) an echelon basis of the sum of the spans before it."""
+
+    def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
+        return field.row_basis(np.concatenate([rows, basis]))
+
+    return list(accumulate(bases[:-1], with_next, initial=bases[0][:0]))

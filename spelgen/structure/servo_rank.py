@@ -5,22 +5,18 @@ equations are linear and homogeneous in kp, kd, armature, dry and pi: logs deter
 space of the system. The ratio of a parameter to kp is identifiable if both change by the same factor in the null space.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from spelgen.arm.arm import Chain
 from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import float_energies
-from spelgen.structure.tuning import TUNING
 
 PARAMETERS = ("kp", "kd", "armature", "dry")
 
 
-@dataclass(frozen=True)
-class ServoRank:
+class ServoRank(NamedTuple):
     """Identifiable ratios of the parameters of servos.
 
     groups: joints whose kp have identifiable ratios: one known kp, mass or load determines all parameters of a group.
@@ -55,19 +51,13 @@ def servo_rank(arm: Chain) -> ServoRank:
     _, null = _row_and_null_space(system / norms)
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
-    groups: list[list[int]] = []
-    undetermined = []
-    for joint in range(n):
-        for group in groups:
-            if np.abs(changes[group[0], 0] - changes[joint, 0]).max() < TUNING.equal_components:
-                group.append(joint)
-                break
-        else:
-            groups.append([joint])
-        differs = np.abs(changes[joint] - changes[joint, 0]).max(axis=-1) > TUNING.equal_components
-        undetermined += [(PARAMETERS[k], joint) for k in np.flatnonzero(differs)]
-    undetermined.sort(key=lambda entry: PARAMETERS.index(entry[0]))
-    return ServoRank(tuple(map(tuple, groups)), tuple(undetermined))
+    # smaller differences are rounding: the errors of null vectors are a thousand times the errors of the matrix
+    equal, kp = 1e-6, changes[:, :1]
+    same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal  # (n, n)
+    groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in same)
+    differs = np.abs(changes - kp).max(axis=-1) > equal  # (n, K)
+    undetermined = [(PARAMETERS[k], joint) for k, joint in np.argwhere(differs.T).tolist()]
+    return ServoRank(tuple(groups), tuple(undetermined))
 
 
 def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
@@ -96,12 +86,12 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     # The last direction of the derivatives is the velocity, along which qd changes by qdd.
     momentum = np.einsum("spij,sj->sip", mass[:, n], qd + 1j * step * qdd)
     kinetic = np.einsum("skpij,si,sj->skp", mass[:, :n], qd, qd) / 2
-    torque: np.ndarray = (momentum - kinetic + potential[:, :n]).imag / step
-    return torque
+    return np.asarray((momentum - kinetic + potential[:, :n]).imag / step)
 
 
 def _row_and_null_space(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return orthonormal bases of row space and null space, (k, rank) and (k, k - rank), of a matrix (m, k), m >= k."""
     _, singular_values, directions = np.linalg.svd(matrix, full_matrices=False)
-    rank = int((singular_values > TUNING.zero_singular_value * singular_values[0]).sum())
+    # a smaller singular value is a rounding error
+    rank = int((singular_values > 1e-9 * singular_values[0]).sum())
     return directions[:rank].T, directions[rank:].T

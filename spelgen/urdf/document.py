@@ -1,10 +1,8 @@
 """Bytes -> XML tree of a URDF; unsafe content and other formats are refused."""
 
-from __future__ import annotations
-
 import re
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from lxml import etree
 
@@ -26,8 +24,7 @@ _OTHER_FORMATS = {
 }
 
 
-@dataclass(frozen=True)
-class UrdfDocument:
+class UrdfDocument(NamedTuple):
     """The bytes of a URDF, its ``<robot>`` element, and the lines of ``<xacro:property>`` elements in it.
 
     ``path`` is the name of the file in errors. For a xacro file, bytes and lines refer to the expanded document, and
@@ -90,21 +87,13 @@ def _refuse_damage(path: Path, data: bytes) -> None:
     # Markers of git are the most common damage, and the parser's message would not name them.
     conflict = _CONFLICT.search(data)
     if conflict:
-        raise UrdfError(
-            "a merge-conflict marker",
-            file=path,
-            line=_line_of(data, conflict.start()),
-            expected="XML",
-            do="resolve the merge conflict first",
-        )
+        line, do = _line_of(data, conflict.start()), "resolve the merge conflict first"
+        raise UrdfError("a merge-conflict marker", file=path, line=line, expected="XML", do=do)
     if data.lstrip().startswith(b"<?xml") and not data.startswith(b"<?xml"):
         raise UrdfError(
-            "text or blank lines before the XML declaration",
-            file=path,
-            line=_line_of(data, data.index(b"<?xml")),
-            expected="<?xml ...?> at the very start of the file",
-            do="delete what stands before it",
-        )
+            "text or blank lines before the XML declaration", file=path, line=_line_of(data, data.index(b"<?xml")),
+            expected="<?xml ...?> at the very start of the file", do="delete what stands before it",
+        )  # fmt: skip
     # Before parsing: an entity could expand to gigabytes, or read another file.
     for declaration in (b"<!DOCTYPE", b"<!ENTITY"):
         if declaration in data:
@@ -112,13 +101,8 @@ def _refuse_damage(path: Path, data: bytes) -> None:
 
 
 def _doctype_error(path: Path, line: int | None) -> UrdfError:
-    return UrdfError(
-        "a document type or entity declaration",
-        file=path,
-        line=line,
-        expected="plain XML",
-        do="remove it: entities are never expanded",
-    )
+    got, do = "a document type or entity declaration", "remove it: entities are never expanded"
+    return UrdfError(got, file=path, line=line, expected="plain XML", do=do)
 
 
 def _syntax_error(path: Path, error: etree.XMLSyntaxError) -> UrdfError:
@@ -127,34 +111,26 @@ def _syntax_error(path: Path, error: etree.XMLSyntaxError) -> UrdfError:
     if unbound:
         prefix, tag = unbound.groups()
         return UrdfError(
-            f"the prefix {prefix!r}, which nothing declares",
-            file=path,
-            line=error.lineno,
-            element=f"<{prefix}:{tag}>",
-            expected="well-formed XML",
+            f"the prefix {prefix!r}, which nothing declares", file=path, line=error.lineno,
+            element=f"<{prefix}:{tag}>", expected="well-formed XML",
             do=f'add xmlns:{prefix}="..." to <robot>, or remove the prefix',
-        )
+        )  # fmt: skip
     reason = " ".join(re.sub(r",? ?line \d+, column \d+.*", "", message).split())
     return UrdfError(f"not well-formed XML ({reason})", file=path, line=error.lineno)
 
 
 def _check_root(path: Path, root: etree._Element) -> None:
     name = etree.QName(root)
-    if name.localname == "robot" and name.namespace:
-        raise UrdfError(
-            f"<robot> in the namespace {name.namespace!r}",
-            file=path,
-            line=root.sourceline,
-            expected="<robot> in no namespace",
-            do=f'remove xmlns="{name.namespace}"',
-        )
-    if name.localname != "robot":
-        got = f"the root element <{name.localname}>"
-        do = "convert it to URDF first"
-        if name.localname in _OTHER_FORMATS:
-            description, do = _OTHER_FORMATS[name.localname]
-            got += f" of {description}"
-        raise UrdfError(got, file=path, line=root.sourceline, expected="<robot>", do=do)
+    got, expected, do = f"the root element <{name.localname}>", "<robot>", "convert it to URDF first"
+    if name.localname == "robot":
+        if not name.namespace:
+            return
+        got, expected = f"<robot> in the namespace {name.namespace!r}", "<robot> in no namespace"
+        do = f'remove xmlns="{name.namespace}"'
+    elif name.localname in _OTHER_FORMATS:
+        description, do = _OTHER_FORMATS[name.localname]
+        got += f" of {description}"
+    raise UrdfError(got, file=path, line=root.sourceline, expected=expected, do=do)
 
 
 def _check_xacro(path: Path, root: etree._Element) -> tuple[int, ...]:
@@ -164,20 +140,14 @@ def _check_xacro(path: Path, root: etree._Element) -> tuple[int, ...]:
     """
     errors, leftovers = [], []
     for element in root.iter(etree.Element):
-        name = etree.QName(element)
+        name, line = etree.QName(element), element.sourceline
         if not (name.namespace and name.namespace.endswith("/xacro")):
             continue
         if name.localname == "property":
-            leftovers.append(element.sourceline)
+            leftovers.append(line)
             continue
-        error = UrdfError(
-            "xacro that was not expanded",
-            file=path,
-            line=element.sourceline,
-            element=f"<{element.prefix}:{name.localname}>",
-            expected="plain URDF",
-            do="expand the file with the xacro command first",
-        )
-        errors.append(error)
+        where, do = f"<{element.prefix}:{name.localname}>", "expand the file with the xacro command first"
+        got = "xacro that was not expanded"
+        errors.append(UrdfError(got, file=path, line=line, element=where, expected="plain URDF", do=do))
     collect(errors)
     return tuple(leftovers)

@@ -1,7 +1,5 @@
 """Visual and collision shapes of links: boxes, cylinders and spheres as numbers, meshes as triangles."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json
@@ -13,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from lxml import etree
@@ -44,8 +42,7 @@ class LinkShape:
     mesh: Mesh | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class LinkShapes:
+class LinkShapes(NamedTuple):
     """The shapes of links that were read, and the unread ones: name of the link -> names of files, or kind."""
 
     shapes: tuple[LinkShape, ...]
@@ -55,8 +52,9 @@ class LinkShapes:
     def unread_text(self) -> str:
         """The first two links and files of the shapes that were not read, and the number of others; empty if none."""
         named = [f"{link} ({', '.join(names)})" for link, names in self.unread.items()]
-        others = [counted(len(named) - 2, "more link")] if len(named) > 2 else []
-        return ", ".join([*named[:2], *others])
+        if len(named) > 2:
+            named[2:] = [counted(len(named) - 2, "more link")]
+        return ", ".join(named)
 
 
 def link_shapes(
@@ -76,6 +74,7 @@ def link_shapes(
     for link in root.iterfind("link"):
         name = link.get("name", "")
         for each in link.iterfind(element) if name in links else ():
+            # one invalid shape must not hide the others, which are only drawn
             try:
                 shapes.append(_shape(name, each))
             except ValueError as error:
@@ -119,7 +118,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
         (shape,) = model.robot.links[0].collisions
         geometry = shape.geometry
         pose = np.eye(4) if shape.origin is None else np.asarray(shape.origin)
-        file_name = ""
+        kind, file_name = "mesh", ""
         if geometry.box is not None:
             kind, size = "box", geometry.box.size
         elif geometry.cylinder is not None:
@@ -127,11 +126,8 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
         elif geometry.sphere is not None:
             kind, size = "sphere", geometry.sphere.radius
         else:
-            kind, size, file_name = (
-                "mesh",
-                1.0 if geometry.mesh.scale is None else geometry.mesh.scale,
-                geometry.mesh.filename,
-            )
+            scale, file_name = geometry.mesh.scale, geometry.mesh.filename
+            size = 1.0 if scale is None else scale
         numbers = np.broadcast_to(np.asarray(size, dtype=float), COUNTS[kind])
     except Exception as error:  # of any type, from attributes that are absent or are not numbers
         raise ValueError("a shape that is not valid") from error

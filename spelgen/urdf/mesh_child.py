@@ -17,10 +17,13 @@ import numpy as np
 
 from spelgen.errors import SpelgenError
 from spelgen.files import read_bytes
-from spelgen.urdf.tuning import TUNING
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
+
+
+MAX_BYTES = 50_000_000
+"""Size of the largest file with a mesh."""
 
 
 class MeshFolder:
@@ -31,7 +34,7 @@ class MeshFolder:
 
     def get(self, name: str) -> bytes:
         """Return the content of a file. Raises SpelgenError."""
-        return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=TUNING.max_mesh_bytes)
+        return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=MAX_BYTES)
 
     __getitem__ = get
 
@@ -47,8 +50,9 @@ def main(faces: int, meshes: list[tuple[str, list[float]]], output: IO[bytes]) -
     with suppress(ImportError):  # not on Windows
         import resource
 
-        resource.setrlimit(resource.RLIMIT_AS, (TUNING.mesh_memory,) * 2)
-        resource.setrlimit(resource.RLIMIT_CPU, (TUNING.mesh_seconds,) * 2)
+        resource.setrlimit(resource.RLIMIT_AS, (2**30,) * 2)
+        # [s] imports and the simplification of fine meshes take most of the time
+        resource.setrlimit(resource.RLIMIT_CPU, (30,) * 2)
     arrays: dict[str, np.ndarray] = {}
     for index, (path, scale) in enumerate(meshes):
         gc.collect()  # meshes contain reference cycles, so the meshes of other links would fill the memory
@@ -66,7 +70,7 @@ def _read(path: Path, scale: list[float], faces: int) -> Trimesh:
     """Return the scaled mesh in a file, with at most `faces` triangles. Raises ValueError if it has none."""
     import trimesh
 
-    content = io.BytesIO(read_bytes(path, SpelgenError, largest=TUNING.max_mesh_bytes))
+    content = io.BytesIO(read_bytes(path, SpelgenError, largest=MAX_BYTES))
     format, resolver = path.suffix.lower().lstrip("."), MeshFolder(path.parent)
     mesh: Any = trimesh.load(content, file_type=format, resolver=resolver, force="mesh")  # type: ignore[arg-type]
     # files repeat the vertices of each triangle: unmerged, the surface would tear when it is simplified
@@ -74,7 +78,8 @@ def _read(path: Path, scale: list[float], faces: int) -> Trimesh:
     mesh.apply_scale(scale)
     # the area overflows for corners that are too far away
     is_finite = np.isfinite(mesh.vertices).all() and mesh.area < np.inf
-    if not is_finite or not 0 < len(mesh.faces) <= TUNING.max_mesh_faces:
+    # archives may expand without end
+    if not is_finite or not 0 < len(mesh.faces) <= 2_000_000:
         raise ValueError(f"{path}: no triangles, too many triangles, or corners that are no numbers")
     if len(mesh.faces) > faces:
         mesh = mesh.simplify_quadric_decimation(face_count=faces, aggression=3)

@@ -1,7 +1,5 @@
 """URDF file -> Robot, with the values of the file: all elements are checked, and no defect is repaired silently."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,13 +29,16 @@ def read_urdf(path: Path) -> Robot:
     """
     document = read_document(path)
     notes = Notes(document.path)
+    # line numbers would be searched for in the wrong file
     if document.path != path:
         message = f"expanded by xacro: lines are those of the document that `xacro {path.name}` prints"
         notes.diagnostics.append(Diagnostic("info", "expanded-xacro", "robot", None, message))
     for warning in document.warnings:
         notes.warn(None, "xacro-warning", "robot", warning)
     root = document.root
-    name = _robot_name(notes, root)
+    name = root.get("name") and (read_name(notes, root) or "")
+    if not name:
+        notes.warn(root.sourceline, "missing-robot-name", "robot", "<robot> has no name: the file's is taken")
     if document.leftovers:
         message = f"{len(document.leftovers)} <xacro:property> elements were left behind by xacro: ignored"
         notes.warn(document.leftovers[0], "unexpanded-xacro", "robot", message)
@@ -46,45 +47,30 @@ def read_urdf(path: Path) -> Robot:
     joints = _unique(notes, [read_joint(notes, element) for element in root.findall("joint")])
     _check_ends(notes, links, joints)
     _check_mimics(notes, joints)
-    joint_names = [joint.name for joint in joints]
-    transmissions = []
-    for element in root.findall("transmission"):
-        transmissions.append(read_transmission(notes, element, joint_names))
-    # only if all joints could be read, because the child links of unread joints would count as roots
-    tops: list[str] = []
-    if not notes.errors:
-        tops = _check_tree(notes, root, links, joints)
-    collect(sorted(notes.errors, key=lambda error: error.line or 0))
+    names = [joint.name for joint in joints]
     robot = Robot(
-        name=name,
+        name=name or notes.path.stem,
         path=path,
         source=document.path,
         digest=hashlib.sha256(document.data).hexdigest(),
         links=tuple(links),
         joints=tuple(joints),
-        transmissions=tuple(transmissions),
-        root=tops[0],
+        transmissions=tuple(read_transmission(notes, x, names) for x in root.findall("transmission")),
+        root="",
         diagnostics=(),
     )
+    # only if all joints could be read, because the child links of unread joints would count as roots
+    if not notes.errors:
+        robot = _rooted(notes, root, robot)
+    collect(sorted(notes.errors, key=lambda error: error.line or 0))
     return replace(robot, diagnostics=_diagnostics(notes, robot))
 
 
 def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
     """Return the diagnostics of reading and lint in the order of lines, without duplicates for absent tensors."""
-    diagnostics = list(notes.diagnostics)
     absent = {remark.line for remark in notes.diagnostics if remark.code == "inertial-without-inertia"}
-    for warning in lint(robot):
-        if warning.code != "zero-inertia" or warning.line not in absent:
-            diagnostics.append(warning)
-    return tuple(sorted(diagnostics, key=lambda remark: remark.line or 0))
-
-
-def _robot_name(notes: Notes, root: etree._Element) -> str:
-    if root.get("name"):
-        return read_name(notes, root) or ""
-    message = "<robot> has no name: the file's is taken"
-    notes.warn(root.sourceline, "missing-robot-name", "robot", message)
-    return notes.path.stem
+    warnings = [x for x in lint(robot) if x.code != "zero-inertia" or x.line not in absent]
+    return tuple(sorted([*notes.diagnostics, *warnings], key=lambda remark: remark.line or 0))
 
 
 def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
@@ -94,9 +80,8 @@ def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
         notes.error(root.sourceline, "<robot>", f"{len(elements)} links", f"at most {MAX_LINKS}")
         collect(notes.errors)
     if not elements:
-        do = None
-        if any(uri.endswith("/xacro") for uri in root.nsmap.values()):
-            do = "this is a xacro file: expand it with the xacro command first"
+        is_xacro = any(uri.endswith("/xacro") for uri in root.nsmap.values())
+        do = "this is a xacro file: expand it with the xacro command first" if is_xacro else None
         notes.error(root.sourceline, "<robot>", "no <link>", "a tree of links and joints", do)
     elif root.find("joint") is None:
         notes.error(root.sourceline, "<robot>", "no <joint>", "a tree of links and joints")
@@ -148,6 +133,7 @@ def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
         if leader is None:
             got = f"no joint is named {joint.mimic.joint!r}"
             notes.error(joint.line, where, got, do=suggestion(joint.mimic.joint, by_name))
+        # a follower of a fixed joint would be a fixed joint that looks as if it moves
         elif not leader.moves:
             got = f"the {leader.type} joint {leader.name!r}"
             notes.error(joint.line, where, got, "a revolute, continuous or prismatic joint to follow")
@@ -166,32 +152,22 @@ def _is_circle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
     return leader is joint and bool(seen)
 
 
-def _check_tree(
-    notes: Notes, root: etree._Element, links: Sequence[UrdfLink], joints: Sequence[UrdfJoint]
-) -> list[str]:
-    """Return the root link in a list; an empty list, with an error, unless the links form one tree."""
-    children = {joint.child for joint in joints}
-    tops = [link for link in links if link.name not in children]
+def _rooted(notes: Notes, root: etree._Element, robot: Robot) -> Robot:
+    """Return the robot with its root link, and report errors unless the links form one tree."""
+    children = {joint.child for joint in robot.joints}
+    tops = [link for link in robot.links if link.name not in children]
     if len(tops) != 1:
-        listed = ", ".join(f"{top.name!r} (line {top.line})" for top in tops[:10])
-        got = "no root link: the joints form a circle"
-        do = None
+        got, do = "no root link: the joints form a circle", None
         if tops:
-            got = f"{len(tops)} root links: {listed}"
-            do = "join the trees by a fixed joint"
+            listed = ", ".join(f"{top.name!r} (line {top.line})" for top in tops[:10])
+            got, do = f"{len(tops)} root links: {listed}", "join the trees by a fixed joint"
         notes.error(root.sourceline, "<robot>", got, "one link that is no joint's child", do)
-        return []
-    below: dict[str, list[str]] = {}
-    for joint in joints:
-        below.setdefault(joint.parent, []).append(joint.child)
-    connected = {tops[0].name}
-    pending = [tops[0].name]
-    while pending:
-        # Each link has one parent here, so that the walk from the root ends even if other links form a cycle.
-        pending += below.get(pending.pop(), [])
-        connected.update(pending)
-    for link in links:
+        return robot
+    robot = replace(robot, root=tops[0].name)
+    # each link has one parent here, so that the walk from the root ends even if other links form a cycle
+    connected = {robot.root, *(joint.child for joint in robot.joints_from_root)}
+    for link in robot.links:
         if link.name not in connected:
-            got = f"a circle of joints that never meets the root {tops[0].name!r}"
+            got = f"a circle of joints that never meets the root {robot.root!r}"
             notes.error(link.line, f"link {link.name!r}", got, "a tree")
-    return [tops[0].name]
+    return robot

@@ -1,4 +1,4 @@
-"""Checked values of URDF attributes, and the list of defects of a file.
+"""Checked reading of the elements of a URDF, and the list of defects of a file.
 
 The package yourdfpy is not used: each number is checked as text first (count, length, finiteness, line), and yourdfpy
 replaces absent inertias by 1.0, converts origins to matrices and drops mechanical reductions. Tests compare the two
@@ -8,6 +8,7 @@ readings of all other values.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
 
@@ -18,118 +19,141 @@ from spelgen.urdf.robot import Vector
 
 # Largest magnitude of a number of exact geometry: products of a few such numbers are in the range of a float.
 MAX_MAGNITUDE = 1e12
-MAX_NUMBER_TEXT = 64
+MAX_NAME = 256
 # [rad, m; Nm, N; per second] From these on a limit states that there is none: exporters write 1e9, 1e16 or DBL_MAX.
 UNLIMITED = {"lower": 1e3, "upper": 1e3, "effort": 1e5, "velocity": 1e3}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-_COUNTS = {1: "one number", 3: "three numbers"}
 
 
+@dataclass
 class Notes:
     """Errors, which are reported together at the end of reading, and diagnostics of a file."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.errors: list[UrdfError] = []
-        self.diagnostics: list[Diagnostic] = []
+    path: Path
+    errors: list[UrdfError] = field(default_factory=list)
+    diagnostics: list[Diagnostic] = field(default_factory=list)
 
     def error(
         self, line: int | None, element: str, got: str, expected: str | None = None, do: str | None = None
     ) -> None:
         """Add an error."""
-        self.errors.append(
-            UrdfError(got, file=self.path, line=line, element=element, expected=expected, do=do)
-        )
+        error = UrdfError(got, file=self.path, line=line, element=element, expected=expected, do=do)
+        self.errors.append(error)
 
     def warn(self, line: int | None, code: str, where: str, message: str) -> None:
         """Add a warning."""
         self.diagnostics.append(Diagnostic("warning", code, where, line, message))
 
-
-def first_child(notes: Notes, element: etree._Element, tag: str, where: str) -> etree._Element | None:
-    """Return the first child with this tag, or None; repeated ones, which parsers treat differently, are reported."""
-    children = element.findall(tag)
-    if len(children) > 1:
-        message = f"{len(children)} <{tag}> elements: the first is taken, the others are ignored"
-        notes.warn(children[1].sourceline, "repeated-element", where, message)
-    return children[0] if children else None
+    def add_as_warnings(self, optional: Notes) -> None:
+        """Add the notes on an optional part of the file, its errors as warnings."""
+        self.diagnostics += optional.diagnostics
+        for error in optional.errors:
+            message = f"got {error.got}, expected {error.expected}: taken as absent"
+            self.warn(error.line, "unusable-value", str(error.element), message)
 
 
-def read_triple(
-    notes: Notes, element: etree._Element, key: str, where: str, default: Vector = (0.0, 0.0, 0.0)
-) -> Vector:
-    """Return three numbers; the default if the attribute is absent or, with an error, unusable."""
-    text = element.get(key)
-    if text is None:
-        return default
-    values = _parsed(notes, element, text, 3, f"{where} {key}", bounded=True)
-    return default if values is None else (values[0], values[1], values[2])
+@dataclass(frozen=True)
+class Element:
+    """An element of a URDF, None if it is absent, its name in messages, and the notes that get its defects."""
 
+    notes: Notes
+    xml: etree._Element | None
+    where: str
 
-def read_number(
-    notes: Notes, element: etree._Element, key: str, where: str, *, bounded: bool = True
-) -> float | None:
-    """Return a number; None if the attribute is absent or, with an error, unusable."""
-    text = element.get(key)
-    values = None if text is None else _parsed(notes, element, text, 1, f"{where} {key}", bounded)
-    return None if values is None else values[0]
+    @property
+    def line(self) -> int:
+        """Line of the element."""
+        return 0 if self.xml is None else int(self.xml.sourceline)
 
+    def error(self, got: str, expected: str | None = None, do: str | None = None, key: str = "") -> None:
+        """Add an error about the element, or about one of its attributes."""
+        self.notes.error(self.line, f"{self.where} {key}".rstrip(), got, expected, do)
 
-def read_limit(notes: Notes, element: etree._Element, key: str, where: str) -> float | None:
-    """Read a limit; None without a limit: absent, inf, nan, or beyond the range of joints."""
-    text = (element.get(key) or "").strip().lower()
-    if text.lstrip("+-") in ("inf", "infinity", "nan"):
+    def child(self, tag: str) -> Element:
+        """Return the first child with this tag; repeated ones, which parsers treat differently, are reported."""
+        children = [] if self.xml is None else self.xml.findall(tag)
+        if len(children) > 1:
+            message = f"{len(children)} <{tag}> elements: the first is taken, the others are ignored"
+            self.notes.warn(children[1].sourceline, "repeated-element", self.where, message)
+        return Element(self.notes, children[0] if children else None, f"{self.where} {tag}")
+
+    def text(self, key: str) -> str | None:
+        """Return an attribute, None if it is absent."""
+        # an absent element reads as one without attributes, so that callers need no branch
+        text: str | None = None if self.xml is None else self.xml.get(key)
+        return text
+
+    def name(self) -> str | None:
+        """Return the name of the element; None, with an error, if it has none."""
+        name = self.text("name")
+        if not name or not name.strip():
+            self.error("no name" if name is None else "an empty name", "a name", 'add name="..."')
+        # names occur in error messages, file names and the emitted module
+        elif len(name) > MAX_NAME:
+            self.error(f"a name of {len(name)} characters", f"at most {MAX_NAME}")
+        elif not self._is_unexpanded(name, "name"):
+            return name
         return None
-    value = read_number(notes, element, key, where, bounded=False)
-    return None if value is None or abs(value) >= UNLIMITED[key] else value
 
+    def triple(self, key: str, default: Vector = (0.0, 0.0, 0.0)) -> Vector:
+        """Return three numbers; the default if the attribute is absent or, with an error, unusable."""
+        values = self._numbers(self.text(key), key, 3)
+        return (values[0], values[1], values[2]) if values else default
 
-def read_text_number(notes: Notes, element: etree._Element, tag: str, where: str) -> float | None:
-    """Return the number in the text of a child element; None if it is absent or, with an error, unusable."""
-    child = element.find(tag)
-    if child is None or not (child.text or "").strip():
-        return None
-    values = _parsed(notes, child, child.text or "", 1, f"{where} {tag}", bounded=True)
-    return None if values is None else values[0]
+    def number(self, key: str) -> float | None:
+        """Return a number; None if the attribute is absent or, with an error, unusable."""
+        values = self._numbers(self.text(key), key)
+        return values[0] if values else None
 
-
-def _parsed(
-    notes: Notes, element: etree._Element, text: str, count: int, where: str, bounded: bool
-) -> list[float] | None:
-    """Return ``count`` finite numbers; None, with an error, for other text.
-
-    bounded: whether magnitudes are at most MAX_MAGNITUDE; not for limits of joints, which may mean "unlimited".
-    """
-    if "${" in text or "$(" in text:
-        note_unexpanded(notes, element, where, text)
-        return None
-    # float() accepts nan, inf, 1_000 and Arabic digits, which other readers of URDF reject
-    words = text.split()
-    expected = _COUNTS[count]
-    if len(words) != count:
-        excerpt = text if len(text) <= MAX_NUMBER_TEXT else f"{text[:MAX_NUMBER_TEXT]}..."
-        notes.error(element.sourceline, where, f"{len(words)} numbers ({excerpt!r})", expected)
-        return None
-    for word in words:
-        if len(word) > MAX_NUMBER_TEXT:
-            got = f"a number of {len(word)} characters"
-            notes.error(element.sourceline, where, got, f"at most {MAX_NUMBER_TEXT}")
+    def limit(self, key: str) -> float | None:
+        """Return a limit; None without a limit: absent, inf, nan, or beyond the range of joints."""
+        text = self.text(key)
+        if text and text.strip().lower().lstrip("+-") in ("inf", "infinity", "nan"):
             return None
-        if not _NUMBER.fullmatch(word):
-            hint = "separate numbers by spaces" if "," in word else None
-            notes.error(element.sourceline, where, repr(word), f"{expected} in decimal notation", hint)
-            return None
-    values = list(map(float, words))
-    if not all(isfinite(value) and (not bounded or abs(value) <= MAX_MAGNITUDE) for value in values):
-        bound = f"within +-{MAX_MAGNITUDE:g}" if bounded else "within the range of a float"
-        notes.error(element.sourceline, where, repr(text), f"{expected} {bound}")
-        return None
-    return values
+        values = self._numbers(text, key, bounded=False)
+        return values[0] if values and abs(values[0]) < UNLIMITED[key] else None
 
+    def number_in_text(self, tag: str) -> float | None:
+        """Return the number in the text of a child element; None if it is absent or, with an error, unusable."""
+        child = None if self.xml is None else self.xml.find(tag)
+        text = "" if child is None else child.text or ""
+        values = Element(self.notes, child, self.where)._numbers(text if text.strip() else None, tag)
+        return values[0] if values else None
 
-def note_unexpanded(notes: Notes, element: etree._Element, where: str, text: str) -> None:
-    """Add an error for a value that contains a xacro expression."""
-    do = "expand the file with the xacro command first"
-    notes.error(
-        element.sourceline, where, f"the xacro expression {text[:MAX_NUMBER_TEXT]!r}", "a plain value", do
-    )
+    def _numbers(self, text: str | None, key: str, count: int = 1, bounded: bool = True) -> list[float]:
+        """Return ``count`` finite numbers; none for an absent text and, with an error, for any other text.
+
+        bounded: whether magnitudes are at most MAX_MAGNITUDE; not for limits of joints, which may mean "unlimited".
+        """
+        if text is None or self._is_unexpanded(text, key):
+            return []
+        # float() accepts nan, inf, 1_000 and Arabic digits, which other readers of URDF reject
+        words, longest = text.split(), 64
+        expected = "one number" if count == 1 else "three numbers"
+        if len(words) != count:
+            excerpt = text if len(text) <= longest else f"{text[:longest]}..."
+            self.error(f"{len(words)} numbers ({excerpt!r})", expected, key=key)
+            return []
+        for word in words:
+            # no exporter writes numbers of this length: the file is damaged
+            if len(word) > longest:
+                self.error(f"a number of {len(word)} characters", f"at most {longest}", key=key)
+                return []
+            if not _NUMBER.fullmatch(word):
+                hint = "separate numbers by spaces" if "," in word else None
+                self.error(repr(word), f"{expected} in decimal notation", hint, key)
+                return []
+        values = list(map(float, words))
+        if not all(isfinite(value) and (not bounded or abs(value) <= MAX_MAGNITUDE) for value in values):
+            bound = f"within +-{MAX_MAGNITUDE:g}" if bounded else "within the range of a float"
+            self.error(repr(text), f"{expected} {bound}", key=key)
+            return []
+        return values
+
+    def _is_unexpanded(self, text: str, key: str) -> bool:
+        """Whether a value contains a xacro expression, which is then an error."""
+        is_unexpanded = "${" in text or "$(" in text
+        if is_unexpanded:
+            do = "expand the file with the xacro command first"
+            self.error(f"the xacro expression {text[:64]!r}", "a plain value", do, key)
+        return is_unexpanded

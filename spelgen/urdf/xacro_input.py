@@ -2,28 +2,28 @@
 
 A xacro file is a program: it contains Python expressions, reads other files and the environment, and is not sandboxed.
 It is therefore executed only if the name of the file is ``*.xacro``, never because of the content of a file. It runs in
-a separate process with limited time and memory, but with the permissions of the user.
+a separate process with limited time and memory, but with the permissions of the user: this file is its program,
+FILE -> stdout, messages -> stderr.
 """
 
-from __future__ import annotations
-
+import re
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from spelgen.errors import UrdfError
-from spelgen.urdf import xacro_child
 
-SUFFIX = ".xacro"
 MAX_SECONDS = 8
-MAX_MESSAGE = 400  # characters of xacro's message in an error
+MEMORY = 2**30  # memory of the process [bytes]
+MISSING = 3  # exit code of the process where the package xacro is not installed
 _BY_HAND = "expand it where that works: xacro FILE name:=value ... > ROBOT.urdf"
 
 
-@dataclass(frozen=True)
-class XacroOutput:
+class XacroOutput(NamedTuple):
     """The expanded URDF, and the warnings of xacro."""
 
     data: bytes
@@ -32,7 +32,7 @@ class XacroOutput:
 
 def is_xacro(path: Path) -> bool:
     """Whether the name of a file marks it as a xacro file."""
-    return path.suffix.lower() == SUFFIX
+    return path.suffix.lower() == ".xacro"
 
 
 def expand(path: Path, max_bytes: int) -> XacroOutput:
@@ -42,22 +42,19 @@ def expand(path: Path, max_bytes: int) -> XacroOutput:
     ``max_bytes``.
     """
     # -P: modules in the current folder must not shadow the package
-    command = [sys.executable, "-P", "-X", "utf8", xacro_child.__file__, str(path)]
+    command = [sys.executable, "-P", "-X", "utf8", "-m", "spelgen.urdf.xacro_input", str(path)]
     # A file and not a pipe: output of any size must not fill the memory of this process.
     with tempfile.TemporaryFile() as output:
         try:
             run = subprocess.run(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.PIPE,
-                timeout=MAX_SECONDS,
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.PIPE, timeout=MAX_SECONDS,
                 check=False,
-            )
+            )  # fmt: skip
         except subprocess.TimeoutExpired:
             raise UrdfError(f"xacro still running after {MAX_SECONDS} s", file=path, do=_BY_HAND) from None
         lines = run.stderr.decode(errors="replace").splitlines()
         warnings = tuple(line.removeprefix("warning: ") for line in lines if line.startswith("warning: "))
+        # messages before the failure are often its cause: they are all part of the error
         if run.returncode:
             raise _failure(path, run.returncode, [line for line in lines if not line.startswith("warning: ")])
         size = output.seek(0, 2)
@@ -68,11 +65,58 @@ def expand(path: Path, max_bytes: int) -> XacroOutput:
 
 
 def _failure(path: Path, code: int, lines: list[str]) -> UrdfError:
-    if code == xacro_child.MISSING:
-        return UrdfError(
-            "a xacro file, and no package to expand it",
-            file=path,
-            do=f"pip install 'spelgen[xacro]', or {_BY_HAND}",
-        )
-    reason = " ".join(" ".join(lines).split())[:MAX_MESSAGE] or f"it ended with code {code}"
+    if code == MISSING:
+        do = f"pip install 'spelgen[xacro]', or {_BY_HAND}"
+        return UrdfError("a xacro file, and no package to expand it", file=path, do=do)
+    # the message of xacro, whose length is not limited
+    reason = " ".join(" ".join(lines).split())[:400] or f"it ended with code {code}"
     return UrdfError(f"xacro cannot expand it ({reason})", file=path, do=f"correct it, or {_BY_HAND}")
+
+
+def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path) -> None:
+    """Let $(find PACKAGE) find a package above the file, or next to a folder above it, without ROS."""
+    installed = functions["_eval_find"]
+
+    def find(package: str) -> str:
+        for folder in path.parents:
+            for candidate in (folder, folder / package):
+                manifest = candidate / "package.xml"
+                if manifest.is_file():
+                    name = re.search(r"<name>\s*(.*?)\s*</name>", manifest.read_text(errors="replace"))
+                    if name and name[1] == package:
+                        return str(candidate)
+        # a package without its manifest has its name
+        named = [folder for folder in path.parents if folder.name == package]
+        return str(named[0]) if named else installed(package)
+
+    functions["_eval_find"] = find
+
+
+def main(path: str) -> None:
+    """Write the expanded URDF to stdout, with the line breaks of the command ``xacro FILE``."""
+    with suppress(ImportError):  # not on Windows
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    try:
+        import xacro
+        from xacro import substitution_args
+    except ModuleNotFoundError:
+        sys.exit(MISSING)
+    _find_packages_above(vars(substitution_args), Path(path).resolve())
+    try:
+        document = xacro.process_file(path)
+        for comment in document.childNodes:
+            # the banner contains the path as given on the command line: it is removed for reproducible bytes
+            if comment is not document.documentElement and " autogenerated by xacro " in comment.data:
+                comment.data = ""
+        text = document.toprettyxml(indent="  ")
+    except Exception as error:
+        print(str(error).strip() or type(error).__name__, file=sys.stderr)
+        xacro.print_location()
+        sys.exit(1)
+    sys.stdout.buffer.write(text.encode())
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

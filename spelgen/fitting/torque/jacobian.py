@@ -24,7 +24,7 @@ from spelgen.fitting.torque.linearization import (
 from spelgen.fitting.torque.parameters import ParameterVector, joint_torque, step_in_inertial_parameters
 from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
-from spelgen.runtime.inputs import MotorInputs
+from spelgen.runtime.motors import MotorInputs
 
 LOGARITHMIC_GROUPS = ("armature", "sizes", "effects", "load_dependence")
 

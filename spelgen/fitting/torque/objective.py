@@ -27,8 +27,8 @@ from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.tuning import SLOWEST
 from spelgen.logs.windows import thinned
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import TorqueFit

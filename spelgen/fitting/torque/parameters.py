@@ -21,7 +21,7 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.torque.samples import SampleBlock
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.logs.tuning import SAMPLES
-from spelgen.runtime.rigid_body import body_factor
+from spelgen.runtime.body_chain import body_factor
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 MIN_SPEED = SAMPLES.moving

@@ -17,7 +17,7 @@ from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.torque.fit import TorqueSolution
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
-from spelgen.runtime.inputs import MotorInputs
+from spelgen.runtime.motors import MotorInputs
 
 TERM_NAMES = {
     "raw_torque_splines": "a torque by position (spring, cable)",

@@ -188,7 +188,8 @@ def fit_residual_terms(
     """Select residual terms on samples, and fit them together with the rigid-body parameters.
 
     Single-joint terms are selected first, in passes: each pass improves the rigid-body parameters, and with them the
-    residual on which further terms are selected. Networks of several joints are selected on the residual of these.
+    residual on which further terms are selected. Networks of several joints are selected on the residual after these
+    terms.
     """
     model = estimate.problem.jacobian.model
     if samples is not estimate.problem.jacobian.samples:

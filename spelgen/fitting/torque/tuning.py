@@ -74,7 +74,7 @@ class TorqueTuning:
     residual_samples: int = 2**14
     # [1] Directions with less than this fraction of the largest curvature are not determined by the samples.
     min_relative_curvature: float = 1e-10
-    # [1] Smallest noise, as a fraction of a torque's range: noise-free samples are fitted to four digits.
+    # [1] Smallest noise, as a fraction of a torque's standard deviation: noise-free samples are fitted to four digits.
     min_noise: float = 1e-4
     # [1] Smallest fraction of independent errors that remains, however many parameters are determined.
     min_error_fraction: float = 0.1

@@ -1,0 +1,190 @@
+"""Compare positions with the integrals of velocities: units, senses and columns that explain a mismatch.
+
+A finding with a line advises a reading of the columns under which positions and velocities agree.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+from math import log
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+
+from spelgen.logs.joint_signals import Advice, JointSignals
+from spelgen.logs.jumps import held_samples
+from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.logs.tuning import SIGNALS, shows_accelerations
+from spelgen.settings.log_mapping import SCALES, TIMES
+
+TURNS = 4 * np.pi  # [rad] A joint with limits turns less: larger positions are in another unit.
+# units of loggers; SI units, which need no line, come first
+UNITS = {
+    "revolute": (("rad", "deg", "turns", "mrad"), ("rad/s", "deg/s", "rpm", "turns/s", "mrad/s")),
+    "prismatic": (("m", "mm"), ("m/s", "mm/s")),
+}
+
+
+def velocity_products(trajectory: Trajectory) -> np.ndarray:
+    """Return sums of products (2n, 2n) of increments over several samples: of the integrals of qd, then of q."""
+    # imported here, since it takes half a second
+    from scipy.integrate import cumulative_trapezoid
+
+    products = np.zeros((2 * trajectory.q.shape[1],) * 2)
+    for piece in split_at_gaps(trajectory, shortest=2):
+        # over several samples: between neighbouring samples the quantisation of q may be larger than its change
+        span = min(SIGNALS.increments, len(piece) - 1)
+        integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
+        positions = np.concatenate([integral, piece.q], axis=1)
+        increments = positions[span:] - positions[:-span]
+        products += increments.T @ increments
+    return products
+
+
+def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return factors (n,) by which qd must be multiplied to be dq/dt, and correlations (n, n).
+
+    Correlation (i, j) is 1 if qd of joint i is proportional to dq/dt of joint j, and NaN if one of them is at rest.
+    products: see `velocity_products`.
+    """
+    n = len(products) // 2
+    qd_squares, q_squares = np.split(products.diagonal(), 2)
+    sizes = np.outer(np.sqrt(qd_squares), np.sqrt(q_squares))
+    correlations = products[:n, n:] / np.where(sizes > 1e-12, sizes, np.nan)
+    return products[:n, n:].diagonal() / np.where(qd_squares > 0, qd_squares, np.nan), correlations
+
+
+def find_units(signals: JointSignals) -> str | Advice | None:
+    """Find other units than the mapping states: q is more than two turns, or a multiple of the integral of qd."""
+    mapping, joint = signals.trajectory.mapping, signals.joint
+    if signals.step > SIGNALS.slowest_step:
+        return None  # the times are in another unit
+    is_far = np.ptp(signals.q) > TURNS and signals.kind != "prismatic" and not signals.turns
+    is_far &= mapping.unit("q", joint) is None
+    message = f"q that changes {signals.factor:.3g} times as fast as qd"
+    if is_far:
+        message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
+    distance, keys = min(_unit_readings(signals, is_far), key=itemgetter(0), default=(np.inf, {}))
+    if distance > log(1.25):
+        return message if is_far else None
+    units = " and ".join(f"{name} in {unit}" for name, unit in keys.get("units", {}).items())
+    return Advice(f"{message}: {units}", keys) if keys else None
+
+
+def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Yield the keys of a joint for all units that its mapping does not state.
+
+    Before them, the distance of the ratio of dq/dt to qd from 1, in which another unit costs something. is_far: q is
+    more than two turns.
+    """
+    mapping, joint = signals.trajectory.mapping, signals.joint
+    # without velocities only the range shows a unit
+    is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
+    is_known &= "qd" in mapping.quantities
+    positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
+    if mapping.unit("q", joint):
+        positions = positions[:1]
+    if not is_known or mapping.unit("qd", joint):
+        speeds = speeds[:1]
+    for q, qd in product(positions, speeds):
+        scale = SCALES.get(q, 1.0)
+        units = {name: x for name, x in (("q", q), ("qd", qd)) if x in SCALES}
+        distance = abs(log(signals.factor * scale / SCALES.get(qd, 1.0))) if is_known else 0.0
+        if not is_far or np.ptp(signals.q) * scale <= TURNS:
+            yield distance + 0.02 * len(units), {"units": units} if units else {}
+    for counts in (2 ** np.arange(10, 21)).tolist() if is_known and "turns" in positions else ():
+        distance = abs(log(signals.factor * 2 * np.pi / counts)) + 0.02
+        yield distance, {"units": {"q": "counts"}, "counts_per_turn": counts}
+
+
+def find_time_unit(signals: JointSignals) -> str | Advice | None:
+    """Find times that are not in seconds: from a sample rate below 2 Hz, or from the ratio of dq/dt to qd."""
+    step, is_stated = signals.step, signals.trajectory.mapping.units.t != "s"
+    message, unit = f"a sample every {step:.3g} s", time_unit(step)
+    if step <= SIGNALS.slowest_step:
+        message = f"q that changes {signals.factor:.3g} times as fast as qd"
+        unit = next((x for x in TIMES if x != "s" and signals.changes_by(TIMES[x])), None)
+    elif signals.number:
+        return None  # reported once, and not for each joint
+    elif unit is not None:
+        message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
+    if unit is None or is_stated:
+        return message if step > SIGNALS.slowest_step else None
+    return Advice(message, keys={"units": {"t": unit}})
+
+
+def time_unit(step: float) -> str | None:
+    """Return the unit of time in which a step between samples is plausible for a robot's log; None if there is none."""
+    # units differ by a factor of 1000, the range of plausible steps by 5000: the first plausible unit is the largest
+    slowest, fastest = SIGNALS.slowest_step, SIGNALS.fastest_step
+    return next((unit for unit, size in TIMES.items() if fastest <= step * size <= slowest), None)
+
+
+def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
+    """Find velocities that are not the derivative of the positions, and the columns or the sense that fit better."""
+    factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
+    # times in another unit are a finding of the first joint already
+    if signals.step > SIGNALS.slowest_step:
+        return None
+    if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
+        return None
+    message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
+    if len(signals.q) <= SIGNALS.increments:
+        return message  # of two samples every correlation is 1
+    if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
+        # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
+        return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
+    trajectory, mapping, k = signals.trajectory, signals.trajectory.mapping, signals.number
+    for other, fit in zip(signals.joints, signals.correlations, strict=True):
+        if fit > max(SIGNALS.agreement, correlation):
+            columns = {"qd": mapping.column("qd", other)}
+            return Advice(f"{message}; that of joint {other!r} is", {"columns": columns})
+    exchanged = velocity_products(replace(trajectory, q=trajectory.qd, qd=trajectory.q))
+    factors, correlations = velocity_agreement(exchanged)
+    if correlations[k, k] > SIGNALS.agreement and abs(factors[k] - 1) < 0.5:
+        columns = {"q": mapping.column("qd", signals.joint), "qd": mapping.column("q", signals.joint)}
+        return Advice(f"{message}; q is the derivative of qd", {"columns": columns})
+    return message
+
+
+def find_held(signals: JointSignals) -> str | None:
+    """Find signals whose values are held over several rows."""
+    rate = signals.trajectory.sample_rate
+    for name in signals.measured:
+        often = held_samples(signals.signal(name))
+        if often > 1:
+            rates = f"{rate / often:.3g} times a second in rows at {rate:.3g} Hz"
+            return f"{name} that changes {rates}: each value lasts {often} samples"
+    return None
+
+
+def find_too_rare(signals: JointSignals) -> str | Advice | None:
+    """Find held signals from which no acceleration can be computed; arms under servos need none."""
+    rate = signals.trajectory.sample_rate
+    if signals.trajectory.u is not None or not shows_accelerations(rate):
+        return None
+    held = {name: held_samples(signals.signal(name)) for name in signals.measured}
+    message = find_held(signals)
+    if message is None or shows_accelerations(rate / max(held.values())):
+        return None
+    # positions that are new show the velocities
+    is_mended = all(often == 1 for name, often in held.items() if name != "qd")
+    return Advice(message, keys={"velocity": "differentiated"}) if is_mended else message
+
+
+def find_unsigned_velocity(signals: JointSignals) -> str | None:
+    """Find velocities that are the magnitude of dq/dt."""
+    # largest velocity of the rarer sign, relative to the largest velocity, of a signal without sign
+    trajectory, qd, share = signals.trajectory, signals.qd, 0.05
+    lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
+    # the velocity noise of a joint at rest has both signs
+    if trajectory.mapping.velocity == "differentiated" or lowest > share * highest or len(qd) < 3:
+        return None
+    speed = np.gradient(signals.q, trajectory.t)
+    backward, forward = sorted((-np.quantile(speed, 0.02), np.quantile(speed, 0.98)))
+    if backward < share * forward or abs(qd).std() == 0:
+        return None
+    if not np.corrcoef(np.abs(speed), np.abs(qd))[0, 1] > 0.9:
+        return None
+    return f"qd that is the magnitude of dq/dt: from {qd.min():.3g} to {qd.max():.3g} while q goes both ways"

@@ -1,0 +1,231 @@
+"""Networks whose outputs depend on their own joints only, and the encoding of positions that they depend on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from spelgen.runtime.parts import Intermediates, Layers, Rows
+from spelgen.runtime.rows import Joint, vector
+
+GRID = 4  # bumps on an edge
+SPACING = 2 / (GRID - 1)
+
+
+class JointEncoding(nn.Module):
+    """Two numbers per joint, (..., 2 n): first cos q of all joints, then sin q; prismatic: scaled q, 0."""
+
+    def __init__(self, joints: Sequence[Joint]) -> None:
+        super().__init__()
+        self.revolute = nn.Buffer(vector(joint.joint_type == "revolute" for joint in joints))
+        self.center = nn.Buffer(vector(joint.center for joint in joints))
+        # derivative of the scaled q with respect to q
+        self.slope = nn.Buffer((1 - self.revolute) / vector(joint.half_range for joint in joints))
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the encoding, (..., 2 n), of q (..., n) [rad, m]."""
+        scaled = self.slope * (q - self.center)
+        return torch.cat([torch.addcmul(scaled, self.revolute, q.cos()), self.revolute * q.sin()], dim=-1)
+
+    def jvp(self, encoded: Tensor, qd: Tensor) -> Tensor:
+        """Return the rate of the encoding, (..., 2 n), at the velocity qd."""
+        first, second = encoded.chunk(2, dim=-1)
+        return torch.cat([(self.slope - second) * qd, self.revolute * first * qd], dim=-1)
+
+    def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
+        """Return the derivative with respect to q, (..., n), from that with respect to the encoding."""
+        first, second = encoded.chunk(2, dim=-1)
+        by_first, by_second = cotangent.chunk(2, dim=-1)
+        return by_first * (self.slope - second) + by_second * self.revolute * first
+
+
+def hidden_units(outputs: Sequence[tuple[int, ...]], width: int, min_units: int) -> list[tuple[int, ...]]:
+    """Return the joints of each unit of a hidden layer.
+
+    Outputs that depend on the same joints form a group. The ``width`` units are divided among the groups in
+    proportion to their numbers of outputs, with at least ``min_units`` for each group.
+    """
+    counts = Counter(outputs)
+    groups = sorted(counts, key=lambda joints: (len(joints), joints))
+    ideal = [width * counts[group] / len(outputs) for group in groups]
+    units = [max(min_units, round(share)) for share in ideal]
+    index = range(len(groups))
+    # after rounding the sum may differ from the width: the largest differences are corrected first
+    while sum(units) > width and max(units) > min_units:
+        units[max(index, key=lambda k: units[k] - ideal[k] if units[k] > min_units else -width)] -= 1
+    while sum(units) < width:
+        units[max(index, key=lambda k: ideal[k] - units[k])] += 1
+    return [group for group, count in zip(groups, units, strict=True) for _ in range(count)]
+
+
+def joint_masks(
+    joints: Sequence[Joint],
+    scales: Rows,
+    outputs: Sequence[Sequence[str]],
+    width: int,
+    depth: int,
+    min_units: int,
+) -> Iterator[Tensor]:
+    """Yield the factors on the weights of each layer, (units, inputs).
+
+    A factor is 0 where the input depends on a joint that the unit must not depend on; the factors of the
+    first layer scale the inputs.
+
+    Args:
+        joints: of the arm.
+        scales: factors of the inputs, a row (n,) for each input per joint.
+        outputs: names of the joints that each output depends on.
+        width: units of a hidden layer.
+        depth: number of hidden layers.
+        min_units: smallest number of units for outputs that depend on the same joints.
+    """
+    number = {joint.name: index for index, joint in enumerate(joints)}
+    numbers = [tuple(number[name] for name in names) for names in outputs]
+    hidden = [hidden_units(numbers, width, min_units)] * depth
+    below = [{joint} for row in scales for joint in range(len(row))]
+    scale = torch.cat([vector(row) for row in scales])
+    for layer in [*hidden, numbers]:
+        units = [set(unit) for unit in layer]
+        yield scale * torch.stack([vector(lower <= unit for lower in below) for unit in units])
+        below, scale = units, torch.ones(len(units), dtype=torch.float64)
+
+
+class MaskedNetwork(nn.Module):
+    """A network whose outputs depend on their own joints only, with explicit derivatives.
+
+    Args:
+        generator: of the initial weights; the last layer starts at zero.
+        joints: of the arm.
+        scales: a row (n,) of factors for each input per joint: cos q or the scaled q, sin q, and others.
+        outputs: names of the joints that each output depends on; no unit has a path to another joint.
+        width, depth: units of a hidden layer, and number of hidden layers.
+        min_units: smallest number of units of a hidden layer for outputs that depend on the same joints.
+    """
+
+    points = 0  # grid points of the function on an edge; 0: a weight per edge
+
+    # offset + output_map y, (..., rows), at encoded positions, and the intermediates of its derivatives
+    forward: Callable[[Tensor, Layers], tuple[Tensor, Intermediates]]
+    vjp: Callable[[Intermediates, Tensor], Tensor]  # cotangent (..., rows) times d/d encoded: (..., inputs)
+    jvp: Callable[[Intermediates, Tensor], Tensor]  # d/d encoded times a tangent: (..., rows)
+
+    def __init__(
+        self,
+        generator: torch.Generator,
+        joints: Sequence[Joint],
+        *,
+        scales: Rows,
+        outputs: Sequence[Sequence[str]],
+        width: int = 64,
+        depth: int = 2,
+        min_units: int = 1,
+    ) -> None:
+        super().__init__()
+        slopes = torch.ones((), dtype=torch.float64)  # of the initial function of an edge, at the grid points
+        if self.points:
+            slopes = torch.linspace(-1, 1, self.points, dtype=torch.float64)
+            self.grid = nn.Buffer(slopes / SPACING)
+        masks = joint_masks(joints, scales, outputs, width, depth, min_units)
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for index, mask in enumerate(masks):
+            edges = mask.unsqueeze(-1) if self.points else mask
+            weight = torch.randn(edges.shape, dtype=torch.float64, generator=generator)
+            readable = (edges != 0).double().sum(dim=1, keepdim=True)
+            self.weights.append(nn.Parameter(weight * slopes / readable.sqrt()))
+            self.biases.append(nn.Parameter(torch.zeros(len(mask), dtype=torch.float64)))
+            self.register_buffer(f"mask{index}", edges)
+        nn.init.zeros_(self.weights[-1])  # so that the outputs start at zero
+
+    def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
+        """Return the masked layers of offset (rows,) + output_map (rows, outputs) y."""
+        weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
+        biases = list(self.biases)
+        weights[-1], biases[-1] = output_map @ weights[-1], offset + output_map @ biases[-1]
+        return tuple(zip(weights, biases, strict=True))
+
+
+class MaskedMLP(MaskedNetwork):
+    """A tanh network; arguments: see ``MaskedNetwork``."""
+
+    def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
+        """Return offset + output_map y, (..., rows), and the intermediates of ``vjp`` and ``jvp``."""
+        layer, hidden = encoded, []
+        for weight, bias in layers[:-1]:
+            layer = torch.tanh(F.linear(layer, weight, bias))
+            hidden.append(layer)
+        return F.linear(layer, *layers[-1]), (hidden, layers)
+
+    def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
+        """Return cotangent, (..., rows), times d/d encoded, by a reverse sweep; (..., inputs)."""
+        hidden, layers = intermediates
+        layer: Tensor = cotangent @ layers[-1][0]
+        for (weight, _), value in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
+            # layer * (1 - value^2) in one operation
+            layer = torch.ops.aten.tanh_backward(layer, value) @ weight
+        return layer
+
+    def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
+        """Return d/d encoded times a tangent, by a forward sweep; (..., rows)."""
+        hidden, layers = intermediates
+        for (weight, _), value in zip(layers[:-1], hidden, strict=True):
+            tangent = torch.ops.aten.tanh_backward(F.linear(tangent, weight), value)
+        return F.linear(tangent, layers[-1][0])
+
+
+class Bumps(NamedTuple):
+    """The inputs of a layer relative to the grid, (..., inputs, GRID)."""
+
+    distance: Tensor  # distance from each grid point, in grid spacings
+    height: Tensor
+
+
+class MaskedKAN(MaskedNetwork):
+    """A Kolmogorov-Arnold network; arguments: see ``MaskedNetwork``.
+
+    Each edge from an input to a unit has a learned function of its own: a sum of Gaussian bumps on
+    a grid over [-1, 1] (Li, arXiv 2405.06721, in place of the splines of Liu et al., arXiv
+    2404.19756). The initial functions are nearly linear with a random slope, because few samples do
+    not smooth a wavy one. tanh keeps the outputs of a layer within the grid.
+    """
+
+    points = GRID
+
+    def _bumps(self, value: Tensor) -> Bumps:
+        distance = (value / SPACING).unsqueeze(-1) - self.grid
+        return Bumps(distance, torch.exp(-distance * distance))
+
+    def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
+        """Return offset + output_map y, (..., rows), and the intermediates of ``vjp`` and ``jvp``."""
+        bumps, hidden = [self._bumps(encoded)], []
+        for weight, bias in layers[:-1]:
+            hidden.append(torch.tanh(F.linear(bumps[-1].height.flatten(-2), weight, bias)))
+            bumps.append(self._bumps(hidden[-1]))
+        return F.linear(bumps[-1].height.flatten(-2), *layers[-1]), (bumps, hidden, layers)
+
+    def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
+        """Return cotangent, (..., rows), times d/d encoded, by a reverse sweep; (..., inputs)."""
+        bumps, hidden, layers = intermediates
+        layer = self._bumps_vjp(bumps[-1], cotangent @ layers[-1][0])
+        for index in reversed(range(len(hidden))):
+            layer = layer * (1 - hidden[index] * hidden[index])
+            layer = self._bumps_vjp(bumps[index], layer @ layers[index][0])
+        return layer
+
+    def _bumps_vjp(self, bumps: Bumps, cotangent: Tensor) -> Tensor:
+        cotangent = cotangent.reshape(*cotangent.shape[:-1], *bumps.distance.shape[-2:])
+        return (-2 / SPACING) * (bumps.distance * bumps.height * cotangent).sum(dim=-1)
+
+    def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
+        """Return d/d encoded times a tangent, by a forward sweep; (..., rows)."""
+        bumps, hidden, layers = intermediates
+        for index, (weight, _) in enumerate(layers):
+            slopes = bumps[index].distance * bumps[index].height
+            tangent = F.linear((-2 / SPACING) * (slopes * tangent.unsqueeze(-1)).flatten(-2), weight)
+            if index < len(hidden):
+                tangent = tangent * (1 - hidden[index] * hidden[index])
+        return tangent
