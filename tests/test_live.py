@@ -200,6 +200,29 @@ def test_contacts_are_found_at_their_joint_with_their_force(arm, levels, run):
     assert np.linalg.norm(states[at].contact.force - force) < 0.25 * np.linalg.norm(force)
 
 
+def test_a_contact_is_reported_until_it_ends(arm, levels, run):
+    """The disturbance adapts to the contact, and is not removed from it."""
+    _model, log, _ = arm
+    acts, torque = (log.t >= 7.0) & (log.t < 9.0), 0.1 * EFFORT[1]
+    _, states = estimates(run, levels, log, log.tau - np.outer(acts, torque * (np.arange(6) == 1)))
+    touched = np.array([state.contact.touched for state in states])
+    assert touched[(log.t > 7.1) & acts, 1].all()
+    assert not touched[(log.t < 7.0) | (log.t > 9.3)].any()
+    found = np.array([state.contact.external_torque[1] for state in states])
+    np.testing.assert_allclose(found[(log.t > 7.3) & acts], torque, atol=0.2 * torque)
+
+
+def test_a_log_that_begins_in_motion_begins_without_a_contact(arm, levels, run):
+    model, log, qdd = arm
+    start = 300 + int(np.abs(qdd[300:1200]).sum(axis=1).argmax())
+    part = log[start : start + 200]
+    inertial = model.inverse_dynamics(*numbers(part.q[0], 0 * part.qd[0], qdd[start]))
+    still = model.inverse_dynamics(*numbers(part.q[0], 0 * part.qd[0], 0 * qdd[start]))
+    _, states = estimates(run, levels, part, part.tau)
+    assert ((inertial - still).abs().numpy() > states[50].contact.threshold).any()
+    assert not any(state.contact.touched.any() for state in states)
+
+
 def test_friction_drift_is_found(arm, levels, run):
     """Friction is 4 % larger, or smaller, than in the model; the prior standard deviation is 3 %."""
     model, log, _ = arm
