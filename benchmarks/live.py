@@ -30,12 +30,12 @@ from recordings import folder_of, panda_urdf
 
 import spelgen
 from spelgen.baselines.registry import arm_of_model
+from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.evaluation.torque import mean_nmse, predicted_torques
 from spelgen.fitting.fitted import Fit
-from spelgen.live.cross_validation import noise_levels
 from spelgen.live.estimator import torque_model
-from spelgen.live.momentum import load_torque
+from spelgen.live.levels import noise_levels
 from spelgen.live.noise import NoiseLevels
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples, is_moving
 from spelgen.logs.filtering import low_passed
@@ -79,8 +79,8 @@ class Case:
 
     def load(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Return the torque of a payload, (T, n)."""
-        motion = [torch.from_numpy(np.ascontiguousarray(x)) for x in (q, qd, qdd)]
-        return load_torque(torque_model(self.fit), *motion, torch.from_numpy(theta)).numpy()
+        # of the last body, with which the payload moves
+        return chain_regressor(torque_model(self.fit).chain, q, qd, qdd)[..., -10:] @ theta
 
     def loaded(self, log: Trajectory, theta: np.ndarray) -> np.ndarray:
         """Return the torques of a log with a payload, (T, n): accelerations are of the filtered velocities."""

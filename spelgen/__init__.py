@@ -69,7 +69,7 @@ _MODULES = {
     "dynamics.friction": "FrictionModel",
     "fitting.fit": "fit",
     "fitting.fitted": "Fit load_run",
-    "fitting.objective": "RunOptions",
+    "fitting.dataset": "RunOptions",
     "fitting.posterior": "Posterior",
     "settings.fits": "GaussianPrior TorqueFit MomentumFit Rollout",
     "evaluation.rollout": "rollout",

@@ -6,6 +6,14 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 
+# predictors in results, charts and tables
+MODEL = "model"  # the trained model
+CONSTANT_VELOCITY = "velocity stays constant"
+URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
+LEAST_SQUARES = "least squares"
+LEAST_SQUARES_WITH_MEMORY = "least squares with memory"
+LINEAR_SERVOS, DELAYED_COMMAND = "linear servo", "delayed command"
+
 
 @dataclass(frozen=True)
 class Units:
@@ -115,7 +123,7 @@ def short_name(name: str) -> str:
     """Return a name from a file for a line of a table: shortened, without control characters."""
     # line ends and tabs of a name would break the table
     line = " ".join(printable(name).split())
-    # a table of 80 columns has room for 36 characters beside its numbers
+    # a table of 80 columns has room for a name of 36 characters
     return f"{line[:33]}..." if len(line) > 36 else line or '""'
 
 
@@ -123,14 +131,6 @@ def thousandths(joint_types: Sequence[str]) -> str:
     """Return the unit of small distances of these joints: ``mrad``, ``mm`` or, for both types, ``mrad, mm``."""
     units = {"mm" if joint_type == "prismatic" else "mrad" for joint_type in joint_types}
     return ", ".join(sorted(units, reverse=True)) or "mrad, mm"
-
-
-MODEL = "model"  # the trained model
-CONSTANT_VELOCITY = "velocity stays constant"
-URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
-LEAST_SQUARES = "least squares"
-LEAST_SQUARES_WITH_MEMORY = "least squares with memory"
-LINEAR_SERVOS, DELAYED_COMMAND = "linear servo", "delayed command"
 
 
 def observed(predictor: str) -> str:

@@ -96,7 +96,7 @@ def _run_on_ray(
     remote: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_work_or_die)
     waiting = {remote.remote(work, task): task for task in tasks}
     try:
-        # in the order in which tasks end: a result is stored at once, whatever happens later
+        # in the order in which tasks end: each result is stored at once, and survives a later failure
         while waiting:
             (reference,), _ = ray.wait(list(waiting), num_returns=1)
             yield waiting.pop(reference), _outcome(reference)

@@ -25,7 +25,7 @@ _FOLDER = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1] / "te
 def _environment(autoescape: bool) -> Environment:
     return Environment(
         loader=FileSystemLoader(_FOLDER),
-        # a misspelt name would otherwise leave a gap in a page or in generated code
+        # a misspelt name would otherwise be an empty text in a page or in generated code
         undefined=StrictUndefined,
         autoescape=autoescape,
         trim_blocks=True,

@@ -61,7 +61,7 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Epochs of few windows take four steps, for tests of files, commands and messages of a fit."""
     from spelgen.fitting.tuning import FittingTuning
 
-    monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", FittingTuning(epoch_steps=4))
+    monkeypatch.setattr("spelgen.fitting.momentum_objective.TUNING", FittingTuning(epoch_steps=4))
 
 
 @pytest.fixture

@@ -63,7 +63,9 @@ def obeyed(arm, message: str):
     return load_arm(arm.robot.path)
 
 
-@pytest.mark.parametrize("part", [0.0, -0.12, 0.2])
+@pytest.mark.parametrize(
+    ("arm", "part"), [("rpr", 0.0), ("rpr", -0.12), ("rpr", 0.2), ("ur10e", -0.12)], indirect=["arm"]
+)
 def test_gravity_of_compensated_torques(arm, part):
     path = logged(arm, recorded(arm, 5, gravity=part))
     message = message_of(arm, path)
@@ -71,7 +73,9 @@ def test_gravity_of_compensated_torques(arm, part):
     assert "gravity" not in message_of(obeyed(arm, message), path)
 
 
-@pytest.mark.parametrize("factor", [1 / 0.003, 0.02])
+@pytest.mark.parametrize(
+    ("arm", "factor"), [("rpr", 1 / 0.003), ("rpr", 0.02), ("ur10e", 0.02)], indirect=["arm"]
+)
 def test_gain_of_torques_in_another_unit(arm, factor):
     path = logged(arm, recorded(arm, 6), tau=factor)
     message = message_of(arm, path)

@@ -11,8 +11,7 @@ from spelgen.cli.main import app
 from spelgen.emission.build import build
 from spelgen.emission.specify import generate
 from spelgen.errors import OptionError, SettingsError
-from spelgen.fitting.fit import fit
-from spelgen.fitting.objectives import FitOptions, choose_config
+from spelgen.fitting.fit import FitOptions, choose_config, fit
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
 from spelgen.settings.fits import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config

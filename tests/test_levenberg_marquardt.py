@@ -6,13 +6,13 @@ from itertools import pairwise
 import pytest
 import torch
 
+from spelgen.fitting.fit import OBJECTIVES
 from spelgen.fitting.levenberg_marquardt import (
     NormalEquations,
     Termination,
     initial_state,
     levenberg_marquardt,
 )
-from spelgen.fitting.objectives import OBJECTIVES
 from spelgen.settings.fits import CONFIGS
 
 

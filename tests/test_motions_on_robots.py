@@ -14,11 +14,10 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import ArmError, SettingsError
-from spelgen.excitation.approach import approach
+from spelgen.excitation.bounds import Box, Surroundings, motion_bounds
 from spelgen.excitation.collisions import Collisions
 from spelgen.excitation.design import excite
-from spelgen.excitation.surroundings import Box, Surroundings
-from spelgen.excitation.trajectory import Motion, motion_bounds
+from spelgen.excitation.trajectory import Motion, approach
 
 LENGTH, RADIUS, BASE = 0.5, 0.06, 0.2
 SPHERE = '<collision><origin xyz="0 0 {}"/><geometry><sphere radius="{}"/></geometry></collision>'

@@ -24,6 +24,7 @@ from spelgen.emission.specify import generate
 from spelgen.errors import ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
+from spelgen.fitting import momentum_objective
 from spelgen.fitting.dataset import Validation
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
@@ -31,7 +32,6 @@ from spelgen.fitting.process import locked
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
 from spelgen.fitting.tuning import FittingTuning
-from spelgen.fitting.window import momentum
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.report_page import render_report
@@ -56,7 +56,7 @@ def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
 def short_epochs():
     """Two steps per epoch: the files, and the times of writing, do not depend on the number of steps."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(momentum, "TUNING", FittingTuning(epoch_steps=2))
+        patch.setattr(momentum_objective, "TUNING", FittingTuning(epoch_steps=2))
         yield
 
 

@@ -16,6 +16,7 @@ from spelgen.evaluation.horizons import end_errors
 from spelgen.exporting.mjcf_export import mjcf_text
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.fitting.levenberg_marquardt import NormalEquations
+from spelgen.fitting.momentum_objective import MomentumObjective
 from spelgen.fitting.servo import laws
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.torque import jacobian as torque_jacobian
@@ -27,7 +28,6 @@ from spelgen.fitting.torque.linearization import append_target, bayesian_ridge
 from spelgen.fitting.torque.objective import fit_torques
 from spelgen.fitting.torque.selection import select_functions
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
-from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.identification.least_squares import deviations
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import Rollout, TorqueFit

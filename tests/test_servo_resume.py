@@ -28,7 +28,7 @@ def few_steps():
     """Outer iterations of two steps: that a resumed fit repeats the same bytes does not depend on their number."""
     with pytest.MonkeyPatch.context() as patch:
         for module in (objective, laws):
-            patch.setattr(module, "TUNING", replace(module.TUNING, steps=2))
+            patch.setattr(module, "TUNING", replace(module.TUNING, steps=2, joint_steps=2))
         yield
 
 

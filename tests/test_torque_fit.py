@@ -20,8 +20,7 @@ from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
 from spelgen.emission.specify import generate
 from spelgen.errors import LogError
-from spelgen.fitting.fit import fit
-from spelgen.fitting.objectives import default_objective
+from spelgen.fitting.fit import default_objective, fit
 from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
 from spelgen.fitting.torque.fit import fit_torque

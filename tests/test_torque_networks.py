@@ -4,7 +4,7 @@ import torch
 from emitted import NETWORKS, ROBOTS, built, import_source
 
 from spelgen.emission.specify import generate
-from spelgen.fitting.objectives import default_objective
+from spelgen.fitting.fit import default_objective
 from spelgen.fitting.torque import networks as torque_networks
 from spelgen.fitting.torque.networks import fit_networks
 from spelgen.fitting.torque.samples import TorqueSamples

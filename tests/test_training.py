@@ -23,9 +23,8 @@ from spelgen.emission.text import read_spec
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
-from spelgen.fitting.dataset import TrainingData, prepare_data
+from spelgen.fitting.dataset import FitRequest, TrainingData, prepare_data
 from spelgen.fitting.fit import RunOptions, fit
-from spelgen.fitting.objective import FitRequest
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import (
@@ -38,10 +37,10 @@ from spelgen.fitting.rollout import (
     roll_out,
     rollout_loss,
 )
+from spelgen.fitting.rollout_objective import RolloutObjective
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.train import train
 from spelgen.fitting.tuning import FittingTuning
-from spelgen.fitting.window.rollout import RolloutObjective
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
@@ -241,7 +240,7 @@ class Interrupted(TrainingProgress):
 def test_a_resumed_training_equals_an_uninterrupted_one(
     module, logs, tmp_path, monkeypatch, optimizer, steps
 ):
-    monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", FittingTuning(epoch_steps=steps))
+    monkeypatch.setattr("spelgen.fitting.momentum_objective.TUNING", FittingTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     train(module, [logs], straight, config)
@@ -287,7 +286,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(module, logs, tmp
         calls.append(torch.is_grad_enabled())
         return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
 
-    monkeypatch.setattr("spelgen.fitting.window.rollout.rollout_loss", blown_up_once)
+    monkeypatch.setattr("spelgen.fitting.rollout_objective.rollout_loss", blown_up_once)
     result = train(module, [logs], tmp_path / "run", QUICK)
     records = lines(tmp_path / "run")
     assert result.status == "finished"
@@ -303,7 +302,7 @@ def test_numbers_that_never_recover_end_the_run(module, logs, tmp_path, monkeypa
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss
 
-    monkeypatch.setattr("spelgen.fitting.window.rollout.rollout_loss", blown_up)
+    monkeypatch.setattr("spelgen.fitting.rollout_objective.rollout_loss", blown_up)
     with pytest.raises(RunError) as caught:
         train(module, [logs], tmp_path / "run", quick(optimizer=optimizer))
     assert str(caught.value) == (
@@ -444,15 +443,18 @@ def test_a_changed_urdf_stays_out_of_the_run(logs, tmp_path):
 
 
 def prepared(logs: Path) -> TrainingData:
-    return prepare_data(read_logs([logs], JOINTS), JOINTS, ("revolute", "revolute"), Preprocessing())
+    return prepare_data(request_of(logs, QUICK), 5, 1)
 
 
-def loop_of(logs: Path, config: Rollout) -> RolloutObjective:
-    request = FitRequest(
+def request_of(logs: Path, config: Rollout) -> FitRequest:
+    return FitRequest(
         Model(), read_logs([logs], JOINTS), config, Preprocessing(), 0.25, 0, None, RunOptions(),
         time.monotonic(), None,
     )  # fmt: skip
-    loop = RolloutObjective(request)
+
+
+def loop_of(logs: Path, config: Rollout) -> RolloutObjective:
+    loop = RolloutObjective(request_of(logs, config))
     loop.prepare()
     loop.begin()
     loop._start_clock()
@@ -558,7 +560,7 @@ def test_the_allowed_time_is_kept_within_an_epoch(logs, monkeypatch):
     """An epoch of a million steps of 20 ms would take hours: by a clock that only steps move."""
     now = [100.0]
     monkeypatch.setattr(
-        "spelgen.fitting.window.momentum.time", types.SimpleNamespace(monotonic=lambda: now[0])
+        "spelgen.fitting.momentum_objective.time", types.SimpleNamespace(monotonic=lambda: now[0])
     )
     run = MiniBatchAdamW.run
 

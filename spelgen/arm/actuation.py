@@ -4,8 +4,6 @@ Logs contain joint torques, or motor torques if the settings specify ``torque: m
 the couplings of wrists.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -109,6 +107,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
+    # G is known for coupled joints, and a gear of their own would count twice
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)

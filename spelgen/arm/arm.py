@@ -1,11 +1,10 @@
 """Robot -> Chain: the serial chain with exact geometry; links on fixed and locked joints are lumped into bodies."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import pi
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +13,6 @@ from spelgen.arm.placement import AngleRounding, Frame, Placement, TenVector
 from spelgen.arm.rational import (
     Matrix,
     Vector,
-    as_matrix,
-    as_vector,
     bounded,
     exact,
     rotation_from_rpy,
@@ -24,8 +21,7 @@ from spelgen.errors import ArmError, Diagnostic
 from spelgen.urdf.robot import JointType, Robot, UrdfJoint, UrdfLink
 
 
-@dataclass(frozen=True)
-class Coordinate:
+class Coordinate(NamedTuple):
     """A degree of freedom; limits as in the file (rad or m, N m or N, per second), None if absent."""
 
     name: str
@@ -101,8 +97,7 @@ class Chain:
         return all(body.inertia is not None and body.inertia[0] > 0 for body in self.bodies)
 
 
-@dataclass(frozen=True)
-class MovingJoint:
+class MovingJoint(NamedTuple):
     """A moving joint, the ``links`` with an inertial that move rigidly with it, and their body."""
 
     joint: UrdfJoint
@@ -110,8 +105,7 @@ class MovingJoint:
     body: Body
 
 
-@dataclass(frozen=True)
-class LumpedLinks:
+class LumpedLinks(NamedTuple):
     """Moving joints (the chain first), locked joints (fixed ones included), and the frames of all links by name."""
 
     moved: tuple[MovingJoint, ...]
@@ -216,8 +210,8 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
             coordinate=chain.names.index(followed.leader.name),
             multiplier=followed.multiplier,
             offset=float(followed.offset),
-            rotation=as_matrix(rotation),
-            translation=as_vector(translation),
+            rotation=tuple(map(tuple, rotation)),
+            translation=tuple(translation),
             inertia=_total(placement, links),
         )
         moved.append(MovingJoint(joint, links, body))
@@ -238,6 +232,7 @@ def _total(placement: Placement, links: Sequence[UrdfLink]) -> TenVector | None:
     if not tens:
         return None
     total = tens[0]
+    # bounded after each sum: of an untrusted file digits could grow with every link
     for ten in tens[1:]:
         total = tuple(bounded(a + b) for a, b in zip(total, ten, strict=True))
     return total

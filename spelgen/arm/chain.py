@@ -1,12 +1,10 @@
 """Robot -> the joints that are the coordinates of the arm, and the leaders of mimic joints."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
+from typing import NamedTuple
 
 from spelgen.arm.rational import bounded, exact
 from spelgen.errors import ArmError, Diagnostic, Severity, suggestion
@@ -16,8 +14,7 @@ from spelgen.urdf.robot import Robot, UrdfJoint
 _GRIPPER = re.compile(r"gripper|finger|thumb|knuckle|(?:^|[^a-z])jaws?(?:[^a-z]|$)", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class ChainChoice:
+class ChainChoice(NamedTuple):
     """The selected joints, root first, and diagnostics of the selection."""
 
     joints: tuple[UrdfJoint, ...]
@@ -29,8 +26,7 @@ class ChainChoice:
         return [joint.name for joint in self.joints]
 
 
-@dataclass(frozen=True)
-class Leader:
+class Leader(NamedTuple):
     """The leader of a joint, which is no mimic joint: q = multiplier * q_leader + offset."""
 
     leader: UrdfJoint

@@ -1,7 +1,5 @@
 """An arm from its URDF and its settings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,12 +5,11 @@ joints (a segment), and approximated by a rational matrix once: 45 degrees, a pr
 exactly 90, and every rotation is exactly orthogonal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from math import pi
+from typing import NamedTuple
 
 import numpy as np
 
@@ -115,8 +114,7 @@ def _text(values: Sequence[float] | np.ndarray) -> str:
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
+class Frame(NamedTuple):
     """The frame of a link at zero position in the frame of its body (-1: the root link).
 
     composed: float64 rotation (3, 3) in the frame of the last revolute body before the link. rotation: exact rotation

@@ -1,7 +1,5 @@
 """Exact rotations and vectors as arrays of fractions, and rational approximation of angles and rotations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -9,8 +7,8 @@ from math import atan2, cos, lcm, pi, sin, tan
 
 import numpy as np
 
-Vector = tuple[Fraction, Fraction, Fraction]
-Matrix = tuple[Vector, Vector, Vector]
+Vector = tuple[Fraction, ...]
+Matrix = tuple[Vector, ...]
 
 
 @dataclass(frozen=True)
@@ -206,15 +204,3 @@ def _rotation_of(quaternion: Sequence[Fraction]) -> np.ndarray:
     # R = 1 + (2 w [v]x + 2 [v]x [v]x) / (w^2 + v.v)
     turned: np.ndarray = IDENTITY + 2 * (w * cross + cross @ cross) * Fraction(1, w * w + v @ v)
     return turned
-
-
-def as_vector(values: np.ndarray) -> Vector:
-    """Return three fractions (3,) as a hashable tuple."""
-    x, y, z = values
-    return x, y, z
-
-
-def as_matrix(rows: np.ndarray) -> Matrix:
-    """Return nine fractions (3, 3) as hashable tuples."""
-    x, y, z = map(as_vector, rows)
-    return x, y, z

@@ -15,6 +15,7 @@ import numpy as np
 
 from spelgen.arm.arm import Chain
 from spelgen.arm.rational import IDENTITY, ZERO, turn_about
+from spelgen.urdf.robot import Assume
 
 
 def is_plain(arm: Chain) -> bool:
@@ -26,14 +27,18 @@ def is_plain(arm: Chain) -> bool:
 
 
 class Axes:
-    """Tests of the axes of the joints of a plain arm at every configuration; joints are counted from 0."""
+    """Tests of the axes of the joints of a plain arm at every configuration; joints are counted from 0.
 
-    def __init__(self, arm: Chain):
+    assume: see ``derive``. With ``kinematics`` the last body counts as neither centred nor balanced.
+    """
+
+    def __init__(self, arm: Chain, assume: Assume = "kinematics"):
         self.arm = arm
+        self.assume = assume
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
         generator = random.Random(0)  # reproducible reports
         # per configuration: directions (n, 3) and twists (n, 6) of the axes
-        # two are enough: each alone fails to refute with a probability of about the degree divided by 1e6
+        # two are enough: one accepts a false relation with a probability of about its degree divided by 1e6
         self._configurations = [_configuration(arm, generator) for _ in range(2)]
 
     def parallel(self, a: int, b: int) -> bool:
@@ -101,10 +106,10 @@ class Axes:
     @cached_property
     def _last_inertia(self) -> Sequence[Fraction]:
         body = self.arm.bodies[-1]
-        if body.inertia is not None and body.joint_type == "revolute":
+        if self.assume == "inertials" and body.inertia is not None and body.joint_type == "revolute":
             return body.inertia
-        # Balance is a property of rotations. For a prismatic joint, inertial parameters of one fail every test of
-        # balance.
+        # Balance is a property of rotations and of the values of the URDF. For a prismatic joint, and for any inertial
+        # values, inertial parameters of one fail every test of balance.
         return (Fraction(1),) * 10
 
     def is_weightless(self, joint: int) -> bool:

@@ -23,6 +23,8 @@ from spelgen.arm.arm import Chain
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.structure.recursion import base_denominators
 
+FLOAT_DIGITS = 17  # decimals that determine a double
+_FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at it
 Terms = dict[Expr, fmpq]
 """A linear combination of products of distances, cosines and sines, with nonzero coefficients."""
 
@@ -147,10 +149,6 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))
     return Add(*total)
-
-
-FLOAT_DIGITS = 17  # decimals that determine a double
-_FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at it
 
 
 def text(expression: Expr) -> str:

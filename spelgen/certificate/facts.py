@@ -18,7 +18,7 @@ from spelgen.labels import axes_in_words, entry_name, joints_in_words, listed
 from spelgen.structure.structure import MassEntry, Structure
 
 Reason = str | None
-EntryReason = Callable[[Axes, Structure, MassEntry], Reason]
+EntryReason = Callable[[Axes, MassEntry], Reason]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Fact:
 def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
     """Return the properties of M and V at all configurations, with simple geometric reasons if there are any."""
     # A mimic joint moves several bodies, for which the reasons about pairs of axes are not valid.
-    words = _Sentences(structure, Axes(arm) if is_plain(arm) else None)
+    words = _Sentences(structure, Axes(arm, structure.assume) if is_plain(arm) else None)
     zero = ("always zero", "Nothing is learned for it", "Nothing is learned for them")
     constant = ("constant", "It needs one parameter and no network", "They need parameters and no networks")
     return (
@@ -61,7 +61,7 @@ class _Sentences:
     axes: Axes | None
 
     def _reason(self, why: Callable[..., Reason], *subject: object) -> Reason:
-        return None if self.axes is None else why(self.axes, self.structure, *subject)
+        return None if self.axes is None else why(self.axes, *subject)
 
     def entries(
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
@@ -127,7 +127,7 @@ class _Sentences:
             yield Fact(f"V does not depend on {joints_in_words(group)}", means, reason)
 
 
-def zero_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
+def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
     """Return the reason for a zero entry."""
     later, earlier = entry.row, entry.column
     slider = later if axes.prismatic[later] else earlier
@@ -136,14 +136,14 @@ def zero_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | Non
         return f"{parallel}, and a rotation has no velocity along its axis"
     if axes.prismatic[later] and axes.prismatic[earlier] and axes.perpendicular(later, earlier):
         return f"prismatic joint {earlier + 1} is orthogonal to prismatic {{joints}}"
-    return balance_reason(axes, structure, entry)
+    return balance_reason(axes, entry)
 
 
-def constant_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
+def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
     """Return the reason for a constant entry."""
     later, earlier = entry.row, entry.column
     if later == earlier:
-        return _diagonal_reason(axes, structure, later)
+        return _diagonal_reason(axes, later)
     if axes.prismatic[later] and axes.prismatic[earlier] and axes.fixed_angle(later, earlier):
         return "both joints are prismatic, and the angle between their axes is constant"
     if axes.prismatic[later] and not axes.prismatic[earlier] and axes.keep_offset(later, earlier):
@@ -152,15 +152,15 @@ def constant_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str |
             f"{axes_in_words([earlier])} and is parallel to joint {later + 1}"
         )
     revolute = not axes.prismatic[later] and not axes.prismatic[earlier]
-    if revolute and axes.same_twist(later, earlier) and _diagonal_reason(axes, structure, later):
+    if revolute and axes.same_twist(later, earlier) and _diagonal_reason(axes, later):
         same = entry_name(later, later)
         if axes.opposed(later, earlier):
             same = f"-{same}"
         return f"{joints_in_words([earlier, later])} are coaxial, so it equals {same}"
-    return balance_reason(axes, structure, entry)
+    return balance_reason(axes, entry)
 
 
-def _diagonal_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
+def _diagonal_reason(axes: Axes, joint: int) -> Reason:
     # Joints before this one move its load as a rigid body: they do not change the inertia about its axis.
     behind = range(joint + 1, len(axes.prismatic))
     if axes.prismatic[joint]:
@@ -169,15 +169,15 @@ def _diagonal_reason(axes: Axes, structure: Structure, joint: int) -> str | None
         return f"joint {joint + 1} is the last and carries one rigid body"
     if all(axes.commute(joint, later) for later in behind):
         return f"all joints after joint {joint + 1} are coaxial revolute or parallel prismatic joints"
-    if len(behind) == 1 and structure.assume == "inertials" and axes.symmetric:
+    if len(behind) == 1 and axes.symmetric:
         return f"the inertia of the load of joint {joint + 2} is symmetric about its axis"
     return None
 
 
-def balance_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
+def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
     """Return the reason for an entry of a balanced last body: Izz times the cosine of the angle between the axes."""
-    last, earlier = len(structure.joints) - 1, entry.column
-    if structure.assume != "inertials" or not axes.balanced or entry.row != last:
+    last, earlier = len(axes.prismatic) - 1, entry.column
+    if not axes.balanced or entry.row != last:
         return None
     # Rotation about a principal axis through the centre of mass has angular momentum along this axis only.
     balanced = f"the load of joint {last + 1} is dynamically balanced"
@@ -192,7 +192,7 @@ def balance_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | 
     return None
 
 
-def equality_reason(axes: Axes, structure: Structure, entries: Sequence[tuple[int, int]]) -> str | None:
+def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
     """Return the reason for equal entries of a row: the joints of the columns move the load of the row equally."""
     # Entries of different rows belong to different loads: there is no simple reason.
     rows, columns = map(sorted, zip(*entries, strict=True))
@@ -202,8 +202,8 @@ def equality_reason(axes: Axes, structure: Structure, entries: Sequence[tuple[in
         if axes.prismatic[columns[0]]:
             return f"prismatic {joints_in_words(columns)} are parallel"
         return f"{joints_in_words(columns)} are coaxial"
-    last = len(structure.joints) - 1
-    if entries[0][0] == last and structure.assume == "inertials" and axes.balanced:
+    last = len(axes.prismatic) - 1
+    if entries[0][0] == last and axes.balanced:
         revolute = not any(axes.prismatic[column] for column in columns)
         if revolute and all(axes.parallel(columns[0], column) for column in columns[1:]):
             balanced = f"the load of joint {last + 1} is dynamically balanced"
@@ -211,7 +211,7 @@ def equality_reason(axes: Axes, structure: Structure, entries: Sequence[tuple[in
     return None
 
 
-def idle_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
+def idle_reason(axes: Axes, joint: int) -> Reason:
     """Return the reason for M not to depend on ``joint``."""
     if joint == 0:
         return "it moves the whole arm as one rigid body"
@@ -219,27 +219,27 @@ def idle_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
     nearer = list(range(joint))
     if all(axes.commute(joint, earlier) for earlier in nearer):
         return f"its motion commutes with {joints_in_words(nearer)}, as if it were the first joint"
-    if joint == len(axes.prismatic) - 1 and structure.assume == "inertials" and axes.symmetric:
+    if joint == len(axes.prismatic) - 1 and axes.symmetric:
         return "the inertia of its load is symmetric about its axis"
     return None
 
 
-def weightless_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
+def weightless_reason(axes: Axes, joint: int) -> Reason:
     """Return the reason for V not to depend on ``joint``."""
     if axes.is_weightless(joint):
         if axes.prismatic[joint]:
             return "gravity does no work in a translation orthogonal to it"
         return "gravity does no work in a rotation about an axis parallel to it"
     last = joint == len(axes.prismatic) - 1
-    if last and structure.assume == "inertials" and axes.centred:
+    if last and axes.centred:
         return "the centre of mass of its load is on its axis"
     return None
 
 
-def potential_reason(axes: Axes, structure: Structure) -> str | None:
+def potential_reason(axes: Axes) -> Reason:
     """Return the reason for V = 0."""
     if not any(axes.arm.gravity):
         return "gravity is zero"
-    if all(axes.is_weightless(joint) for joint in range(len(structure.joints))):
+    if all(axes.is_weightless(joint) for joint in range(len(axes.prismatic))):
         return "every axis is parallel to gravity if revolute, orthogonal to it if prismatic"
     return None

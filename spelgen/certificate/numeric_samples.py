@@ -28,6 +28,7 @@ from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.robot import Robot
 
 ENGINE = f"Pinocchio {pin.__version__}"
+TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True)
@@ -106,9 +107,6 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
     for body, inertia in zip(arm.bodies, parameters_of(factors @ factors.mT).tolist(), strict=True):
         bodies.append(replace(body, inertia=tuple(map(Fraction, inertia))))
     return replace(arm, bodies=tuple(bodies))
-
-
-TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def compare(
     name = target.stem + ("-logs" if data else "") + ("-ablation" if ablation else "")
     # the working folders of workers differ, so paths must be absolute
     folder = (output or Path("comparisons") / name).absolute()
-    # all cores: a comparison is seldom run beside other work
+    # all cores: a comparison takes hours on one
     parallel = jobs or default_jobs()
     # two simultaneous comparisons in one folder would overwrite each other's runs
     with locked(folder), termination_as_interrupt():

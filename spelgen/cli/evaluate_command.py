@@ -114,8 +114,8 @@ def estimate(
     """
     paths = options.logs(data, extra_logs)
     from spelgen.fitting.fitted import load_run
-    from spelgen.live.cross_validation import noise_levels
     from spelgen.live.estimator import torque_model
+    from spelgen.live.levels import noise_levels
     from spelgen.live.replay import replay
     from spelgen.logs.read import read_logs
     from spelgen.render.estimate_page import write_estimate

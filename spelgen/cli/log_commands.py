@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,46 +19,54 @@ from spelgen.labels import counted
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
 
-Acceleration = Annotated[
-    str | None, option("X|X,X,X", "Largest acceleration, of all joints or per joint [rad/s^2, m/s^2].")
-]
-Start = Annotated[
-    str | None,
-    option(
-        "X,X,X",
-        "Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
-        "--from",
-    ),
-]
-SurroundingsFile = Annotated[
-    Path | None, option("FILE.yaml", "Floor, boxes and clearance, which the motion respects.")
-]
-TrajectoryFile = Annotated[
-    Path | None,
-    option("FILE", "Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML."),
-]
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """The arguments of `spelgen.excite`, as options of a command."""
+
+    duration: Annotated[float, option("", "Duration [s].", min=2.0, max=600.0)] = 30.0
+    sample_rate: Annotated[float, option("", "Sample rate [Hz].", min=1.0, max=10000.0)] = 100.0
+    harmonics: Annotated[
+        int | None, option("", "Number of harmonics; default: 0.4 per second, at least 5.", min=2, max=100)
+    ] = None
+    reach: Annotated[float, option("", "Fraction of the position range to use.", min=0.05, max=1.0)] = 0.9
+    speed: Annotated[float, option("", "Fraction of the velocity limits to use.", min=0.05, max=1.0)] = 0.7
+    acceleration: Annotated[
+        str | None, option("X|X,X,X", "Largest acceleration, of all joints or per joint [rad/s^2, m/s^2].")
+    ] = None
+    start: Annotated[
+        str | None,
+        option(
+            "X,X,X",
+            "Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
+            "--from",
+        ),
+    ] = None
+    surroundings: Annotated[
+        Path | None, option("FILE.yaml", "Floor, boxes and clearance, which the motion respects.")
+    ] = None
+    trials: Annotated[int, option("", "Candidates of the search, after random ones.", min=1)] = 100
+    seed: Annotated[int, option("", "Seed of the search.", min=0)] = 0
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments, with numbers in place of text."""
+        acceleration = options.numbers(self.acceleration, "--acceleration")
+        return vars(self) | {"acceleration": acceleration, "start": options.numbers(self.start, "--from")}
 
 
+@options.grouped
 def excite(
     robot: options.Robot,
     output: Annotated[Path, output_option("FILE.csv", "Output file of the motion.")],
+    design: MotionOptions,
     joints: options.Joints = None,
     tip: options.Tip = None,
     angle_tolerance: options.AngleTolerance = 2e-3,
-    duration: Annotated[float, option("", "Duration [s].", min=2.0, max=600.0)] = 30.0,
-    sample_rate: Annotated[float, option("", "Sample rate [Hz].", min=1.0, max=10000.0)] = 100.0,
-    harmonics: Annotated[
-        int | None, option("", "Number of harmonics; default: 0.4 per second, at least 5.", min=2, max=100)
+    trajectory: Annotated[
+        Path | None,
+        option("FILE", "Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML."),
     ] = None,
-    reach: Annotated[float, option("", "Fraction of the position range to use.", min=0.05, max=1.0)] = 0.9,
-    speed: Annotated[float, option("", "Fraction of the velocity limits to use.", min=0.05, max=1.0)] = 0.7,
-    acceleration: Acceleration = None,
-    start: Start = None,
-    surroundings: SurroundingsFile = None,
-    trajectory: TrajectoryFile = None,
     html: Annotated[Path | None, option("FILE", "Also write a page that shows the motion.")] = None,
-    trials: Annotated[int, option("", "Candidates of the search, after random ones.", min=1)] = 100,
-    seed: Annotated[int, option("", "Seed of the search.", min=0)] = 0,
     force: options.Force = False,
     format: options.TextOrJson = "text",
 ) -> None:
@@ -73,20 +81,7 @@ def excite(
             options.require_free(path, force=force)  # checked first: the search takes minutes
     arm = options.load(robot, joints, tip, angle_tolerance)
     with progress_bar("searching") as progress:
-        motion = design_motion(
-            arm,
-            duration=duration,
-            sample_rate=sample_rate,
-            harmonics=harmonics,
-            reach=reach,
-            speed=speed,
-            acceleration=options.numbers(acceleration, "--acceleration"),
-            start=options.numbers(start, "--from"),
-            surroundings=surroundings,
-            trials=trials,
-            seed=seed,
-            progress=progress,
-        )
+        motion = design_motion(arm, progress=progress, **design.arguments())
     written = [str(write_text(output, motion.csv()))]
     # the CSV remains the main output: `simulate` and logs use it
     if trajectory is not None:

@@ -35,7 +35,7 @@ class Command(TyperCommand):
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""
-        # the help of typer has `PATH` beside each name, which is no more than the name states
+        # typer adds `PATH` to the name of each argument, which its metavar states already
         for parameter in self.params:
             if isinstance(parameter, TyperArgument):
                 vars(parameter)["display_type"] = lambda ctx: ""

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import csv
+import inspect
 import re
 from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args, get_type_hints
 
 import typer
 from typer.models import ArgumentInfo, OptionInfo
@@ -105,6 +108,35 @@ def write_result(format: str | None, output: Path | None, forms: Mapping[str, Ca
     deliver(forms[choose_format(format, output, forms)]() + "\n", output)
 
 
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command whose arguments of a dataclass are given as the options that its fields declare."""
+    parameters: list[inspect.Parameter] = []
+    groups: dict[str, type] = {}
+    declared = get_type_hints(command, include_extras=True)
+    for name, parameter in inspect.signature(command).parameters.items():
+        group = declared[name]
+        if not (isinstance(group, type) and is_dataclass(group)):
+            parameters.append(parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=group))
+            continue
+        groups[name], options = group, get_type_hints(group, include_extras=True)
+        for field in fields(group):
+            annotation, default = options[field.name], field.default
+            parameters.append(
+                inspect.Parameter(field.name, parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+            )
+
+    @wraps(command)
+    def run(**values: object) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
+        command(**values)
+
+    # typer reads both
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    vars(run)["__signature__"] = inspect.Signature(parameters)
+    return run
+
+
 def names(text: str | None) -> list[str] | None:
     """Return `a, b, "c, d"` as three names, and None as None."""
     if text is None:
@@ -137,7 +169,7 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
 
 def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
     """Return the paths of all options --data. Raises a usage error if there are none."""
-    # an option and not an argument, so that a forgotten --data is not taken for the name of a module
+    # an option and not an argument: logs and a module cannot be confused
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
     return [*data, *(extra_logs or [])]

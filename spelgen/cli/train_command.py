@@ -81,7 +81,7 @@ def train(
     # with --resume, the argument may be the run folder
     folder = output or _default_folder(module, source, resume=resume)
     spec = _specification(module, source, folder if resume else None)
-    # a resumed run keeps the settings of its record, not those of a file that may have changed since
+    # a resumed run keeps the settings of its record: the file of the robot may have changed
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
     start = resumed_run(folder, request) if resume else new_run(urdf, request)
     from spelgen.emission.specify import arm_of_spec
@@ -124,7 +124,7 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
 
     A new fit gets its own noise levels, an adapted run has the noise levels of its source.
     """
-    from spelgen.live.cross_validation import keep_levels, stored_levels
+    from spelgen.live.levels import keep_levels, stored_levels
     from spelgen.live.replay import carried_payload
 
     if source is None:
@@ -166,7 +166,7 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
         outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
     outcome += [] if posterior is None else [table.text() for table in posterior.listings]
     answer(format, record, *outcome, f"run folder: {folder}")
-    # as a shell does: a script must not take an interrupted fit for a finished one
+    # as a shell does: a script must distinguish an interrupted fit from a finished one
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)

@@ -17,7 +17,7 @@ from spelgen.settings.values import Count
 from spelgen.settings.yaml_document import explain
 
 if TYPE_CHECKING:
-    from spelgen.fitting.objectives import FitOptions
+    from spelgen.fitting.fit import FitOptions
     from spelgen.settings.log_mapping import LogMapping
 
 TIME_LIMIT = "max_minutes"
@@ -106,7 +106,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
 
 def new_run(urdf: Path | None, request: Request) -> Start:
     """Return the start of a new run: the command line takes precedence over the robot's settings."""
-    from spelgen.fitting.objectives import FitOptions
+    from spelgen.fitting.fit import FitOptions
     from spelgen.settings.settings import load_settings
 
     # without a URDF there is no settings file with defaults
@@ -123,7 +123,7 @@ def new_run(urdf: Path | None, request: Request) -> Start:
 
 def resumed_run(folder: Path, request: Request) -> Start:
     """Return the start of a resumed run: the command line takes precedence over the run's record."""
-    from spelgen.fitting.objectives import FitOptions
+    from spelgen.fitting.fit import FitOptions
     from spelgen.fitting.run_folder import RunFolder
 
     run = RunFolder(folder)

@@ -19,8 +19,7 @@ from spelgen.errors import RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.plain import record
 from spelgen.files import read_json, write_json
-from spelgen.fitting.fit import RunOptions, fit
-from spelgen.fitting.objectives import FitOptions
+from spelgen.fitting.fit import FitOptions, RunOptions, fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.tuning import TUNING as WINDOWS
 from spelgen.labels import MODEL, observed, thousandths

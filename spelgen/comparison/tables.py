@@ -169,7 +169,7 @@ def _losses(
         medians = _summary(figures, figure, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        # the ratio is what the paper states: absolute losses depend on its units and sampling
+        # the paper compares ratios: absolute losses depend on its units and sampling
         if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))

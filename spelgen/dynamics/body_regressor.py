@@ -29,6 +29,7 @@ def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 def quaternion(rotation: object) -> np.ndarray:
     """Return (w, x, y, z) of a rotation, (3, 3), w not negative."""
     matrix = np.array(rotation, dtype=float)
+    # scipy has (x, y, z, w)
     result: np.ndarray = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
     result[np.abs(result) < 1e-16] = 0.0  # rounding
     return result
@@ -94,6 +95,7 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     Khalil, IEEE T-RA 6:368, 1990).
     """
     n, inertial = len(motors), 10 * len(chain.parents)
+    # parameters that can always be regrouped come last, so that the conventional ones are kept
     order = [
         10 * body + INERTIAL_PARAMETERS.index(name) for body in range(inertial // 10) for name in BASE_ORDER
     ]

@@ -43,6 +43,7 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
     tensors = (model.friction.reach, motors_of(model), width)
+    # paths are computed by numpy in double precision, whatever the device of the model
     arrays = [x.detach().cpu().double().numpy() for x in tensors]
     return BristleReach(*arrays)
 
@@ -92,6 +93,7 @@ def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     steps = np.diff(path, axis=0, prepend=path[:1])
     # at rest, the direction of the last motion remains
     moving = np.where(steps != 0, np.arange(len(path))[:, None], 0)
+    # a running maximum of indices is the latest sample that moved
     direction = np.sign(np.take_along_axis(steps, np.maximum.accumulate(moving, axis=0), axis=0))
     turns = np.zeros(path.shape, dtype=bool)
     turns[1:] = direction[1:] * direction[:-1] < 0
@@ -107,6 +109,7 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
     """Return the direction (T, n) of dry friction without bristles at qd (T, n); None: its smoothing is unknown."""
     if bristles.smoothing_velocity is None:
         return None
+    # the same smooth sign as in `runtime.friction_laws`: another would be an error of friction
     speed = qd if bristles.motors is None else qd @ bristles.motors.T
     return np.asarray(speed / np.hypot(speed, bristles.smoothing_velocity))
 

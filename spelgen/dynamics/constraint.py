@@ -34,6 +34,7 @@ def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
             offset[row] += multiplier * mimic.offset
             multiplier *= mimic.multiplier
             leader = mimic.joint
+        # a locked joint keeps a row of zeros: it stays at zero
         if leader in columns:
             jacobian[row, columns[leader]] = multiplier
     return Constraint(tuple(moving), jacobian, offset)

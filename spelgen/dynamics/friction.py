@@ -71,6 +71,7 @@ def joint_friction(
 
     joints: of a URDF, or the coordinates of an arm. speeds: C, (n, n), see ``DriveFriction``.
     """
+    # settings replace <dynamics> as a whole: both describe the same losses
     losses = []
     for joint in joints:
         if joint.name in drives:
@@ -129,7 +130,7 @@ class FrictionModel:
         """
         motors = np.eye(qd.shape[-1]) if motors is None else motors
         effects = self._effects(qd @ motors.T, qdd @ motors.T, bent)
-        # The torque of drive j acts on joint i by C_ji.
+        # The torque of drive j acts on joint i by C_ji, as power is equal on both sides of the gears.
         columns: np.ndarray = effects[..., None, :, :] * motors.T[:, None]
         return columns.reshape(*qd.shape, -1)
 
@@ -156,4 +157,5 @@ class FrictionModel:
             effects.append(sign * np.exp(-((speed / 0.1) ** 2)))
         if self.polynomial:
             effects += [speed * np.abs(speed), speed**3]
+        # the order of `effects`
         return np.stack(effects, axis=-2)

@@ -1,13 +1,15 @@
-"""Group, unit and number of a model's trained parameters; removal of its residual terms."""
+"""Group, unit and number of a model's trained parameters; other parameters than its own; removal of residual terms."""
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.runtime.networks import MaskedMLP, MaskedNetwork
@@ -62,7 +64,10 @@ def parameters_of_kind(model: nn.Module, *kinds: str) -> tuple[str, ...]:
     return tuple(name for name, info in parameter_table(model).items() if info.kind in kinds)
 
 
-Model = TypeVar("Model")
+Model = TypeVar("Model", bound=nn.Module)
+Result = TypeVar("Result")
+NamedTensors = Mapping[str, Tensor]
+"""Tensors by the names of a model's parameters and buffers."""
 
 
 def idle_residuals(model: object) -> list[str]:
@@ -70,6 +75,7 @@ def idle_residuals(model: object) -> list[str]:
     terms = residual_terms(model)
     if terms is None:
         return []
+    # of single joints; hidden layers of networks are never zero
     idle = [name for name, weights in terms.named_parameters(recurse=False) if not weights.any()]
     for prefix, network in (("mass", terms.mass), ("potential", terms.potential)):
         if _is_idle(network):
@@ -99,6 +105,7 @@ def without_idle_residuals(model: Model) -> Model:
         terms = reduced.residuals
         terms.mass = None if _is_idle(terms.mass) else terms.mass
         terms.potential = None if _is_idle(terms.potential) else terms.potential
+        # without any term, the factor on friction is one and needs no evaluation either
         if not any(bool(weights.any()) for weights in terms.parameters()):
             reduced.residuals = None
     return reduced
@@ -126,3 +133,24 @@ def friction_factor(model: object, q: Tensor) -> Tensor:
     if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.ones_like(q)
     return model.residuals.at(q, model.prepare().residual).friction
+
+
+class _Caller(nn.Module):
+    """Module whose `forward` applies any function to a model, since `functional_call` calls only `forward`."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, function: Callable[..., Result]) -> Result:
+        return function(self.model)
+
+
+def evaluate_with(model: Model, parameters: NamedTensors, function: Callable[[Model], Result]) -> Result:
+    """Return function(model) with other parameters than its own, as a differentiable function of these parameters.
+
+    All other parameters of the model keep their values.
+    """
+    named = {f"model.{name}": tensor for name, tensor in parameters.items()}
+    result: Result = functional_call(_Caller(model), named, (function,))
+    return result

@@ -49,6 +49,7 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
             errors.append(ArmError(got, element=f"joint {body.name!r}", expected=expected, do=do))
     collect(errors)
     model = kinematic_model(arm)
+    # index 0 is Pinocchio's universe
     for index, body in enumerate(arm.bodies, start=1):
         model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
     # a mimic joint has no motor of its own
@@ -63,6 +64,7 @@ def kinematic_model(arm: Chain) -> pin.Model:
     model.name = arm.name
     model.gravity.linear = np.array(arm.gravity, dtype=float)
     for body in arm.bodies:
+        # frames of bodies have their joint's axis as z, so that two types of joints are enough
         joint = pin.JointModelPZ() if body.joint_type == "prismatic" else pin.JointModelRZ()
         placement = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
         model.addJoint(body.parent + 1, joint, placement, body.name)

@@ -29,6 +29,7 @@ def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
     @wraps(method)
     def on_arrays(self: PinocchioDynamics, *states: Any) -> object:
         first = states[0]
+        # a single state is a call of an integrator: broadcasting would take longer than the dynamics
         if isinstance(first, np.ndarray) and first.ndim == 1:
             return method(self, *states)
         result = method(self, *np.broadcast_arrays(*map(np.asarray, states)))
@@ -107,6 +108,7 @@ class PinocchioDynamics:
         speeds, rates = qd @ self.jacobian.T, qdd @ self.jacobian.T
         torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
         torque = torque + self.friction(qd)
+        # the zero row of a passive joint would make G singular
         passive = np.diag(~self.inputs.any(axis=1))
         return np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
 
@@ -143,6 +145,7 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     cannot read the file.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
+    # Pinocchio's own reading of the file is an independent reference for the chain of spelgen
     model = pin.buildModelFromXML(urdf_bytes(urdf).decode(errors="replace"))
     model.gravity.linear = np.array(settings.gravity)
     constraint = mimic_constraint(robot, joints)

@@ -102,6 +102,7 @@ class PreparedModel:
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
+            # velocities in place of momenta: control loops measure velocities
             q, qd, z, _ = runge_kutta(self._model, rhs, q, qd, z, dt / substeps)
         return State(q, qd, z)
 
@@ -182,5 +183,6 @@ def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: 
     # torch 2.13: vmap of a derivative of linalg.solve is wrong in forward mode, or without autograd
     with torch.inference_mode(False), torch.enable_grad():
         jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
+        # clones: tensors of inference mode cannot be differentiated
         derivatives: tuple[Tensor, ...] = jacobian(*(x.clone() for x in states))
     return derivatives

@@ -98,6 +98,7 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
     z: initial state, (W, n, elements); None: of joints that have moved at the first qd for a long time.
     """
     states = [sliding_memory(dynamics, qd[:, 0]) if z is None else z]
+    # the state after a sample depends on the state before it: no batch over samples
     for moved in q.diff(dim=1).unbind(1):
         states.append(memory_after(dynamics, states[-1], moved))
     return torch.stack(states, dim=1)
@@ -121,6 +122,7 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
+        # the state of friction is passed through: rollouts ask these dynamics for it
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements

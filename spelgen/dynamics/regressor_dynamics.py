@@ -43,7 +43,7 @@ def urdf_parameters(arm: Chain) -> np.ndarray:
     return np.array([body.inertia or (0,) * 10 for body in arm.bodies], dtype=float).ravel()
 
 
-def _row(values: tuple[object, object, object]) -> Row:
+def _row(values: tuple[object, ...]) -> Row:
     return tuple(map(float, values))  # type: ignore[arg-type]
 
 
@@ -64,6 +64,7 @@ class RegressorDynamics:
         drives: Drives | None = None,
         bristle_reach: np.ndarray | None = None,
     ) -> None:
+        # parameters by least squares may be inconsistent: a Cholesky factor, as in the models, may not exist
         self.chain, self.friction = body_chain(arm), friction
         by_body = torch.from_numpy(parameters).double().reshape(-1, 10)
         self.inertia = torch.block_diag(*pseudo_inertia(by_body))
@@ -99,6 +100,7 @@ class RegressorDynamics:
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
         """Return the frames of the bodies, and their momenta per joint velocity, (..., n, 12 bodies)."""
+        # the columns of frames in place of points: M is linear in the pseudo-inertias between them
         chain = self.chain.forward(q, torch.eye(len(self.inertia)).to(q))
         jacobian = torch.unflatten(self.chain.ratios.mT @ chain.jacobian, -1, (3, -1))
         return chain, (jacobian @ self.inertia).flatten(-2)

@@ -139,6 +139,7 @@ def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt
         state, previous_bias = None, None
         for now, interval in zip(commands.unbind(1), dt.unbind(1), strict=True):
             pose = model.configuration(q, prepared)
+            # once per interval: M and gravity change slowly between samples, springs and friction do not
             bias = middle_bias = model.nonlinear_effects(pose, qd)
             # extrapolated to the middle of the interval: the bias is known at its start only
             if previous_bias is not None:

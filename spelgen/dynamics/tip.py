@@ -27,6 +27,7 @@ class TipKinematics:
     def __init__(self, robot: Robot, joints: Sequence[str], link: str) -> None:
         self.link = link
         path = robot.path_to(link)
+        # a chain of pytorch-kinematics has one type of numbers: both are made, as `q` decides
         self._chains = {
             dtype: _serial_chain(robot.root, path, dtype) for dtype in (torch.float64, torch.float32)
         }
@@ -34,6 +35,7 @@ class TipKinematics:
         rows = [constraint.names.index(joint.name) for joint in path if joint.moves]
         self._jacobian = torch.from_numpy(constraint.jacobian[rows])  # (joints of the path, n)
         self._offset = torch.from_numpy(constraint.offset[rows])
+        # a joint that does not move the link is a mistake of the caller, not a zero column
         missing = [name for name, column in zip(joints, self._jacobian.T, strict=True) if not column.any()]
         if missing:
             raise ValueError(f"the joints {', '.join(missing)} do not lead to {link}")

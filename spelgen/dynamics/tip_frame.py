@@ -30,6 +30,7 @@ def tip_frame(loaded: Arm) -> Tip:
     """Return the frame of the tip link, with the unrounded angles of the URDF."""
     names = loaded.chain.joint_names
     link = loaded.tip or last_link(loaded.robot, names)
+    # rounded angles would move the tip by up to the tolerance times the extent of the arm
     bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
     return Tip(link, *link_poses(loaded)[link], bodies)
 

@@ -59,6 +59,7 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
     # In place of the function that the text of a module defines: the same operations in the same order.
     names["mass_entries"] = MassEntries(entry_sums(spec))
     try:
+        # the rows first: calls refer to them by name
         for name, rows in assembly.rows.items():
             names[name] = tuple(_value(row, names) for row in rows)
         arguments = {str(name): _value(item, names) for name, item in assembly.model.arguments}
@@ -100,6 +101,7 @@ class MassEntries:
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
     """Return the linear combination of terms (...,) in the order of the module, with the same rounding errors."""
+    # subtractions, not sums of negative products: the module is written so
     total: Tensor | float = 0
     for position, (factor, index) in enumerate(sums):
         term = terms[index] if abs(factor) == 1 else abs(factor) * terms[index]
@@ -127,4 +129,4 @@ def _value(item: object, names: dict[str, object]) -> object:
         return item
     positional = [_value(value, names) for name, value in item.arguments if name is None]
     keywords = {name: _value(value, names) for name, value in item.arguments if name is not None}
-    return dict(**keywords) if item.callee == "dict" else vars(runtime)[item.callee](*positional, **keywords)
+    return vars(runtime)[item.callee](*positional, **keywords)

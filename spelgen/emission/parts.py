@@ -28,15 +28,9 @@ class ModelParts:
     rows: dict[str, tuple[Call, ...]]
     model: Call
 
-    @property
-    def uses_networks(self) -> bool:
-        """Whether the model has networks with random initial weights."""
-        return _names(self.model, GENERATOR)
-
-    @property
-    def uses_mass_entries(self) -> bool:
-        """Whether M is a linear combination of functions and constants."""
-        return _names(self.model, MASS_ENTRIES)
+    def uses(self, name: Code) -> bool:
+        """Return True if the call refers to a name, for example to ``generator`` if the model has networks."""
+        return _names(self.model, name)
 
 
 def model_parts(spec: ModelSpec) -> ModelParts:
@@ -152,8 +146,7 @@ def _friction_laws(spec: ModelSpec) -> Call:
     if spec.design.memory == "none":
         return call("SlidingFriction", JOINTS)
     # of the types of the arm's joints, in the order of the table
-    types = [name for name in BREAKAWAY if name in spec.joint_types]
-    breakaway = call("dict", **{name: BREAKAWAY[name] for name in types})
+    breakaway = {name: row for name, row in BREAKAWAY.items() if name in spec.joint_types}
     rounding = {"stribeck_rounding": SERVO_STRIBECK_ROUNDING} if spec.servos else {}
     return call("FrictionLaws", JOINTS, breakaway=breakaway, **rounding)
 
@@ -201,6 +194,7 @@ def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
 
 
 def _potential(spec: ModelSpec) -> Call:
+    # cos q and sin q of a joint have the same scale
     scales = (tuple(joint.potential_sensitivity for joint in spec.joints),) * 2
     # V is one output, M has many: a part of the units is enough.
     width = max(TUNING.min_units, round(TUNING.potential_fraction * units(spec)))
@@ -217,6 +211,7 @@ def _friction(spec: ModelSpec) -> Call:
         width = TUNING.friction_units * n
         network = _network(spec, outputs, (scale, scale, speeds, ones), width=width, depth=1)
         return call("JointFriction", JOINTS, network=network)
+    # only one of the three axes of a joint moves, the others are part of the published model
     axes = 3 if spec.design.dissipation == "dense-3n" else 1
     rows = axes * n
     network = _network(spec, (spec.joint_names,) * (rows * (rows + 1) // 2), (scale, scale, ones))
@@ -270,6 +265,7 @@ def entry_sums(spec: ModelSpec) -> list[list[Sums]]:
     for index, term in enumerate(terms):
         for row, column, factor in term.basis:
             cells[row, column].append((factor, index))
+    # no entry starts with a minus where another order has none
     ordered = {entry: sorted(sums, key=lambda term: term[0] < 0) for entry, sums in cells.items()}
     return [[ordered.get((row, column), []) for column in range(row + 1)] for row in range(len(spec.joints))]
 

@@ -128,14 +128,18 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
 
 
 def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings) -> JointSpec:
+    # networks see the range in which the joint works, also if the file has no limits
     low, high = working_range(coordinate)
-    lower, upper, speed = coordinate.lower, coordinate.upper, coordinate.velocity
-    if coordinate.continuous:
-        lower = upper = None
-    lower, upper = (None if x is None or not isfinite(x) else rounded(x) for x in (lower, upper))
-    # Exporters write 0 or 1e16 for an unknown speed.
-    if not speed or speed > TUNING.largest_speed:
-        speed = TUNING.angular_speed if coordinate.joint_type == "revolute" else TUNING.linear_speed
+    limits = (None, None) if coordinate.continuous else (coordinate.lower, coordinate.upper)
+    lower, upper = (None if x is None or not isfinite(x) else rounded(x) for x in limits)
+    effort = _plausible(coordinate.effort, TUNING.largest_effort)
+    speed = _plausible(coordinate.velocity, TUNING.largest_speed)
+    # Without data, the full effort accelerates the armature to full speed in ``rise`` seconds.
+    armature = TUNING.rise * effort / speed if effort and speed else 0.0
+    # The torque of a wrist may be negligible, but the friction of its gear is similar to the friction of other gears.
+    torque = max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
+    friction = TUNING.friction_of_effort * effort if effort else TUNING.friction_of_torque * torque
+    default_speed = TUNING.angular_speed if coordinate.joint_type == "revolute" else TUNING.linear_speed
     return JointSpec(
         name=coordinate.name,
         joint_type=coordinate.joint_type,
@@ -143,9 +147,9 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
         upper=upper,
         center=rounded((low + high) / 2),
         half_range=rounded((high - low) / 2),
-        speed=speed,
-        friction=rounded(_friction(coordinate, sizes, index), 3),
-        armature=rounded(drive.armature or _guessed_armature(coordinate), 3),
+        speed=speed or default_speed,
+        friction=rounded(friction, 3),
+        armature=rounded(drive.armature or armature, 3),
         gear=drive.gear,
         mass_sensitivity=sizes.mass_sensitivities[index],
         potential_sensitivity=sizes.potential_sensitivities[index],
@@ -154,30 +158,15 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
 
 def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
     """Return the servo of a joint; an unknown servo has its full effort at half a unit from its command."""
-    effort = coordinate.effort
-    if not effort or effort > TUNING.largest_effort:
-        effort = None
+    effort = _plausible(coordinate.effort, TUNING.largest_effort)
+    # a known gain is constant, a guessed one is trained
     kp = drive.kp or rounded((effort or TUNING.servo_effort) / TUNING.full_effort_at, 3)
     return ServoSpec(kp, drive.kp is not None, rounded(TUNING.servo_lag * kp, 3), effort)
 
 
-def _guessed_armature(coordinate: Coordinate) -> float:
-    """Return an estimate of the armature: the full effort accelerates it to full speed in ``rise`` seconds."""
-    effort, speed = coordinate.effort, coordinate.velocity
-    if not effort or not speed or effort > TUNING.largest_effort or speed > TUNING.largest_speed:
-        return 0.0
-    return TUNING.rise * effort / speed
-
-
-def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
-    """Return the initial friction torque [Nm, N].
-
-    It is a fraction of the effort in the URDF if plausible, else of the torque of the nominal arm.
-    """
-    if coordinate.effort and coordinate.effort <= TUNING.largest_effort:
-        return TUNING.friction_of_effort * coordinate.effort
-    # The torque of a wrist may be negligible, but the friction of its gear is similar to the friction of other gears.
-    return TUNING.friction_of_torque * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
+def _plausible(limit: float | None, largest: float) -> float | None:
+    """Return a limit of the URDF; None for a placeholder: exporters write 0 or 1e16 for an unknown limit."""
+    return limit if limit and limit <= largest else None
 
 
 def _with_armature(joints: Sequence[JointSpec], mass: np.ndarray) -> list[JointSpec]:

@@ -37,8 +37,10 @@ def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
     if indent + len(text) + reserved < WIDTH or not _items(value) or _alike(value):
         return text
     inner = " " * (indent + _STEP)
-    opening, closing = "{}" if _is_dict(value) else "()"
-    lines = [f"{start}{_callee(value)}{opening}", inner]
+    opening, closing = "{}" if isinstance(value, dict) else "()"
+    callee = value.callee if isinstance(value, Call) else ""
+    # as many items per line as fit: matrices stay readable as rows
+    lines = [f"{start}{callee}{opening}", inner]
     for key, item in _items(value):
         text = f"{filled(key, item, indent + _STEP)},"
         line = lines[-1]
@@ -68,7 +70,7 @@ def flat(value: object) -> str:
         if _alike(value):
             return f"({flat(value[0])},) * {len(value)}"
         return f"({flat(value[0])},)" if len(value) == 1 else f"({_joined(value)})"
-    if _is_dict(value):
+    if isinstance(value, dict):
         return "{" + _joined(value) + "}"
     return f"{value.callee}({_joined(value)})" if isinstance(value, Call) else repr(value)
 
@@ -78,20 +80,12 @@ def _escaped(text: str) -> str:
     return '"' + "".join(rf"\U{ord(x):08x}" if not x.isascii() else json.dumps(x)[1:-1] for x in text) + '"'
 
 
-def _is_dict(value: object) -> bool:
-    return isinstance(value, Call) and value.callee == "dict"
-
-
-def _callee(value: object) -> str:
-    return value.callee if isinstance(value, Call) and not _is_dict(value) else ""
-
-
 def _items(value: object) -> list[tuple[str, object]]:
-    """Return the items of a call or a tuple, each with the text before it; none of other values."""
+    """Return the items of a call, a dictionary or a tuple, each with the text before it; none of other values."""
     if isinstance(value, Call):
-        end = ": " if _is_dict(value) else "="
-        keys = [(flat(key) if _is_dict(value) else key, item) for key, item in value.arguments]
-        return [(f"{key}{end}" if key else "", item) for key, item in keys]
+        return [(f"{key}=" if key else "", item) for key, item in value.arguments]
+    if isinstance(value, dict):
+        return [(f"{flat(key)}: ", item) for key, item in value.items()]
     return [("", item) for item in value] if isinstance(value, tuple) else []
 
 

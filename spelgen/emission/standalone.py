@@ -82,6 +82,7 @@ def load_runtime() -> Runtime:
         for path in (files("spelgen") / "runtime").iterdir()
         if path.name.endswith(".py")
     }
+    # sorted: the order of files differs between file systems, and the text of a module must not
     trees = {name: ast.parse(texts[name]) for name in sorted(texts)}
     public = [alias.name for node in _imported(trees.pop("__init__")) for alias in node.names]
     order: TopologicalSorter[str] = TopologicalSorter()

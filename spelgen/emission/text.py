@@ -12,16 +12,23 @@ import re
 from pathlib import Path
 from textwrap import fill, wrap
 
-from spelgen.emission.parts import ModelParts, Sums, entry_sums, model_parts, term_names
+from spelgen.emission.parts import (
+    GENERATOR,
+    MASS_ENTRIES,
+    ModelParts,
+    Sums,
+    entry_sums,
+    model_parts,
+    term_names,
+)
 from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call
 from spelgen.emission.standalone import bundle, load_runtime
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
-from spelgen.labels import counted, entry_name, joint_ranges, joints_in_ranges
+from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
 from spelgen.spec import ModelSpec, spec_from_json
 from spelgen.templates import render
 
-_UNITS = {"revolute": ("rad", "Nm"), "prismatic": ("m", "N")}
 _COMMENTS = {
     "JOINTS": ["Positions [rad, m], speed [rad/s, m/s], friction [Nm, N], armature [kg m^2, kg]."],
     "LINKS": [
@@ -58,7 +65,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
         "model.py.jinja",
         base=assembly.model.callee,
         summary=class_summary(spec),
-        has_networks=assembly.uses_networks,
+        has_networks=assembly.uses(GENERATOR),
         call=listed_call("super().__init__", Call("", assembly.model.arguments), 8) + SKIP,
     )
     title = f"Port-Hamiltonian model of an arm with {counted(len(spec.joints), 'joint')}, by `spelgen build`."
@@ -69,7 +76,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     used = set(re.findall(r"\w+", f"{arm}\n{model}")) & load_runtime().public
     # As ruff sorts members: classes first.
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
-    return render("module.py.jinja", names=ordered, has_tensor=assembly.uses_mass_entries, **context)
+    return render("module.py.jinja", names=ordered, has_tensor=assembly.uses(MASS_ENTRIES), **context)
 
 
 def class_summary(spec: ModelSpec) -> str:
@@ -144,8 +151,9 @@ def _joint_table(spec: ModelSpec) -> str:
         limits = "unlimited"
         if joint.lower is not None and joint.upper is not None:
             limits = f"{joint.lower:g} .. {joint.upper:g}"
-        unit, torque = _UNITS[joint.joint_type]
-        lines.append(f"    {number:2}  {name.ljust(width)}  {joint.joint_type:9}  {limits} {unit}, {torque}")
+        units = UNITS[joint.joint_type]
+        quantities = f"{limits} {units.position}, {units.torque}"
+        lines.append(f"    {number:2}  {name.ljust(width)}  {joint.joint_type:9}  {quantities}")
     return "\n".join(lines)
 
 
@@ -184,7 +192,7 @@ def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
 
 def _mass_entries(spec: ModelSpec, assembly: ModelParts) -> str:
     """Return the function that makes M from its functions and constants; empty if M is made in another way."""
-    if not assembly.uses_mass_entries:
+    if not assembly.uses(MASS_ENTRIES):
         return ""
     names = term_names(spec)
     arguments = ", ".join(f"{name}: Tensor" for name in names)
@@ -205,8 +213,7 @@ def _mass_entries(spec: ModelSpec, assembly: ModelParts) -> str:
         rows.append(f"[{', '.join(texts)}]")
     end = f"    return symmetric({', '.join(rows)})"
     if len(end) > WIDTH:
-        lines = [f"        {row}," for row in rows]
-        end = "\n".join(["    return symmetric(", *lines, f"    ){SKIP}"])
+        end = "\n".join(["    return symmetric(", *(f"        {row}," for row in rows), f"    ){SKIP}"])
     return "\n".join([start, about, *body, end])
 
 
@@ -247,25 +254,27 @@ def read_spec(path: Path | str) -> ModelSpec:
 
 def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
     """Return the specification in the text of a module, which may be edited. Raises ModuleError."""
+    values = {}
     try:
         for node in ast.parse(text).body:
             if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
-                names = [target.id for target in node.targets if isinstance(target, ast.Name)]
-                if names == ["FACTS"]:
-                    raise ModuleError(
-                        "a module of an earlier version of spelgen", file=file, expected=_EXPECTED,
-                        do="build it again with `spelgen build`, and train it again",
-                    )  # fmt: skip
-                if names == ["SPEC"]:
-                    return spec_from_json(str(node.value.value), file)
+                values[ast.unparse(node.targets[0])] = node.value.value
     except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
         raise _no_module(problem, file) from None
-    raise _no_module(None, file)
+    if "FACTS" in values:
+        raise ModuleError(
+            "a module of an earlier version of spelgen", file=file, expected=_EXPECTED,
+            do="build it again with `spelgen build`, and train it again",
+        )  # fmt: skip
+    if "SPEC" not in values:
+        raise _no_module(None, file)
+    return spec_from_json(str(values["SPEC"]), file)
 
 
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
     """Return the specification in the text of a module. Raises ModuleError if the text differs from its module."""
     spec = parse_spec(text, file)
+    # the whole text is compared: an edit anywhere would be lost without a word
     if text in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         return spec
     raise ModuleError(

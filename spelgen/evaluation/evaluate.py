@@ -142,7 +142,7 @@ def _evaluate_torques(
     pieces = used.pieces(logs, shortest=2)
     tests = EvaluatedLogs(pieces, samples, used, tested.reach, tested.model.joint_types)
     lengths = horizon_lengths(tests, *ahead, notes)
-    # windows as long as in training: on longer ones errors of the dynamics would hide those of the integrator
+    # windows as long as in training: on longer ones errors of the dynamics would hide errors of the integrator
     probe = tests.windows(tested.window - 1, TUNING.probed_model_windows)
     # residual terms that were not selected only cost time
     model = without_idle_residuals(tested.model)

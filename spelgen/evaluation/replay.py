@@ -53,7 +53,7 @@ class ServoModel:
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the positions per part, (K, n). All parts run in one batch, in which shorter ones are padded."""
-        # one number for all parts, as they are one batch; more steps than needed only cost time
+        # one number for all parts, which form one batch; more steps than needed only cost time
         steps = max(steps_between(log) for log, _ in parts)
         lengths = [rows.stop - rows.start - 1 for _, rows in parts]
         commands, intervals = [], []

@@ -60,7 +60,7 @@ def verdict(
     identified: content of least_squares.json, for the coverage of the training logs. limits: of the joints.
     independent: names of joints on whose position the dynamics do not depend, as of a vertical first axis.
     """
-    # each assessment adds its uses: a sentence about the model is made of what the logs show
+    # each assessment adds the uses that its figures prove
     uses = _Uses()
     _assess_torques(results, uses)
     _assess_motion(results, uses)

@@ -13,14 +13,15 @@ from math import ceil
 import coal
 import numpy as np
 import pinocchio as pin
-from scipy.spatial.transform import Rotation
+from numpy.typing import ArrayLike
 
 from spelgen.arm.arm import Chain, lump_links
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
+from spelgen.arm.rational import rotation_from_rpy
 from spelgen.dynamics.pinocchio_arm import body_constraint, kinematic_model
-from spelgen.excitation.surroundings import Surroundings
-from spelgen.excitation.trajectory import Motion, MotionBounds
+from spelgen.excitation.bounds import MotionBounds, Surroundings
+from spelgen.excitation.trajectory import Motion
 from spelgen.excitation.tuning import TUNING
 from spelgen.labels import counted
 from spelgen.urdf.geometry import LinkShape, link_shapes
@@ -54,31 +55,27 @@ class Collisions:
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
         found = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
         self.unread = found.unread_text
+        if self.unread and not found.shapes:
+            raise LookupError(f"no collision shape can be read: {self.unread}")
         if not found.shapes:
-            unread = f"no collision shape can be read: {self.unread}"
-            raise LookupError(unread if self.unread else "the URDF has no collision geometry")
+            raise LookupError("the URDF has no collision geometry")
         frames = lump_links(robot, choose_chain(robot, chain.joint_names, None), arm.angle_tolerance).frames
         self._model, self._constraint = kinematic_model(chain), body_constraint(chain)
         self._geometry = pin.GeometryModel()
         self._bodies: list[int] = []  # body of each object, -1: the root link
-        self._extents = np.zeros(
-            len(chain.bodies)
-        )  # largest distance of a shape from the origin of its body [m]
+        # largest distance of a shape from the origin of its body [m]
+        self._extents = np.zeros(len(chain.bodies))
         for shape in found.shapes:
             frame = frames[shape.link]
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
-            self._add(shape.link, frame.body, pose @ shape.pose, _geometry(shape))
+            pose = _pose(frame.rotation, frame.position) @ shape.pose
+            self._add(shape.link, frame.body, pose, _geometry(shape))
         links = len(self._bodies)
-        self._surroundings = (
-            " and surroundings" if surroundings.boxes or surroundings.floor is not None else ""
-        )
         if surroundings.floor is not None:
             self._add(FLOOR, -1, np.eye(4), coal.Halfspace(np.array([0.0, 0.0, 1.0]), surroundings.floor))
         for name, box in surroundings.boxes.items():
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", box.rpy).as_matrix(), box.xyz
+            pose = _pose(rotation_from_rpy(box.rpy), box.xyz)
             self._add(f"box {name!r}", -1, pose, coal.Box(*box.size))
+        self._surroundings = " and surroundings" if len(self._bodies) > links else ""
         for first, second in self._pairs(chain, links):
             self._geometry.addCollisionPair(pin.CollisionPair(first, second))
         self._displacement = self._largest_displacements(chain, bounds)
@@ -223,10 +220,9 @@ class Collisions:
 
     def _remove_overlapping(self, bounds: MotionBounds, links: int) -> tuple[str, ...]:
         """Remove the pairs that are too close at nearly all random positions within bounds; return their names."""
-        random = np.random.default_rng(0).uniform(
-            bounds.low, bounds.high, (TUNING.positions, len(bounds.low))
-        )
-        share = (np.array(list(map(self.distances, random))) < self.clearance).mean(axis=0)
+        generator = np.random.default_rng(0)
+        random = generator.uniform(bounds.low, bounds.high, (TUNING.positions, len(bounds.low)))
+        share = np.mean([self.distances(q) < self.clearance for q in random], axis=0)
         names: dict[str, None] = {}
         for pair in reversed(range(self.pairs)):
             objects = self._geometry.collisionPairs[pair]
@@ -238,15 +234,18 @@ class Collisions:
         return tuple(reversed(names))
 
 
+def _pose(rotation: ArrayLike, position: ArrayLike) -> np.ndarray:
+    """Return the homogeneous matrix (4, 4) of a rotation (3, 3) and a position (3,) [m]."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    return pose
+
+
 def _geometry(shape: LinkShape) -> coal.CollisionGeometry:
     """Return a shape for Coal, of a mesh its convex hull."""
-    if shape.kind == "box":
-        return coal.Box(*shape.size)
-    if shape.kind == "cylinder":
-        return coal.Cylinder(*shape.size)
-    if shape.kind == "sphere":
-        return coal.Sphere(*shape.size)
-    assert shape.mesh is not None
+    if shape.mesh is None:
+        kinds = {"box": coal.Box, "cylinder": coal.Cylinder, "sphere": coal.Sphere}
+        return kinds[shape.kind](*shape.size)
     points = coal.StdVec_Vec3s()
     for vertex in shape.mesh[0]:
         points.append(vertex)

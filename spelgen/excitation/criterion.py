@@ -54,10 +54,12 @@ class Criterion:
         """
         return float(self._log_condition(self._rows(states)).exp())
 
-    def efforts(self, states: Tensor) -> np.ndarray:
-        """Return rigid-body torques divided by the effort limits, (T, n), for states (3, T, n); NaN without a limit."""
-        efforts = torch.where(self.limits.isinf(), torch.nan, self._efforts(self._rows(states)))
-        return np.asarray(efforts.numpy())
+    def largest_efforts(self, states: Tensor) -> np.ndarray:
+        """Return the largest rigid-body torques divided by the effort limits, (n,), for states (3, T, n); NaN without
+        a limit.
+        """
+        largest = self._efforts(self._rows(states)).abs().amax(dim=0)
+        return np.asarray(torch.where(self.limits.isinf(), torch.nan, largest).numpy())
 
     def value(self, parameters: np.ndarray) -> float:
         """Return the criterion for parameters (size,)."""
@@ -75,9 +77,8 @@ class Criterion:
         states = self.trajectory.states(parameters, self.times)
         rows = self._rows(states)
         overrun = (self._efforts(rows).abs() - TUNING.effort).clamp(min=0.0)
-        penalties = (
-            TUNING.penalty * overrun.square().sum() + self.trajectory.amplitude_reduction(parameters).sum()
-        )
+        reduction = self.trajectory.amplitude_reduction(parameters).sum()
+        penalties = TUNING.penalty * overrun.square().sum() + reduction
         if self.collisions is not None:
             value, gradient = self.collisions.penalty(states[0].detach().numpy())
             # a linear function of q with the value and the gradient of the penalty

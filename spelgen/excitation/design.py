@@ -15,11 +15,10 @@ from scipy.optimize import minimize
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
 from spelgen.errors import ArmError, SettingsError
-from spelgen.excitation.approach import approach
+from spelgen.excitation.bounds import MotionBounds, Surroundings, motion_bounds, read_surroundings
 from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.excitation import Excitation
-from spelgen.excitation.surroundings import Surroundings, read_surroundings
-from spelgen.excitation.trajectory import ExcitationTrajectory, Motion, MotionBounds, motion_bounds
+from spelgen.excitation.trajectory import ExcitationTrajectory, approach
 from spelgen.excitation.tuning import TUNING
 
 if TYPE_CHECKING:
@@ -90,46 +89,27 @@ def excite(
         to_motion = approach(beginning, motion.q[0], bounds.speed, strongest, sample_rate)
         contact = None if collisions is None else collisions.contact(to_motion.then(motion))
         if contact is None:
-            if contacts:
-                statement += (
-                    f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed "
-                    f"{seed + attempt} and {reach * fraction:.0%} of the ranges."
-                )
-            return _excitation(arm.chain, criterion, (starts[0], best), (to_motion, motion), statement)
+            break
         contacts.append(str(contact))
-    do = "use less of the ranges (--reach), begin elsewhere (--from), or lower the clearance"
-    raise ArmError(f"no motion without a contact: {'; '.join(contacts)}", element="excite", do=do)
-
-
-def _excitation(
-    arm: Chain,
-    criterion: Criterion,
-    parameters: tuple[np.ndarray, np.ndarray],
-    motions: tuple[Motion, Motion],
-    statement: str,
-) -> Excitation:
-    """Return a motion with its quality.
-
-    Args:
-        arm: with n joints.
-        criterion: of the motion.
-        parameters: of the first random motion and of the best one, (size,).
-        motions: approach and motion.
-        statement: of collisions.
-    """
-    first, best = map(criterion.states, parameters)
-    motion = motions[1]
-    states = torch.from_numpy(np.stack([motion.q, motion.qd, motion.qdd]))
+    else:
+        do = "use less of the ranges (--reach), begin elsewhere (--from), or lower the clearance"
+        raise ArmError(f"no motion without a contact: {'; '.join(contacts)}", element="excite", do=do)
+    if contacts:
+        statement += (
+            f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed "
+            f"{seed + attempt} and {reach * fraction:.0%} of the ranges."
+        )
+    first, states = criterion.states(starts[0]), np.stack([motion.q, motion.qd, motion.qdd])
     return Excitation(
-        arm=arm,
+        arm=arm.chain,
         motion=motion,
-        approach=motions[0],
+        approach=to_motion,
         collisions=statement,
         parameters=len(criterion.columns),
         first=criterion.condition(first),
-        condition=criterion.condition(best),
-        efforts=np.abs(criterion.efforts(states)).max(axis=0),
-        first_efforts=np.abs(criterion.efforts(first)).max(axis=0),
+        condition=criterion.condition(criterion.states(best)),
+        efforts=criterion.largest_efforts(torch.from_numpy(states)),
+        first_efforts=criterion.largest_efforts(first),
     )
 
 
@@ -137,11 +117,14 @@ def _checked_harmonics(
     duration: float, sample_rate: float, harmonics: int | None, reach: float, speed: float
 ) -> int:
     """Return the number of harmonics of a motion. Raises SettingsError for an invalid argument of ``excite``."""
-    positive = {"duration": duration, "sample_rate": sample_rate, "reach": reach, "speed": speed}
-    for name, value in positive.items():
-        is_fraction = name in ("reach", "speed")
-        if not 0 < value < inf or (is_fraction and value > 1):
-            expected = "more than 0, at most 1" if is_fraction else "a positive number"
+    fraction, positive = (1.0, "more than 0, at most 1"), (inf, "a positive number")
+    for name, value, (largest, expected) in (
+        ("duration", duration, positive),
+        ("sample_rate", sample_rate, positive),
+        ("reach", reach, fraction),
+        ("speed", speed, fraction),
+    ):
+        if not 0 < value <= largest or value == inf:
             raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
     if harmonics is None:
         return max(TUNING.min_harmonics, round(TUNING.harmonics_per_second * duration))
@@ -152,16 +135,13 @@ def _checked_harmonics(
 
 def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, positive: bool) -> np.ndarray:
     """Return one number per joint, (n,). Raises SettingsError."""
+    count = len(arm.coordinates)
     array = np.atleast_1d(np.array(values, dtype=float))
     if positive and array.shape == (1,):
-        array = np.repeat(array, len(arm.coordinates))
-    if (
-        array.shape != (len(arm.coordinates),)
-        or not np.isfinite(array).all()
-        or (positive and array.min() <= 0)
-    ):
-        joints = ", ".join(arm.joint_names)
-        expected = f"one {'positive ' if positive else ''}number per joint: {joints}"
+        array = np.repeat(array, count)
+    is_valid = array.shape == (count,) and np.isfinite(array).all()
+    if not is_valid or (positive and array.min() <= 0):
+        expected = f"one {'positive ' if positive else ''}number per joint: {', '.join(arm.joint_names)}"
         raise SettingsError(repr(values), element=f"excite: {name}", expected=expected)
     return array
 
@@ -174,21 +154,20 @@ def _collisions(arm: Arm, surroundings: Surroundings, limits: MotionBounds) -> t
 
         collisions = Collisions(arm, surroundings, limits)
     except ModuleNotFoundError as error:
-        return (
-            None,
-            f"Not checked: collisions (pip install 'spelgen[simulate]' for the package {error.name}).",
-        )
+        reason = f"pip install 'spelgen[simulate]' for the package {error.name}"
     except LookupError as error:
-        return None, f"Not checked: collisions ({error.args[0]})."
-    return collisions, collisions.statement
+        reason = str(error.args[0])
+    else:
+        return collisions, collisions.statement
+    return None, f"Not checked: collisions ({reason})."
 
 
 def _start(
     start: Sequence[float] | None, arm: Chain, limits: MotionBounds, collisions: Collisions | None
 ) -> np.ndarray:
     """Return the position from which the approach starts, (n,). Raises SettingsError, ArmError for a contact."""
-    middle = (limits.low + limits.high) / 2
     if start is None:
+        middle = (limits.low + limits.high) / 2
         position = np.where((limits.low <= 0) & (limits.high >= 0), 0.0, middle)
         if collisions is not None and collisions.contact_at(position):
             position = middle

@@ -1,89 +1,22 @@
-"""Excitation trajectories: Fourier series that start and end at rest and keep the limits of an arm by construction.
+"""Motions: Fourier series that start and end at rest and keep the limits of an arm by construction; approaches.
 
 Swevers et al., Optimal robot excitation and identification, IEEE T-RA 13:730 (1997).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from math import cos, nan, pi
+from dataclasses import dataclass
+from math import ceil, cos, pi, sqrt
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.arm.arm import Chain
-from spelgen.errors import ArmError, SpelgenError, collect
+from spelgen.excitation.bounds import MotionBounds
 from spelgen.excitation.tuning import TUNING
-from spelgen.urdf.robot import UrdfJoint
 
 # Smallest ratio of the maximum of a series on the grid to its maximum over time.
 GRID_RATIO = cos(pi / TUNING.grid)
-# Speed limits of joints without a velocity limit [rad/s], [m/s].
-SPEEDS = {"revolute": TUNING.revolute_speed, "prismatic": TUNING.prismatic_speed}
-
-
-@dataclass(frozen=True, eq=False)
-class MotionBounds:
-    """Bounds of a motion, (n,) each: lowest and highest position [rad, m], speed, acceleration (by default none)."""
-
-    low: np.ndarray
-    high: np.ndarray
-    speed: np.ndarray
-    acceleration: np.ndarray | None = None
-
-    def narrowed(self, factor: float) -> MotionBounds:
-        """Return bounds with a fraction of the position ranges about the same middle."""
-        middle, half = (self.low + self.high) / 2, factor * (self.high - self.low) / 2
-        return replace(self, low=middle - half, high=middle + half)
-
-
-def motion_bounds(
-    arm: Chain,
-    range_fraction: float,
-    speed_fraction: float,
-    joints: Mapping[str, UrdfJoint] | None = None,
-    ranges: Mapping[str, tuple[float, float]] | None = None,
-) -> MotionBounds:
-    """Return the central fraction of the position ranges, and a fraction of the velocity limits.
-
-    joints: of the URDF by name, so that <mimic> joints keep their own limits. ranges: of joints by name, in place of
-    their limits; continuous joints without a range move by half a turn to both sides. Raises ArmError for a joint
-    without a range, or whose limits are not increasing.
-    """
-    limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
-    for k, coordinate in enumerate(arm.coordinates):
-        default = (-pi, pi) if coordinate.continuous else (nan, nan)
-        limits[k] = sorted((ranges or {}).get(coordinate.name) or coordinate.limits or default)
-        speeds[k] = coordinate.velocity or SPEEDS[coordinate.joint_type]
-    for body in arm.bodies:
-        k, factor = body.coordinate, float(body.multiplier)
-        mimic = (joints or {}).get(body.name)
-        if mimic is None or body.name == arm.coordinates[k].name or not factor:
-            continue
-        if mimic.type != "continuous" and mimic.lower is not None and mimic.upper is not None:
-            low, high = sorted((end - body.offset) / factor for end in (mimic.lower, mimic.upper))
-            limits[k] = max(low, limits[k, 0]), min(high, limits[k, 1])
-        if mimic.velocity:
-            speeds[k] = min(speeds[k], mimic.velocity / abs(factor))
-    errors: list[SpelgenError] = []
-    for coordinate, (low, high) in zip(arm.coordinates, limits, strict=True):
-        if np.isnan(low):
-            line = f"simulation: {{positions: {{{coordinate.name}: [LOWEST, HIGHEST]}}}}"
-            errors.append(ArmError(
-                "no position limits", element=f"joint {coordinate.name!r}", expected="a range to move in",
-                do=f"write '{line}' into the robot's YAML",
-            ))  # fmt: skip
-        elif not low < high:
-            errors.append(ArmError(
-                f"the limits {low:g} .. {high:g}", element=f"joint {coordinate.name!r}",
-                expected="room to move", do="correct them, or omit the joint by --joints",
-            ))  # fmt: skip
-    collect(errors)
-    middle, half_range = limits.mean(axis=1), np.diff(limits)[:, 0] / 2
-    half_range = range_fraction * half_range
-    return MotionBounds(middle - half_range, middle + half_range, speed_fraction * speeds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,13 +30,38 @@ class Motion:
 
     def then(self, later: Motion) -> Motion:
         """Return this motion and a later one, which begins at the last position of this one."""
-        columns = [
-            (self.t, self.t[-1] + later.t),
-            (self.q, later.q),
-            (self.qd, later.qd),
-            (self.qdd, later.qdd),
-        ]
-        return Motion(*(np.concatenate([first, second[1:]]) for first, second in columns))
+        second = later.t + self.t[-1], later.q, later.qd, later.qdd
+        # the later motion repeats the position
+        pairs = zip((self.t, self.q, self.qd, self.qdd), second, strict=True)
+        return Motion(*(np.concatenate([ours, theirs[1:]]) for ours, theirs in pairs))
+
+
+def approach(
+    start: np.ndarray, end: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, sample_rate: float
+) -> Motion:
+    """Return the fastest motion from rest at `start` to rest at `end` by a polynomial of degree 5.
+
+    All joints move at the same time.
+
+    Args:
+        start, end: (n,) [rad, m].
+        speed: largest speeds, (n,) [rad/s, m/s].
+        acceleration: largest accelerations, (n,) [rad/s^2, m/s^2].
+        sample_rate: approximate [Hz].
+    """
+    distance = end - start
+    # the largest derivatives of 10 s^3 - 15 s^4 + 6 s^5 over s in 0..1 are 1.875 and 10 / sqrt(3)
+    by_speed = (1.875 * np.abs(distance) / speed).max()
+    by_acceleration = np.sqrt(10 / sqrt(3) * np.abs(distance) / acceleration).max()
+    duration = float(max(by_speed, by_acceleration))
+    t = np.linspace(0.0, duration, ceil(duration * sample_rate) + 1)
+    s = t / (duration or 1.0)
+    position = s**3 * (10 - 15 * s + 6 * s**2)
+    velocity = 30 * s**2 * (1 - s) ** 2 / (duration or 1.0)
+    second = 60 * s * (1 - s) * (1 - 2 * s) / (duration or 1.0) ** 2
+    return Motion(
+        t, start + np.outer(position, distance), np.outer(velocity, distance), np.outer(second, distance)
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,6 @@ from spelgen.exporting.model_expressions import drive_friction, joint_mass, name
 from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics
 from spelgen.live.noise import TAIL, BlockNoise, NoiseLevels
-from spelgen.live.payload import EVIDENCE, ITERATIONS, LOAD_PRIOR, WEIGHTS
 from spelgen.live.tuning import TUNING
 from spelgen.templates import render
 
@@ -50,16 +49,20 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     gradient = kinetic_gradient + residuals["kinetic"] - gravity - residuals["gravity"] - residuals["torque"]
     applied = constant(model.inputs) @ (tau - model.torque_offset)
     torque = applied + constant(model.friction_compensation) * qd + gradient
+    # the friction state is known up to an interval: its middle is the friction, half its width the uncertainty
     first, second = (drive_friction(model, residuals, qd, gravity, z) for z in (high, low))
+    # of the last body's frame, in root axes: linear, then angular rows
+    pose, jacobian = frame_kinematics(bodies, len(bodies) - 1, np.eye(4), q)
+    rotation, weight = pose[:3, :3], load[0] * constant(model.arm.gravity)
     load_momentum, load_gradient = payload.momentum(qd)
-    load_gradient -= payload.torque(still, still)
-    pose = np.eye(4)
-    pose[:3, 3] = levels.point
-    _, jacobian = frame_kinematics(bodies, len(bodies) - 1, pose, q)
+    moment = ca.cross(rotation @ load[1:4], constant(model.arm.gravity))
+    # not by Newton-Euler: with its rounding errors, log odds differ 40 times as much from Python's
+    load_gradient += jacobian.T @ ca.vertcat(weight, moment)
+    at_point = jacobian[:3, :] - ca.skew(rotation @ levels.point) @ jacobian[3:, :]
     outputs = {
         "momentum_balance": (
             momentum, torque, (first + second) / 2, ca.fabs(first - second) / 2,
-            ca.jacobian(load_momentum, load), ca.jacobian(load_gradient, load), jacobian[:3, :],
+            ca.jacobian(load_momentum, load), ca.jacobian(load_gradient, load), at_point,
         ),
         "payload_torque": (payload.torque(qd, qdd),),
     }  # fmt: skip
@@ -76,7 +79,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     # C has no empty arrays
     breakaway = model.breakaway.ravel() if model.memory else [0.0]
     tables: dict[str, Iterable[float]] = {
-        "load_prior": LOAD_PRIOR,
+        "load_prior": TUNING.load_prior,
         "scales": TUNING.scales,
         "breakaway": breakaway,
     }
@@ -93,9 +96,9 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "tuning": TUNING,
         "supported": f"{levels.supported_alarms:.2g} per minute",
         "windows": repr(60 / TUNING.window * TAIL * model.n),
-        "evidence": repr(EVIDENCE),
-        "iterations": ITERATIONS,
-        "weights": WEIGHTS,
+        "evidence": repr(TUNING.evidence),
+        "iterations": TUNING.iterations,
+        "weights": TUNING.weights,
         "tables": {name: _numbers(row) for name, row in tables.items()},
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, model.input_inverse)),

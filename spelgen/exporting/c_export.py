@@ -20,6 +20,7 @@ from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
+# warnings are errors: users compile with the flags of their own projects
 _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 
 
@@ -45,6 +46,7 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
     if levels is not None:
         functions += estimator_c_functions(model, levels)
         texts = estimator_texts(model, levels)
+    # the files themselves are compiled and compared, not a second rendering of them
     with tempfile.TemporaryDirectory() as folder:
         write_c(model, functions, Path(folder))
         for name, text in texts.items():
@@ -68,6 +70,7 @@ def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -
     sources = [sources] if isinstance(sources, Path) else sources
     library = sources[0].with_suffix(".so")
     command = [program, *_FLAGS, *flags, *map(str, sources), "-o", str(library), "-lm"]
+    # no shell: the folder's name is never parsed
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         raise RunError(f"{Path(program).name} refuses the exported C", do=result.stderr.strip()[:500])
@@ -96,6 +99,7 @@ def called_by_c(
             # NaN fails the parity check if the function does not write a number
             outputs[key] = np.full((states, *shape), np.nan, dtypes.get(key, dtype))
         arguments += outputs.values()
+        # state by state, as a control loop calls it
         for state in range(states):
             rows = [array[state : state + 1] for array in arguments]
             call(*(row.ctypes.data_as(ctypes.c_void_p) for row in rows))

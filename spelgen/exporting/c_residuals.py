@@ -48,6 +48,7 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
             variables.append(f"{RESIDUAL}{name}[{symbols[name].numel()}]")
             arguments.append(RESIDUAL + name)
         calls.append(f"{call}, {', '.join(arguments)});")
+    # cos q and sin q are shared by the networks of M and V
     if "(encoded" in "".join(calls):
         variables.insert(0, "encoded[ENCODED]")
         calls.insert(0, "encode(q, encoded);")
@@ -71,7 +72,7 @@ def network_source(model: TrainedModel) -> list[str]:
         "networks.c.jinja",
         n=n,
         hidden=max(map(len, shapes.values())) - 1,
-        # the size of buffers, for the widest layer
+        # the size of buffers, for the widest layer: one array serves all networks
         width=max(max(shape) for layers in shapes.values() for shape in layers),
         encoded=3 * n,
         lanes=1 + n + n * (n + 1) // 2,
@@ -151,6 +152,7 @@ def _spline_fields(splines: Mapping[int, BSpline]) -> list[str]:
 def _table(name: str, values: np.ndarray) -> str:
     """Return a constant C array with values (rows,) or (rows, columns), all digits."""
     scalar = "short" if values.dtype.kind == "i" else "real"
+    # repr keeps all digits, so that C reads the same double
     size = ""
     numbers = ", ".join(map(repr, values.tolist()))
     if values.ndim == 2:

@@ -44,8 +44,10 @@ def export_casadi(trained: Trained) -> Exported:
 
 def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
     """Return functions by name: SX expressions of bodies and friction, MX expressions of residual terms."""
+    # without residual terms all is scalar: SX takes less time than calls within MX
     if not model.residuals:
         return expression_functions(model, entries)
+    # derivatives are taken of the function with its residual terms, not of its symbols
     bases = {name: ENTRY_POINTS[name.removesuffix("_derivatives")] for name in entries}
     expressions = expression_functions(model, {base.name: base for base in bases.values()})
     functions: dict[str, ca.Function] = {}
@@ -117,6 +119,7 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
         values["energy"] = _network(residuals.potential, encoded)
         # reverse mode: takes about the time of the network
         values["gravity"] = ca.gradient(values["energy"], q)
+    # its derivative is the torque: both stay consistent
     if residuals.has_torque:
         values["torque_energy"] = _torque_energy(residuals, q)
         values["torque"] = ca.gradient(values["torque_energy"], q)
@@ -151,5 +154,6 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
 def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
     """Return the value at q, (1, 1); outside of the knots it is constant."""
     knots, degree = spline.t, spline.k
+    # bspline extrapolates its last polynomial, the model does not
     inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])
     return ca.bspline(inside, ca.DM(spline.c), [knots.tolist()], [degree], 1, {})

@@ -108,9 +108,9 @@ def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
             do="--to torch, onnx, mjcf and urdf take every preset",
         )
     weights = exact.prepare()
-    # armature and constant residual terms are one matrix
     constant_mass = array(weights.armature)
     residuals = Residuals((), None, None, {}, (), {})
+    # a constant residual of M needs no evaluation: it is added to the armature
     if residual_terms(exact) is not None:
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
@@ -143,6 +143,7 @@ def identifier(text: str) -> str:
 
 def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
     """Return a different identifier for each joint, similar to its name."""
+    # names of joints become fields and comments of the emitted code
     identifiers: list[str] = []
     for number, name in enumerate(names, start=1):
         plain = _letters_and_digits(name)
@@ -178,7 +179,7 @@ def _residuals(model: ArmModel) -> Residuals:
     """Return the residual terms that are not zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
-    # Only entries of the lower triangle that any function contributes to.
+    # Only entries of the lower triangle that any function contributes to: all others would be computed zeros.
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
@@ -211,6 +212,7 @@ def _network(
     weights, biases = (list(map(array, tensors)) for tensors in zip(*layers, strict=True))
     # inputs become (cos q, sin q, q) of all joints
     first, second = np.hsplit(weights[0], 2)
+    # a prismatic input (q - center) slope is a weight of q and a part of the bias
     slopes, revolute = first * array(encoding.slope), array(encoding.revolute)
     weights[0] = np.hstack([first * revolute, second * revolute, slopes])
     biases[0] -= slopes @ array(encoding.center)
@@ -246,11 +248,12 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
     cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
-        # number of leading frequencies 1, 2, ...
+        # number of leading frequencies 1, 2, ...; those of the motor are multiples of its gear ratio
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]
             used = np.flatnonzero((c != 0) | (s != 0))
+            # trailing zeros would cost a rotation of the phasor each
             if used.size:
                 last = used[-1] + 1
                 ripple.append(Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))

@@ -15,7 +15,7 @@ from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
 from spelgen.listing import Listing
-from spelgen.live.cross_validation import stored_levels
+from spelgen.live.levels import stored_levels
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -57,6 +57,7 @@ def export(
         trained = load_run(trained)
     intervals: tuple[Listing, ...] = ()
     levels = None
+    # a model that is not a fit has neither intervals nor noise levels
     if isinstance(trained, Fit):
         levels = stored_levels(trained)
         if trained.checkpoint.posterior:

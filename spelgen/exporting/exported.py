@@ -14,6 +14,7 @@ from spelgen.labels import printable
 if TYPE_CHECKING:
     from spelgen.exporting.describe import Trained
 
+# of all formats: an export has no other units than the model
 UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 
 
@@ -43,6 +44,7 @@ EXPORTERS = {
     "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2", "for ROS 2"),
 }
 """The formats, by the values of --to."""
+# only formats of one file are recognised by the name of the output
 _BY_SUFFIX = {exporter.suffix: name for name, exporter in EXPORTERS.items() if exporter.suffix}
 
 if TYPE_CHECKING:
@@ -125,6 +127,7 @@ def with_readme(
         summary: sentences without full stops.
         example: lines of Python that run in the folder of the README.
     """
+    # five lines that a user needs before the first call; the rest is in docs/deploy.md
     exporter, conventions = EXPORTERS[to], f"{UNITS}; the tip is the link {trained.tip}; {about}"
     title, result = f"Dynamics of {trained.robot} {exporter.title}", f"{'; '.join(summary)}."
     name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"

@@ -15,6 +15,7 @@ from lxml import etree
 from spelgen.arm.arm import Chain, Coordinate, make_arm
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_regressor import about_center, quaternion
+from spelgen.dynamics.pinocchio_arm import body_constraint
 from spelgen.dynamics.tip_frame import link_poses, tip_frame
 from spelgen.emission.build import build
 from spelgen.exporting.describe import Trained
@@ -43,6 +44,7 @@ def export_mjcf(trained: Trained) -> Exported:
 
     Raises RunError if M, bias and forward dynamics of these bodies differ in MuJoCo.
     """
+    # MuJoCo has rigid bodies only: residual terms and networks are projected onto them
     projection = rigid_body_projection(trained.model, trained.arm)
     text, omitted = mjcf_text(projection)
     parity = check_mjcf(text, projection)
@@ -82,6 +84,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
     q = torch.from_numpy(random["q"])
+    # the file has the URDF's angles, the model rounded ones: M would differ by their tolerance
     bodies = _with_exact_angles(projection)
     mass = bodies.mass_matrix(q)
     bias = bodies.nonlinear_effects(q, torch.from_numpy(random["qd"]))
@@ -120,14 +123,13 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
     # positions and velocities of all joints, mimic joints included, from the coordinates
-    jacobian = np.zeros((model.nv, len(arm.coordinates)))
-    offset = np.zeros(model.nv)
-    for body in arm.bodies:
-        (dof,) = model.joint(body.name).dofadr
-        jacobian[dof, body.coordinate] = float(body.multiplier)
-        offset[dof] = body.offset
+    constraint = body_constraint(arm)
+    # MuJoCo orders joints by the tree of bodies
+    order = np.argsort([model.joint(name).dofadr[0] for name in constraint.names])
+    jacobian, offset = constraint.jacobian[order], constraint.offset[order]
     driven = [arm.joint_names.index(model.actuator(k).name) for k in range(model.nu)]
     data = mujoco.MjData(model)
+    # MuJoCo stores a sparse M: it is expanded into this array
     full = np.zeros((model.nv, model.nv))
     values: dict[str, list[np.ndarray]] = {"mass_matrix": [], "bias": [], "forward_dynamics": []}
     for position, velocity, control in zip(q, qd, controls, strict=True):
@@ -157,6 +159,7 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     _add(root, "compiler", angle="radian", autolimits="true")
     _add(root, "option", gravity=arm.gravity)
     world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in _SECTIONS)
+    # a motor that rotates with several joints cannot be the armature of one of them
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
     elements, tip = [world], tip_frame(projection.arm)
     for body, inertia in zip(tip.bodies, projection.inertias, strict=True):
@@ -230,6 +233,7 @@ def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos:
     """Add a position actuator for each joint, whose control is the delayed command."""
     for k, joint in enumerate(joints):
         limit = servos.limit[k]
+        # an infinite force range is an error in MuJoCo, an absent one is unlimited
         force = (-limit, limit) if np.isfinite(limit) else None
         gains = {"kp": servos.kp[k], "kv": servos.kd[k]}
         _add(actuators, "position", name=joint.name, joint=joint.name, **gains, forcerange=force)
@@ -293,6 +297,7 @@ def _form(shape: LinkShape, assets: etree._Element) -> dict[str, object]:
 
 def _is_flat(vertices: np.ndarray) -> bool:
     """True if a mesh with vertices (V, 3) has no convex hull in three dimensions."""
+    # singular values: a flat mesh may lie in any plane
     extents = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
     return len(extents) < 3 or bool(extents[2] <= TUNING.flat * extents[0])
 

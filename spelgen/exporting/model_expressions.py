@@ -28,8 +28,10 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
     names = ("q", "qd", "qdd", "tau", "dq", "u")
     inputs = {name: ca.SX.sym(name, model.n) for name in names}
     inputs["z"] = ca.SX.sym("z", model.memory)
+    # all entry points share their subexpressions, so they are built together
     residuals = residual_symbols(model)
     expressions = _expressions(model, inputs, residuals)
+    # the derivatives take most of the time of an export
     if any(name.endswith("_derivatives") for name in entries):
         expressions |= _derivatives(model, inputs, residuals)
     functions: dict[str, ca.Function] = {}
@@ -190,6 +192,7 @@ def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
     if servos.dead_zone.any():
         error -= ca.fmin(ca.fmax(error, -servos.dead_zone), servos.dead_zone)
     torque: ca.SX = servos.kp * error - servos.kd * qd
+    # without a limit, no comparison in C
     for joint in np.flatnonzero(np.isfinite(servos.limit)).tolist():
         limit = servos.limit[joint]
         torque[joint] = ca.fmin(ca.fmax(torque[joint], -limit), limit)

@@ -56,6 +56,7 @@ def export_onnx(trained: Trained) -> Exported:
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
     """Return the serialised ONNX model of an entry point."""
+    # decompositions act while the program is traced, before the translation to ONNX
     with _silent_exporter():
         with _Decomposed():
             program = export_program(model, name, flat_state=True)
@@ -101,6 +102,7 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     identity = torch.eye(n, dtype=matrix.dtype)
     # the matrix or the right-hand side may have no batch dimension
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
+    # matrix and right-hand side are eliminated together
     rows = torch.cat([matrix.expand(*batch, n, n), right.expand(*batch, *right.shape[-2:])], dim=-1)
     for k in range(n):
         pivot = rows[..., k : k + 1, :]

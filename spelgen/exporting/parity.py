@@ -117,6 +117,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
     They are the same in each call, since exports are reproducible.
     """
     random = np.random.default_rng(0)
+    # velocities within the limits: friction at higher speeds is extrapolated
     speed = nominal_speeds(coordinates)
     q = np.stack([random.uniform(*working_range(joint), states) for joint in coordinates], axis=-1)
     return {
@@ -126,6 +127,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
         "dq": 0.05 * speed * random.standard_normal(q.shape),
         # break-away displacements are fractions of a milliradian
         "z": 1e-4 * random.standard_normal((states, memory)),
+        # forward dynamics are linear in tau: its size is of no importance
         "tau": 10.0 * random.standard_normal(q.shape),
         "u": q + 0.3 * random.standard_normal(q.shape),
     }

@@ -86,6 +86,7 @@ def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX,
     """Return the symbols that depend on q, (k, 1) each, with their derivatives with respect to q, (k, n)."""
     # the friction factor of a joint depends on the position of this joint only
     joints = np.eye(model.n)[list(model.residuals.friction)]
+    # second is (m, n n): a block of n columns per joint of the first derivative
     by_joint = ca.horzsplit(symbols["second"], model.n)
     jacobians = [
         (symbols["factor"], symbols["factor_slope"] * ca.SX(joints)),

@@ -86,8 +86,10 @@ class RigidBodyProjection:
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     """Return the projection of a trained model of ``arm``."""
+    # a copy in double precision: the model of the user is not changed
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
+    # rigid bodies of the model need no search; residual terms are left out and stated
     exact = isinstance(model, RigidBodyDynamics)
     bodies: ArmModel = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
@@ -150,6 +152,7 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
         model: trained model.
         q: (positions, n) [rad, m], of which every k-th is used.
     """
+    # friction changes most at low speed: logarithmic steps
     fractions = np.geomspace(0.02, 1.0, TUNING.friction_speeds)
     fractions = np.concatenate([-fractions[::-1], fractions])
     speeds = np.outer(fractions, nominal_speeds(arm.coordinates))

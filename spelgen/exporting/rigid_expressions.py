@@ -51,6 +51,7 @@ class RigidBodies:
     """
 
     def __init__(self, arm: Chain, q: ca.SX, inertias: Sequence[ca.SX] | np.ndarray) -> None:
+        # frames are shared by torque and momentum, so that their sines are computed once
         self.arm, self.bodies, self.frames = arm, arm.bodies, body_frames(arm.bodies, q)
         self.inertias: list[tuple[ca.SX, ca.SX, ca.SX]] = []
         for ten in map(ca.sparsify, map(ca.SX, inertias)):
@@ -160,7 +161,7 @@ def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: 
 
     carrier: index of the body that carries the frame; -1: the root link. pose: (4, 4), in the frame of this body.
     """
-    # poses of the root link, then of all bodies
+    # poses of the root link, then of all bodies: those that do not carry the frame vanish from the function
     poses = [ca.SX.eye(4)]
     for body, frame in zip(bodies, body_frames(bodies, q), strict=True):
         poses.append(poses[body.parent + 1] @ ca.vertcat(ca.horzcat(*frame), constant([[0, 0, 0, 1]])))

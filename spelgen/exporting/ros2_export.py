@@ -41,6 +41,7 @@ _CONTROLLER_PATHS = {
 def export_ros2(trained: Trained) -> Exported:
     """Return the package. Raises RunError if its C differs from the model."""
     model, missing = trained.described, _missing_part(trained)
+    # the plugin of inverse dynamics is always part of the package
     controller, estimator = missing is None or missing[0] != "controller", missing is None
     entries = (*_CALLED, "tip_pose") if estimator else _CALLED
     levels = trained.levels if estimator else None
@@ -108,9 +109,12 @@ def _controller_numbers(trained: Trained) -> dict[str, object]:
         # a JSON text is YAML
         "yaml_joints": ", ".join(map(json.dumps, trained.joint_names)),
         "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in trained.joint_names),
+        # 0 for an unknown limit: the user must set it
         "efforts": _listed(joint.effort or 0.0 for joint in coordinates),
         "velocities": _listed(_velocity_limit(joint.velocity) for joint in coordinates),
+        # [rad, m] computed torque stops above it
         "position_errors": _listed(np.where(revolute, 0.2, 0.05)),
+        # [rad, m] travel by the measured velocity after which an unchanged position is a fault
         "frozen_travel": _listed(np.where(revolute, 1e-2, 1e-3)),
         "continuous": ", ".join(continuous),
         "tip_link": cpp_string(model.tip.link),

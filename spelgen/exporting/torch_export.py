@@ -88,6 +88,7 @@ def calls(model: PreparedModel, names: Sequence[str], zeros: str, no_state: str)
     lines = [f"q = qd = qdd = tau = dq = {zeros}  # a batch of 5; dq: change of q since the last step"]
     if model.elements and "friction_memory" not in names:
         lines.append(f"z = {no_state}")
+    # the order of a control loop: z is initialised before, and updated after the other calls
     for name in sorted(names, key=lambda name: (name == "friction_step") - (name == "friction_memory")):
         output = {"friction_memory": "z", "friction_step": "z"}.get(name, program_output(name))
         inputs = ", ".join(f"{key}={key}" for key in program_inputs(model, name))
@@ -106,6 +107,7 @@ def _saved(program: torch.export.ExportedProgram) -> bytes:
 
 def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
     """Return a function that calls the programs of files."""
+    # the saved content is checked, not the program in memory
     programs = {name: torch.export.load(io.BytesIO(content)).module() for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:
@@ -146,7 +148,7 @@ def export_program(
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(program_inputs(model, name), (model.n,))
     if "z" in shapes:
         shapes["z"] = (model.n * model.elements,) if flat_state else (model.n, model.elements)
-    # a batch of two: torch.export treats one as a constant
+    # a batch of two: torch.export treats one as a constant; 0.1: zero may be a kink of friction
     inputs = tuple(torch.full((2, *shape), 0.1, dtype=model.dtype) for shape in shapes.values())
     batch = tuple({0: torch.export.Dim("batch")} for _ in inputs)
     return torch.export.export(_Program(model, name, flat_state), inputs, dynamic_shapes=(batch,))

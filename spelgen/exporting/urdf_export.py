@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import yaml
 from lxml import etree
 
@@ -74,6 +75,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     friction = projection.friction
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
+        # the file has one <dynamics> per joint: readers use the first or the last
         _remove(element, "dynamics")
         values = {"damping": _number(friction.viscous[index]), "friction": _number(friction.coulomb[index])}
         etree.SubElement(element, "dynamics", values)
@@ -84,6 +86,7 @@ def _settings_text(projection: RigidBodyProjection) -> str:
     """Return the settings of the arm with the armature and friction of a projection."""
     path = projection.arm.robot.path.with_suffix(".yaml")
     content: dict[str, dict[str, dict[str, object]]] = {}
+    # other settings of the user are kept
     if path.exists():
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
@@ -92,9 +95,9 @@ def _settings_text(projection: RigidBodyProjection) -> str:
         # settings have the inertia at the rotor, the model has the inertia at the joint
         gear = projection.arm.settings.joint(coordinate.name).gear
         joint = joints.setdefault(coordinate.name, {})
-        joint["rotor_inertia"] = _rounded(projection.armature[index] / gear**2)
-        joint["viscous"] = _rounded(friction.viscous[index])
-        joint["coulomb"] = [_rounded(friction.forward[index]), _rounded(friction.backward[index])]
+        joint["rotor_inertia"] = _plain(projection.armature[index] / gear**2)
+        joint["viscous"] = _plain(friction.viscous[index])
+        joint["coulomb"] = _plain([friction.forward[index], friction.backward[index]])
     return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
 
@@ -113,7 +116,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         sections["law"] = _law_constants(trained, projection)
     servos = projection.servos
     if servos is not None:
-        content |= {"servo": _SERVO, "delay": _rounded(servos.delay)}
+        content |= {"servo": _SERVO, "delay": _plain(servos.delay)}
         gains = {"kp": servos.kp, "kd": servos.kd, "limit": servos.limit, "dead_zone": servos.dead_zone}
         sections["servo"] = gains
     joints: dict[str, dict[str, object]] = {}
@@ -130,21 +133,16 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
+    # a factor of one at all positions says nothing
     if (factor != 1).any():
         constants["position_factor"] = np.stack([factor.min(axis=0), factor.max(axis=0)], axis=-1)
     return constants
 
 
-def _plain(value: np.ndarray) -> float | list[float]:
-    """Return the numbers of an array () or (K,) for YAML."""
-    if value.ndim == 0:
-        return _rounded(float(value))
-    return list(map(_rounded, value.tolist()))
-
-
-def _rounded(value: float) -> float:
-    """Return a number rounded to twelve digits: readable, and more precise than any fit."""
-    return float(_number(value))
+def _plain(value: npt.ArrayLike) -> object:
+    """Return a number, or the numbers of (K,), for YAML: readable with twelve digits, more precise than any fit."""
+    rounded = np.vectorize(lambda x: float(_number(x)), otypes=[float])
+    return rounded(value).tolist()
 
 
 def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Training data: logs checked, split, filtered and cut into windows, and the validation of a model on them."""
+"""The request of a fit, and its data: logs checked, split, filtered and cut into windows; validation on the windows."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import hashlib
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from spelgen.dynamics.bristles import BristleReach
+from spelgen.dynamics.bristles import bristle_reach
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.rollout import LossScales, choose_substeps, loss_scales, rollout_loss
@@ -19,103 +20,130 @@ from spelgen.logs.checks import check
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned
-from spelgen.settings.fits import DEFAULTS, Solver
+from spelgen.settings.fits import DEFAULTS, FitConfig, Solver
+from spelgen.settings.log_mapping import LogMapping
 
 
 @dataclass(frozen=True)
-class WindowChoice:
-    """Choice of the windows for training and validation.
+class RunOptions:
+    """How a fit runs.
 
-    validation: trajectories, or the fraction of the logs that validates: whole trajectories, chosen at random
-    with `seed` before windows are cut, so that no sample is in both parts. window, stride, reach: see `cut_windows`.
+    device, threads: of torch. resume: continue from the folder's checkpoint, exactly as if there had been no
+    interruption. force: replace a run. progress: show it on stderr. mapping: with which the logs were read, kept with
+    the run. notes: earlier diagnostics, reported with the others. began: start of the allowed time (`time.monotonic`);
+    None: now.
     """
 
-    window: int = 5
-    stride: int = 1
-    validation: float | Sequence[Trajectory] = 0.25
-    seed: int = 0
-    reach: BristleReach | None = None
-
-    def span(self, preprocessing: Preprocessing) -> int:
-        """Return the number of samples that one window spans, before decimation."""
-        return (self.window - 1) * (preprocessing.decimation or 1) + 1
-
-    def windows(self, trajectories: Sequence[Trajectory], preprocessing: Preprocessing) -> Windows:
-        """Return all windows of the trajectories, whose gap-free pieces are filtered; preprocessing: resolved."""
-        return cut_windows(
-            preprocessing.pieces(trajectories, shortest=self.span(preprocessing)),
-            self.window,
-            self.stride,
-            preprocessing.decimation or 1,
-            measured=preprocessing.filtered,
-            reach=self.reach,
-        )
+    device: str = "cpu"
+    threads: int = 1
+    resume: bool = False
+    force: bool = False
+    progress: bool = False
+    mapping: LogMapping | None = None
+    notes: Sequence[Diagnostic] = ()
+    began: float | None = None
 
 
-DEFAULT_CHOICE = WindowChoice()
+@dataclass(frozen=True)
+class FitRequest:
+    """The arguments of a fit.
 
-
-@dataclass(frozen=True, eq=False)
-class TrainingData:
-    """Windows of the logs for training and validation.
-
-    preprocessing: the resolved one. digest: of all numbers, so that a fit resumes on the same data only. recordings:
-    all trajectories, with validation.
+    validation: the fraction of the logs that is set aside, or trajectories. urdf: of the robot, None if unknown.
+    began: start of the allowed time (`time.monotonic`). folder: of the run, None without one.
     """
+
+    model: ArmModel
+    logs: Sequence[Trajectory]
+    config: FitConfig
+    preprocessing: Preprocessing
+    validation: float | Sequence[Trajectory]
+    seed: int
+    urdf: Path | None
+    options: RunOptions
+    began: float
+    folder: Path | None
+
+    @property
+    def recordings(self) -> list[Trajectory]:
+        """All logs, validation included."""
+        return [*self.logs, *(() if isinstance(self.validation, float) else self.validation)]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PreparedLogs:
+    """Logs that were checked, and the facts of them that a run folder records.
+
+    preprocessing: the resolved one. digest: of all numbers, so that a fit resumes on the same data only.
+    training_names, validation_names: of the logs. window_counts: for training and validation. diagnostics: for the
+    user. scales: of the validation loss; None without one.
+    """
+
+    preprocessing: Preprocessing
+    digest: str
+    training_names: Sequence[str]
+    validation_names: Sequence[str] = ()
+    window_counts: tuple[int, int]
+    diagnostics: Sequence[Diagnostic]
+    scales: LossScales | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrainingData(PreparedLogs):
+    """Windows of the logs for training and validation; recordings: all trajectories, with validation."""
 
     training: Windows
     validation: Windows
     scales: LossScales
-    preprocessing: Preprocessing
-    training_names: tuple[str, ...]
-    validation_names: tuple[str, ...]
-    diagnostics: tuple[Diagnostic, ...]
-    digest: str
-    recordings: Sequence[Trajectory] = ()
+    recordings: Sequence[Trajectory]
 
 
-def prepare_data(
-    trajectories: Sequence[Trajectory],
-    joints: Sequence[str],
-    joint_types: Sequence[str],
-    preprocessing: Preprocessing,
-    choice: WindowChoice = DEFAULT_CHOICE,
-) -> TrainingData:
-    """Check the logs, split them and cut windows. Raises LogError."""
-    if not trajectories:
+def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
+    """Check the logs, split them and cut windows. Raises LogError.
+
+    Args:
+        request: of the fit.
+        window: samples of a window.
+        stride: samples between the starts of two windows.
+    """
+    if not request.logs:
         raise LogError("no logs", expected="a trajectory or more")
     # Whole trajectories are set aside: neighbouring windows of one motion are not independent.
-    split = _split(trajectories, choice)
-    everything = list(trajectories)
-    if not isinstance(choice.validation, float):
-        everything += choice.validation
-    for trajectory in everything:
-        require_joints(trajectory, joints)
-    require_torques(everything)
-    notes = check(everything, joints, joint_types)
+    if isinstance(request.validation, float):
+        split = split_validation(request.logs, request.validation, request.seed)
+    else:
+        message = f"validation on {len(request.validation)} trajectories that were given"
+        note = Diagnostic("info", "validation-split", "logs", None, message)
+        split = Split(tuple(request.logs), tuple(request.validation), note)
+    model, recordings = request.model, request.recordings
+    for trajectory in recordings:
+        require_joints(trajectory, model.joint_names)
+    require_torques(recordings)
+    notes = check(recordings, model.joint_names, model.joint_types)
     # Resolved once for all logs: training and validation need the same filter.
-    resolved = preprocessing.resolved([x.sample_rate for x in everything])
-    windows = choice.windows(split.training, resolved)
+    resolved = request.preprocessing.resolved([x.sample_rate for x in recordings])
+    decimation, reach = resolved.decimation or 1, bristle_reach(model)
+
+    def windows(trajectories: Sequence[Trajectory]) -> Windows:
+        """Return all windows (W, K, n) of the filtered pieces between gaps."""
+        pieces = resolved.pieces(trajectories, shortest=(window - 1) * decimation + 1)
+        return cut_windows(pieces, window, stride, decimation, measured=resolved.filtered, reach=reach)
+
+    training = windows(split.training)
+    # A bounded number of windows: validation follows every epoch.
+    validation = thinned(windows(split.validation), TUNING.validation_windows)
     return TrainingData(
-        training=windows,
-        # A bounded number of windows: validation follows every epoch.
-        validation=thinned(choice.windows(split.validation, resolved), TUNING.validation_windows),
-        scales=loss_scales(windows, joint_types),
+        training=training,
+        validation=validation,
+        # of training windows only: validation logs must not change the loss
+        scales=loss_scales(training, model.joint_types),
         preprocessing=resolved,
-        training_names=tuple(x.name for x in split.training),
-        validation_names=tuple(x.name for x in split.validation),
+        training_names=[x.name for x in split.training],
+        validation_names=[x.name for x in split.validation],
+        window_counts=(len(training), len(validation)),
         diagnostics=(*notes, *resolved.diagnostics, split.note),
-        digest=digest(everything),
-        recordings=everything,
+        digest=digest(recordings),
+        recordings=recordings,
     )
-
-
-def _split(trajectories: Sequence[Trajectory], choice: WindowChoice) -> Split:
-    if isinstance(choice.validation, float):
-        return split_validation(trajectories, choice.validation, choice.seed)
-    message = f"validation on {len(choice.validation)} trajectories that were given"
-    note = Diagnostic("info", "validation-split", "logs", None, message)
-    return Split(tuple(trajectories), tuple(choice.validation), note)
 
 
 def digest(trajectories: Iterable[Trajectory]) -> str:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.registry import FittedBaselines, arm_of_model, fit_baselines
+from spelgen.dynamics.protocol import input_of
 from spelgen.emission.assemble import ArmModel
-from spelgen.errors import Diagnostic, RunError, SpelgenError
+from spelgen.errors import Diagnostic, OptionError, RunError, SettingsError, SpelgenError
 from spelgen.files import write_json
+from spelgen.fitting.dataset import FitRequest, RunOptions
 from spelgen.fitting.fitted import Fit, load_run, required_spec
-from spelgen.fitting.objective import FitRequest, Objective, RunOptions, Status, new_record
-from spelgen.fitting.objectives import FitOptions, choose_config, objective_of
+from spelgen.fitting.momentum_objective import MomentumObjective
+from spelgen.fitting.objective import Objective, Status, new_record
 from spelgen.fitting.process import (
     TrainingProgress,
     locked,
@@ -21,19 +24,39 @@ from spelgen.fitting.process import (
     termination_as_interrupt,
     threads_of_torch,
 )
+from spelgen.fitting.rollout_objective import RolloutObjective
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import Checkpoint
+from spelgen.fitting.servo.objective import ServoObjective
+from spelgen.fitting.torque.objective import TorqueObjective
 from spelgen.logs.dynamics_samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.fits import FitConfig
+from spelgen.logs.tuning import shows_accelerations
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+from spelgen.settings.fits import FitConfig, fit_config
 
 __all__ = ["Fit", "RunOptions", "fit", "load_run"]
 
 AUTOMATIC = Preprocessing()
-
-
 QUIET = RunOptions()
+ALL: tuple[type[Objective], ...] = (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
+OBJECTIVES = {objective.name: objective for objective in ALL}
+Rates = Callable[[], Sequence[float]]
+"""Return the sample rates of the logs [Hz]; called only if the choice depends on them, since it may read the logs."""
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Options of a fit whose objective may not be known yet.
+
+    objective: None: chosen by `default_objective`. options: by name; an option that does not apply is an error.
+    defaults: by name, for options that are not given; inapplicable ones are omitted.
+    """
+
+    objective: str | None = None
+    options: Mapping[str, object] = field(default_factory=dict)
+    defaults: Mapping[str, object] = field(default_factory=dict)
 
 
 def fit(
@@ -83,6 +106,7 @@ def fit(
     if run is not None and not options.resume:
         # Before the logs are filtered and cut, which may take minutes.
         run.require_free(force=options.force)
+    # locked after the request was checked: a wrong option leaves no folder
     with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
         return _Fitting(request, objective, run).fitted()
@@ -94,8 +118,8 @@ class _Fitting:
     def __init__(self, request: FitRequest, objective: Objective, run: RunFolder | None) -> None:
         self.request, self.objective, self.run = request, objective, run
         prepared = objective.prepare()
-        self.notes: list[Diagnostic] = [*prepared.notes, *request.options.notes]
-        self.record = new_record(request, prepared)
+        self.notes: list[Diagnostic] = [*prepared.diagnostics, *request.options.notes]
+        self.record = new_record(request, objective.config, prepared)
         self.baselines: FittedBaselines = {}
 
     def fitted(self) -> Fit:
@@ -128,7 +152,7 @@ class _Fitting:
             baselines=self.baselines,
             urdf=request.urdf,
             folder=request.folder,
-            logs=self._logs(),
+            logs=request.recordings,
         )
 
     def _resume(self, run: RunFolder) -> None:
@@ -147,6 +171,7 @@ class _Fitting:
         """Write the checkpoint, the best weights and the history."""
         if self.run is not None:
             checkpoint = self.objective.checkpoint()
+            # the checkpoint is last: a resumed run drops the lines of epochs after it
             self.run.write_metrics(self.objective.history)
             self.run.save(checkpoint["best_weights"], checkpoint)
 
@@ -158,18 +183,16 @@ class _Fitting:
                 progress.note(note)
             try:
                 status = self.objective.run(progress, self._save)
-                self._keep_results()
+                self.record = self.record.model_copy(update=self.objective.results)
+                if self.run is not None and self.objective.results:
+                    write_json(self.run.config, self.record.to_dict())
                 if arm is not None:
-                    self._fit_baselines(arm)
+                    self.baselines = fit_baselines(arm, self.request.recordings, self.record.preprocessing)
+                    if self.run is not None:
+                        write_json(self.run.baseline, self.baselines)
             except KeyboardInterrupt:
                 return "interrupted"
         return status
-
-    def _keep_results(self) -> None:
-        if self.objective.results:
-            self.record = self.record.model_copy(update=self.objective.results)
-            if self.run is not None:
-                write_json(self.run.config, self.record.to_dict())
 
     def _baseline_arm(self) -> Arm | None:
         """Return the arm that baselines are fitted for; None if its URDF is unknown, or if they are fitted already.
@@ -186,15 +209,51 @@ class _Fitting:
             self.notes.append(Diagnostic("warning", "no-baselines", "run", None, message))
             return None
 
-    def _logs(self) -> list[Trajectory]:
-        """Return all logs, validation included."""
-        validation = self.request.validation
-        return [*self.request.logs, *(() if isinstance(validation, float) else validation)]
 
-    def _fit_baselines(self, arm: Arm) -> None:
-        self.baselines = fit_baselines(arm, self._logs(), self.record.preprocessing)
-        if self.run is not None:
-            write_json(self.run.baseline, self.baselines)
+def objective_of(request: FitRequest) -> Objective:
+    """Return the objective of a request. Raises OptionError if it does not apply to the model."""
+    name = request.config.objective
+    objective = OBJECTIVES[name]
+    under = input_of(request.model)
+    if objective.input != under:
+        message = (
+            f"{name} belongs to arms with 'input: {objective.input}' in their settings, this has '{under}'"
+        )
+        raise OptionError("objective", message)
+    return objective(request)
+
+
+def default_objective(model: ArmModel, rates: Rates) -> str:
+    """Return the objective for a model and its logs.
+
+    "servo" for an arm under position servos; "torque" for rigid bodies if a log is sampled densely enough for
+    accelerations; else "rollout".
+    """
+    if input_of(model) == ServoObjective.input:
+        return ServoObjective.name
+    if isinstance(model, RigidBodyDynamics) and any(map(shows_accelerations, rates())):
+        return "torque"
+    return "rollout"
+
+
+def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rates: Rates) -> FitConfig:
+    """Return the configuration of a fit. Raises OptionError for an option that does not apply to the model."""
+    rigid_bodies = isinstance(model, RigidBodyDynamics)
+    if isinstance(requested, FitConfig):
+        requested.require(rigid_bodies=rigid_bodies)
+        return requested
+    if not isinstance(requested, FitOptions | None):
+        raise SettingsError(
+            f"{requested!r} as the configuration of a fit",
+            expected="spelgen.TorqueFit(), MomentumFit(), Rollout() or ServoFit()",
+        )
+    chosen = requested or FitOptions()
+    objective, defaults = chosen.objective, chosen.defaults
+    if objective is None:
+        objective = default_objective(model, rates)
+        if rigid_bodies and objective == "rollout":  # rigid bodies need no regularizer unless it is requested
+            defaults = {"urdf_weight": 0.0, **defaults}
+    return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.options, defaults=defaults)
 
 
 def sample_rates(logs: Sequence[Trajectory]) -> list[float]:

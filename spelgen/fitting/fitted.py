@@ -151,6 +151,7 @@ class Fit:
             # The zero-phase filter needs a few samples for its transient.
             if self.preprocessing.cutoff and len(piece) > 3:
                 piece = low_pass(piece, self.preprocessing.cutoff)
+            # logs have no accelerations
             qdd = np.gradient(piece.qd, piece.t, axis=0)
             motion = piece.q, piece.qd, qdd, bristles_along(piece.q, reach)
             if std:
@@ -201,6 +202,7 @@ class Fit:
     def _torque(self, *motion: np.ndarray | None) -> np.ndarray:
         """Return torques (T, n) at q, qd, qdd, and at z and direction if they are known (see `DynamicsSamples`)."""
         like = next(self.model.parameters())
+        # torch does not accept arrays with negative strides, which filters return
         inputs = [torch.as_tensor(np.ascontiguousarray(x)).to(like) for x in motion if x is not None]
         with torch.no_grad():
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()
@@ -238,6 +240,7 @@ def load_run(folder: Path | str) -> Fit:
     """Return a run of `spelgen train` or `Fit.save`, with its best weights. Raises RunError and ModuleError."""
     run = RunFolder(folder)
     record = run.read_record()  # a missing run is reported before its model is assembled
+    # a loaded model predicts: derivatives would take memory
     return Fit(
         model=fitted_model(run).requires_grad_(False).eval(),
         history=run.read_metrics(),

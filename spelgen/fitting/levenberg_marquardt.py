@@ -14,6 +14,7 @@ from enum import Enum
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import torch
+from torch import Tensor
 
 from spelgen.fitting.tuning import TUNING
 
@@ -32,18 +33,18 @@ class Termination(Enum):
 class NormalEquations(NamedTuple):
     """Gauss-Newton Hessian of a cost, (..., k, k), and its negative gradient, (..., k)."""
 
-    curvature: torch.Tensor
-    descent: torch.Tensor
+    curvature: Tensor
+    descent: Tensor
 
-    def step(self, damping: float | torch.Tensor = 0.0) -> torch.Tensor:
+    def step(self, damping: float | Tensor = 0.0) -> Tensor:
         """Return the damped step (..., k); damping: one number, or (...), one per system of equations."""
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
         # Marquardt's scaling by diag H, not Levenberg's by 1: steps do not depend on the units of the parameters.
         diagonal = torch.diag_embed(self.curvature.diagonal(dim1=-2, dim2=-1))
-        result: torch.Tensor = torch.linalg.solve(self.curvature + factor * diagonal, self.descent)
+        result: Tensor = torch.linalg.solve(self.curvature + factor * diagonal, self.descent)
         return result
 
-    def predicted_decrease(self, step: torch.Tensor) -> float:
+    def predicted_decrease(self, step: Tensor) -> float:
         """Return the decrease of the quadratic model of the cost after a step (k,): -g^T s - s^T H s / 2."""
         return float(step @ (self.descent - self.curvature @ step / 2))
 
@@ -57,7 +58,7 @@ class SolverState(Generic[Parameters]):
     """
 
     x: Parameters
-    residual: torch.Tensor
+    residual: Tensor
     cost: float
     damping: float
     steps: int = 0
@@ -79,16 +80,16 @@ class SolverResult(Generic[Parameters]):
 class LeastSquaresProblem(Protocol[Parameters]):
     """Cost of parameters x, computed from a residual (or from its sums of squares, if the residual is too large)."""
 
-    def residual(self, x: Parameters) -> torch.Tensor:
+    def residual(self, x: Parameters) -> Tensor:
         """Return the residual, from which the cost is computed: of samples, (T, n), or squared and summed, (n,)."""
 
-    def cost(self, x: Parameters, residual: torch.Tensor) -> float:
+    def cost(self, x: Parameters, residual: Tensor) -> float:
         """Return the cost for this residual, (...,); infinite if the residual diverged."""
 
-    def normal_equations(self, x: Parameters, residual: torch.Tensor) -> NormalEquations:
+    def normal_equations(self, x: Parameters, residual: Tensor) -> NormalEquations:
         """Return Gauss-Newton Hessian and negative gradient with respect to the free parameters, (k, k) and (k,)."""
 
-    def candidates(self, x: Parameters, step: torch.Tensor) -> Iterable[Parameters]:
+    def candidates(self, x: Parameters, step: Tensor) -> Iterable[Parameters]:
         """Return the parameters after a step (k,).
 
         Further candidates are evaluated only if the gain ratio of the ones before (decrease of the cost divided by the
@@ -126,6 +127,7 @@ def levenberg_marquardt(
         min_relative_decrease: likewise relative to the cost after the step.
         callback: is called with the state after each accepted step.
     """
+    # also without a step: a result has the normal equations of its state
     normal = problem.normal_equations(state.x, state.residual)
     for number in range(max_steps):
         if number:
@@ -165,7 +167,7 @@ def _accepted_step(
 def _best_candidate(
     problem: LeastSquaresProblem[Parameters],
     state: SolverState[Parameters],
-    step: torch.Tensor,
+    step: Tensor,
     predicted: float,
 ) -> SolverState[Parameters]:
     """Return the state of minimum cost among the candidates of a step, up to the first with a high gain ratio."""

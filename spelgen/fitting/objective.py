@@ -1,89 +1,24 @@
-"""The base class of all objectives, and their arguments: the request of a fit."""
+"""The base class of all objectives, and the record of a fit."""
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable
 from typing import ClassVar, Literal
 
-from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import input_of
-from spelgen.emission.assemble import ArmModel, spec_of
+from spelgen.emission.assemble import spec_of
 from spelgen.errors import Diagnostic
-from spelgen.fitting.dataset import TrainingData, WindowChoice, prepare_data
+from spelgen.fitting.dataset import FitRequest, PreparedLogs
 from spelgen.fitting.process import TrainingProgress
-from spelgen.fitting.rollout import LossScales
 from spelgen.fitting.run_record import Content, Record
-from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
-from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.yaml_document import validated
 
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """How a fit runs.
-
-    device, threads: of torch. resume: continue from the folder's checkpoint, exactly as if there had been no
-    interruption. force: replace a run. progress: show it on stderr. mapping: with which the logs were read, kept with
-    the run. notes: earlier diagnostics, reported with the others. began: start of the allowed time (`time.monotonic`);
-    None: now.
-    """
-
-    device: str = "cpu"
-    threads: int = 1
-    resume: bool = False
-    force: bool = False
-    progress: bool = False
-    mapping: LogMapping | None = None
-    notes: Sequence[Diagnostic] = ()
-    began: float | None = None
-
-
-@dataclass(frozen=True)
-class FitRequest:
-    """The arguments of a fit.
-
-    validation: the fraction of the logs that is set aside, or trajectories. urdf: of the robot, None if unknown.
-    began: start of the allowed time (`time.monotonic`). folder: of the run, None without one.
-    """
-
-    model: ArmModel
-    logs: Sequence[Trajectory]
-    config: FitConfig
-    preprocessing: Preprocessing
-    validation: float | Sequence[Trajectory]
-    seed: int
-    urdf: Path | None
-    options: RunOptions
-    began: float
-    folder: Path | None
-
-
-@dataclass(frozen=True)
-class PreparedLogs:
-    """Logs that were checked and cut into windows, and the settings that depend on them.
-
-    config, preprocessing: resolved. digest: see `dataset.digest`. training, validation: names of the logs. scales: of
-    the validation loss; None without one. notes: diagnostics for the user.
-    """
-
-    config: FitConfig
-    preprocessing: Preprocessing
-    digest: str
-    training: Sequence[str]
-    validation: Sequence[str]
-    training_windows: int
-    validation_windows: int
-    notes: Sequence[Diagnostic]
-    scales: LossScales | None = None
 
 
 class Objective(ABC):
@@ -132,56 +67,18 @@ class Objective(ABC):
         """Return the content of checkpoint.pt: the keys of `run_record.Checkpoint`, and states for `resume`."""
         return self._checkpoint
 
-
-class TorqueLogObjective(Objective):
-    """An `Objective` for logs with torques, which are cut into windows: for the fit, or only for validation."""
-
-    def _cut_windows(self, window: int, stride: int) -> TrainingData:
-        """Return the training and validation windows of the logs. Raises LogError and RunError."""
-        request = self.request
-        reach = bristle_reach(self.model)
-        choice = WindowChoice(window, stride, request.validation, request.seed, reach)
-        joints, kinds = self.model.joint_names, self.model.joint_types
-        return prepare_data(request.logs, joints, kinds, request.preprocessing, choice)
-
-    def _prepared(self, data: TrainingData, config: FitConfig) -> PreparedLogs:
-        """Return the prepared logs of these windows."""
-        return PreparedLogs(
-            config=config,
-            preprocessing=data.preprocessing,
-            digest=data.digest,
-            training=data.training_names,
-            validation=data.validation_names,
-            training_windows=len(data.training),
-            validation_windows=len(data.validation),
-            notes=data.diagnostics,
-            scales=data.scales,
-        )
-
-    def _regularizer(
-        self, data: TrainingData, weight: float, notes: list[Diagnostic]
-    ) -> UrdfRegularizer | None:
-        """Return the regularizer towards the URDF; None without a weight or a readable URDF."""
-        urdf = self.request.urdf
-        if not weight or urdf is None or not urdf.exists():
-            return None
-        try:
-            return urdf_regularizer(urdf, self.model.joint_names, self.model, data.training)
-        # Pinocchio and its parser raise many types; the fit continues without a regularizer
-        except Exception as error:
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            message = f"fitted without the URDF's regularizer: {reason}"
-            notes.append(Diagnostic("info", "no-regularizer", urdf.name, None, message))
-            return None
+    def _make_checkpoint(self, loss: float, seconds: float, substeps: int, step: int = 0) -> None:
+        """Make a checkpoint with the current weights of the model, for an objective without epochs."""
+        self._checkpoint = {
+            "epoch": 0, "step": step, "best_epoch": 0, "best_loss": loss, "seconds": seconds, "substeps": substeps,
+            "best_weights": copy.deepcopy(self.model.state_dict()),
+        }  # fmt: skip
 
 
-def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
+def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -> Record:
     """Return the record of a fit before it runs, with the resolved options that apply to the model and no others."""
-    model, spec = request.model, spec_of(request.model)
-    config, fraction = prepared.config, None
-    if prepared.validation and isinstance(request.validation, float):
-        fraction = request.validation
-    notes = [*prepared.notes, *request.options.notes]
+    model, spec, options = request.model, spec_of(request.model), request.options
+    notes = [note for note in (*prepared.diagnostics, *options.notes) if note.severity == "warning"]
     record = Record(
         schema=2,
         robot=spec.robot if spec else type(model).__name__,
@@ -190,23 +87,22 @@ def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
         objective=config.objective,
         config=validated(type(config), config.record(rigid_bodies=isinstance(model, RigidBodyDynamics))),
         preprocessing=prepared.preprocessing,
-        validation_fraction=fraction,
+        validation_fraction=None,
         seed=request.seed,
         data_digest=prepared.digest,
-        training=list(prepared.training),
-        validation=list(prepared.validation),
-        training_windows=prepared.training_windows,
-        validation_windows=prepared.validation_windows,
-        mapping=request.options.mapping or LogMapping(input=input_of(model)),
-        device=request.options.device,
-        threads=request.options.threads,
-        warnings=[
-            f"{note.where}: {note.message}"
-            for note in notes
-            if note.severity == "warning" and note.where != "run"
-        ],
+        training=list(prepared.training_names),
+        validation=list(prepared.validation_names),
+        training_windows=prepared.window_counts[0],
+        validation_windows=prepared.window_counts[1],
+        mapping=options.mapping or LogMapping(input=input_of(model)),
+        device=options.device,
+        threads=options.threads,
+        # of logs and links; diagnostics of the run are about the command, and do not describe the model
+        warnings=[f"{note.where}: {note.message}" for note in notes if note.where != "run"],
     )
-    if prepared.scales is None:
-        return record
-    scales = {name: x.tolist() for name, x in prepared.scales._asdict().items()}
-    return record.model_copy(update={"scales": scales})
+    known: Content = {}
+    if prepared.validation_names and isinstance(request.validation, float):
+        known["validation_fraction"] = request.validation
+    if prepared.scales is not None:
+        known["scales"] = {name: x.tolist() for name, x in prepared.scales._asdict().items()}
+    return record.model_copy(update=known)

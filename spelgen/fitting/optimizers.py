@@ -12,14 +12,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 
 import torch
+from torch import Tensor
 
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.tuning import TUNING
 from spelgen.logs.windows import Windows
 
-Loss = Callable[[Windows], torch.Tensor]
+Loss = Callable[[Windows], Tensor]
 LearningRate = Callable[[int], float]
-Summands = Callable[[], Iterable[torch.Tensor]]  # of a loss; one at a time is in memory with its graph
+Summands = Callable[[], Iterable[Tensor]]  # of a loss; one at a time is in memory with its graph
 
 
 class WindowOptimizer(ABC):
@@ -86,7 +87,7 @@ class MiniBatchAdamW(WindowOptimizer):
         rows, size = steps * self._batch, len(windows)
         # Whole passes over the windows, so that each window is used equally often.
         passes = [torch.randperm(size, generator=self._generator) for _ in range(-(-rows // size))]
-        total: torch.Tensor | float = 0.0  # on the device: no synchronization with a GPU between steps
+        total: Tensor | float = 0.0  # on the device: no synchronization with a GPU between steps
         for step, batch in enumerate(torch.cat(passes)[:rows].split(self._batch)):
             for group in self._optimizer.param_groups:
                 group["lr"] = learning_rate(step) * group["factor"]
@@ -94,7 +95,7 @@ class MiniBatchAdamW(WindowOptimizer):
         mean = float(total) / steps
         return mean if math.isfinite(mean) else math.nan
 
-    def _step(self, loss: Loss, windows: Windows) -> torch.Tensor | float:
+    def _step(self, loss: Loss, windows: Windows) -> Tensor | float:
         """Take a step and return the loss before it, (); NaN if the loss or its gradient is not finite."""
         self._optimizer.zero_grad()
         try:
@@ -133,6 +134,7 @@ class LBFGS(WindowOptimizer):
             self._parameters,
             history_size=TUNING.lbfgs_history,
             line_search_fn="strong_wolfe",
+            # simulated logs are fitted to many digits: `stalled` ends the fit, not torch
             tolerance_grad=1e-12,
             tolerance_change=1e-15,
         )
@@ -169,7 +171,7 @@ class LBFGS(WindowOptimizer):
         waits: int = self._optimizer.param_groups[0]["waits"]
         return waits > 1
 
-    def _evaluated(self, summands: Summands) -> torch.Tensor:
+    def _evaluated(self, summands: Summands) -> Tensor:
         """Return the loss with its penalty, (), after its backward pass; a large number if it is not finite."""
         self._optimizer.zero_grad()
         try:
@@ -189,7 +191,7 @@ class LBFGS(WindowOptimizer):
         self._optimizer.zero_grad()
         return torch.tensor(TUNING.too_large, dtype=torch.float64)
 
-    def _penalty(self) -> torch.Tensor | float:
+    def _penalty(self) -> Tensor | float:
         return 0.5 * self._decay * sum(weight.square().sum() for weight in self._matrices)
 
 

@@ -18,11 +18,10 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.body_regressor import base_combinations, constants_regressor
-from spelgen.dynamics.parameters import friction_factor
+from spelgen.dynamics.parameters import evaluate_with, friction_factor
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
-from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import ParameterVector

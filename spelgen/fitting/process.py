@@ -78,6 +78,7 @@ def locked(folder: Path | None) -> Iterator[None]:
     # Folders that do not exist yet: they are removed if the fit writes nothing.
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     file = folder / LOCK
+    # no wait: the user may not know of the other process
     lock = FileLock(file, timeout=0)
     with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)

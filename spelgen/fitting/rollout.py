@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from spelgen.dynamics.equations import mass_as_learned, runge_kutta
 from spelgen.dynamics.protocol import known_past, memory_after, memory_along, sliding_memory
@@ -23,7 +24,7 @@ AT_REST = 1e-6  # [rad, m] below the resolution of encoders
 
 def roll_out(
     model: PortHamiltonian, windows: Windows, substeps: int = 1, solver: Solver = "rk4"
-) -> tuple[torch.Tensor, torch.Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Return positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
 
     The state is (q, p) with p = M(q) qd, so that no time derivative of M is needed. The windows form one batch, each
@@ -45,9 +46,7 @@ def roll_out(
     positions, velocities = [], []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
 
-        def rhs(
-            q: torch.Tensor, p: torch.Tensor, z: torch.Tensor, tau: torch.Tensor = tau
-        ) -> tuple[torch.Tensor, torch.Tensor]:
+        def rhs(q: Tensor, p: Tensor, z: Tensor, tau: Tensor = tau) -> tuple[Tensor, Tensor]:
             """Return the rates of q and p, (W, n) each."""
             return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
 
@@ -63,12 +62,12 @@ def roll_out(
 
 def _adaptive_step(
     dynamics: object,
-    rhs: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]],
-    q: torch.Tensor,
-    p: torch.Tensor,
-    z: torch.Tensor,
-    step: torch.Tensor | float,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    rhs: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
+    q: Tensor,
+    p: Tensor,
+    z: Tensor,
+    step: Tensor | float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Integrate over one interval with adaptive steps; arguments and results (W, n) as of `runge_kutta`.
 
     Dormand and Prince, J. Comput. Appl. Math. 6 (1980), differentiated through the solver. All windows are solved
@@ -76,7 +75,7 @@ def _adaptive_step(
     """
     from torchdiffeq import odeint  # its import takes half a second
 
-    def rate(t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+    def rate(t: Tensor, state: Tensor) -> Tensor:
         """Return the rate of the state (q, p), (W, 2 n), per sample interval."""
         q_now, p_now = state.chunk(2, dim=-1)
         return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
@@ -86,9 +85,7 @@ def _adaptive_step(
     return q_end, p_end, memory_after(dynamics, z, q_end - q), rhs(q, p, z)[0]
 
 
-def position_difference(
-    predicted: torch.Tensor, measured: torch.Tensor, joint_types: Sequence[str]
-) -> torch.Tensor:
+def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequence[str]) -> Tensor:
     """Return the signed distance (..., n) [rad, m]: the difference, for revolute joints the geodesic distance on SO(3).
 
     For rotations about a common axis, R = exp(q e), the geodesic distance |log(R^T R')| / sqrt(2) is the wrapped angle
@@ -96,6 +93,7 @@ def position_difference(
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
+    # constant in the derivatives: the wrapped angle has slope one
     turns = torch.round(difference.detach() / (2 * math.pi))
     return difference - 2 * math.pi * torch.where(revolute, turns, 0.0)
 
@@ -107,9 +105,9 @@ class LossScales(NamedTuple):
     standard deviation [Nm, N].
     """
 
-    q: torch.Tensor
-    qd: torch.Tensor
-    tau: torch.Tensor
+    q: Tensor
+    qd: Tensor
+    tau: Tensor
 
     def to(self, device: str | torch.device) -> LossScales:
         """Return the scales on another device."""
@@ -136,16 +134,17 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
     )
 
 
-def _scale(mean_square: torch.Tensor) -> torch.Tensor:
+def _scale(mean_square: Tensor) -> Tensor:
     """Return the root of mean squares (..., n), at least 1 % of the largest one."""
     root = mean_square.sqrt()
+    # above zero even if nothing varies: errors are divided by the scale
     smallest = (1e-2 * root.amax(dim=-1, keepdim=True)).clamp(min=1e-9)
     return torch.maximum(root, smallest)
 
 
 def rollout_errors(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
-) -> torch.Tensor:
+) -> Tensor:
     """Return scaled errors (W, K-1, 2n) of the rollout: of the positions, then of the velocities."""
     q, qd = roll_out(model, windows, substeps, solver)
     position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q
@@ -154,7 +153,7 @@ def rollout_errors(
 
 def rollout_loss(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
-) -> torch.Tensor:
+) -> Tensor:
     """Return the mean squared scaled error, (), of the rollouts (W, K, n): SPEL eq. 8 with other units.
 
     The paper sums squared geodesic distances and velocity errors over joints and samples in rad and rad/s. Scaled, all
@@ -163,7 +162,7 @@ def rollout_loss(
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
 
-def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> torch.Tensor:
+def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tensor:
     """Return the mean squared residual of the weak form, (): p(t) - p(0) minus the impulse of all forces until t.
 
     The impulse is along the measured samples, by the trapezium rule: no ODE solution and no accelerations are needed.
@@ -192,11 +191,11 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> torc
         inputs = model.input_matrix(q).abs()
     # of joint torques: there may be gears between motors and joints
     unit = (inputs @ scales.tau).mean(dim=(0, 1))
-    result: torch.Tensor = (residual / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
+    result: Tensor = (residual / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
     return result
 
 
-def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> Tensor:
     """Return `rollout_errors`, (W, K-1, 2n), without gradients; NaN if the rollout diverges."""
     try:
         with torch.no_grad():
@@ -205,7 +204,7 @@ def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int)
         return torch.tensor(math.nan)
 
 
-def integration_error(coarse: torch.Tensor, fine: torch.Tensor) -> float:
+def integration_error(coarse: Tensor, fine: Tensor) -> float:
     """Return the integration error of a rollout relative to the error of the model.
 
     Args:

@@ -9,6 +9,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import torch
+from torch import Tensor
 
 from spelgen.emission.assemble import ArmModel, assemble
 from spelgen.errors import ModuleError, RunError
@@ -16,10 +17,6 @@ from spelgen.files import local, read_bytes, read_json, remove, require_regular_
 from spelgen.fitting.run_record import Checkpoint, Content, Epoch, Record, require
 from spelgen.spec import ModelSpec, spec_from_json
 from spelgen.urdf.document import urdf_bytes
-
-# Largest specification that is read [bytes]: the largest that `spelgen build` makes has a tenth.
-MAX_SPEC = 2**20
-LARGEST_STATE = 2**29  # bytes of model.pt or checkpoint.pt, unpacked
 
 
 class RunFolder:
@@ -33,11 +30,11 @@ class RunFolder:
 
     def __init__(self, path: Path | str) -> None:
         self.path = local(path)
+        self.config = self.path / "config.json"
         self.spec = self.path / "spec.json"
         self.urdf = self.path / "robot.urdf"
         self.settings = self.path / "robot.yaml"
         self.mapping = self.path / "mapping.yaml"
-        self.config = self.path / "config.json"
         self.metrics = self.path / "metrics.jsonl"
         self.checkpoint = self.path / "checkpoint.pt"
         self.weights = self.path / "model.pt"
@@ -50,11 +47,8 @@ class RunFolder:
         if self.path.exists() and not self.path.is_dir():
             raise RunError("a file", file=self.path, expected="a folder or a new name")
         if self.config.exists() and not force:
-            raise RunError(
-                "there is a run in this folder",
-                file=self.path,
-                do="--resume it, --force to replace it, or -o another",
-            )
+            do = "--resume it, --force to replace it, or -o another"
+            raise RunError("there is a run in this folder", file=self.path, do=do)
 
     def start(self, spec: ModelSpec, urdf: Path | None, *, force: bool) -> None:
         """Make the folder, write the specification and copy the robot into it.
@@ -62,24 +56,18 @@ class RunFolder:
         A folder is a run if it has config.json, which is written last. Raises RunError if there is one, unless forced.
         """
         self.require_free(force=force)
-        # read before anything is removed: the files may be the copies in this run folder
-        robot = self._robot_files(urdf)
-        # first the files that mark a run
-        old_files = (
-            self.config, self.urdf, self.settings, self.mapping, self.metrics, self.checkpoint, self.weights,
-            self.evaluation, self.baseline, self.estimator,
-        )  # fmt: skip
-        for old in old_files:
-            remove(old)
-        for path, content in [(self.spec, f"{spec.to_json()}\n".encode()), *robot]:
-            write_bytes(path, content)
-
-    def _robot_files(self, urdf: Path | None) -> list[tuple[Path, bytes]]:
-        if urdf is None:
-            return []
-        settings = urdf.with_suffix(".yaml")
-        robot = [(self.urdf, urdf_bytes(urdf))] if urdf.exists() else []  # a xacro file is expanded
-        return robot + ([(self.settings, settings.read_bytes())] if settings.is_file() else [])
+        content = {self.spec: f"{spec.to_json()}\n".encode()}
+        # before anything is removed: they may be this very run's copies
+        if urdf is not None and urdf.exists():
+            content[self.urdf] = urdf_bytes(urdf)  # a xacro file is expanded
+        if urdf is not None and (settings := urdf.with_suffix(".yaml")).is_file():
+            content[self.settings] = settings.read_bytes()
+        # first config.json, which marks a run
+        for file in vars(self).values():
+            if file != self.path:
+                remove(file)
+        for file, written in content.items():
+            write_bytes(file, written)
 
     def save(self, weights: Content, checkpoint: Content) -> None:
         """Write model.pt and checkpoint.pt."""
@@ -95,9 +83,9 @@ class RunFolder:
 
     def read_metrics(self) -> list[Content]:
         """Return the lines of metrics.jsonl, without an incomplete last one."""
-        lines, records = [], []
-        if self.metrics.exists():
-            lines = read_bytes(self.metrics, RunError).decode("utf-8", "replace").splitlines()
+        if not self.metrics.exists():
+            return []
+        records, lines = [], read_bytes(self.metrics, RunError).decode("utf-8", "replace").splitlines()
         for count, line in enumerate(lines, start=1):
             try:
                 record = json.loads(line)
@@ -111,10 +99,12 @@ class RunFolder:
     def read_json(self, path: Path) -> Content:
         """Return the object in a JSON file of the folder. Raises RunError if the file is absent or broken."""
         if not path.exists():
-            raise RunError(
-                "no such run", file=self.path, expected=f"a folder with {path.name}", do="spelgen train"
-            )
+            raise self._no_run(path)
         return read_json(path, RunError)
+
+    def _no_run(self, missing: Path) -> RunError:
+        expected = f"a folder with {missing.name}"
+        return RunError("no such run", file=self.path, expected=expected, do="spelgen train")
 
     def read_record(self) -> Record:
         """Return config.json. Raises RunError if it is absent, broken, or has a key absent or of another type."""
@@ -135,15 +125,14 @@ class RunFolder:
         if not path.exists():
             raise RunError(f"no {path.name}", file=self.path, expected="a run folder", do="spelgen train")
         require_regular_file(path, RunError)
+        expected = "a file of `spelgen train`"
         try:
             _require_unpacked_size(path)
             state = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # torch has no common type of errors for broken files
-            raise RunError(
-                f"unreadable ({type(error).__name__})", file=path, expected="a file of `spelgen train`"
-            ) from error
+            raise RunError(f"unreadable ({type(error).__name__})", file=path, expected=expected) from error
         if not isinstance(state, dict):
-            raise RunError(type(state).__name__, file=path, expected="a file of `spelgen train`")
+            raise RunError(type(state).__name__, file=path, expected=expected)
         return state
 
     def read_spec(self) -> ModelSpec:
@@ -154,10 +143,9 @@ class RunFolder:
                     "a run of an earlier version of spelgen", file=self.path, expected=f"a run with {self.spec.name}",
                     do="build the module again with `spelgen build`, and train it again with `spelgen train`",
                 )  # fmt: skip
-            raise RunError(
-                "no such run", file=self.path, expected=f"a folder with {self.spec.name}", do="spelgen train"
-            )
-        text = read_bytes(self.spec, ModuleError, "a specification of a model", MAX_SPEC)
+            raise self._no_run(self.spec)
+        # the largest specification that `spelgen build` makes has a tenth of this size
+        text = read_bytes(self.spec, ModuleError, "a specification of a model", 2**20)
         return spec_from_json(text.decode("utf-8", "replace"), self.spec)
 
     def untrained_model(self) -> ArmModel:
@@ -165,35 +153,33 @@ class RunFolder:
         return assemble(self.read_spec())
 
 
-SERVO_LIMIT = "servo.limit"
-
-
 def _require_unpacked_size(path: Path) -> None:
     """Raise ValueError if tensors would fill the memory: torch allocates the sizes that a file states."""
     with ZipFile(path) as archive:
         size = sum(member.file_size for member in archive.infolist())
-    if size > LARGEST_STATE:
-        raise ValueError(f"{size} bytes, expected at most {LARGEST_STATE}")
+    # far more than a checkpoint with the state of an optimizer
+    if size > 2**29:
+        raise ValueError(f"{size} bytes, expected at most {2**29}")
 
 
 def _require_finite(weights: Content, path: Path) -> None:
     """Raise RunError if a weight is not finite: all results of the model would be NaN."""
     for name, tensor in weights.items():
-        if not isinstance(tensor, torch.Tensor):
+        if not isinstance(tensor, Tensor):
             continue
         stored = tensor.untyped_storage()
         # a shape may repeat a few numbers to any size
         if tensor.numel() * tensor.element_size() > stored.nbytes():
             tensor = tensor.new_empty(0).set_(stored)
         # a servo without an effort limit has an infinite one
-        if tensor.isnan().any() or (name != SERVO_LIMIT and tensor.isinf().any()):
-            raise RunError(
-                "no finite numbers", file=path, element=name, expected="weights", do="start a new run"
-            )
+        if tensor.isnan().any() or (name != "servo.limit" and tensor.isinf().any()):
+            do = "start a new run"
+            raise RunError("no finite numbers", file=path, element=name, expected="weights", do=do)
 
 
 def write_state(path: Path, state: Content) -> None:
     """Write a state with torch.save, all or nothing."""
+    # in memory first: an interruption leaves the former file
     buffer = io.BytesIO()
     torch.save(state, buffer)
     write_bytes(path, buffer.getvalue())

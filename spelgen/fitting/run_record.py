@@ -170,6 +170,7 @@ def require(schema: type[Schema], content: object, file: Path, line: int | None 
     try:
         return schema.model_validate(content)
     except ValidationError as error:
+        # one error suffices: a file that was written by a fit has none
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"]))
         message = f"{key}: {first['msg']}".removeprefix(": ")

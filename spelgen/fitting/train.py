@@ -10,9 +10,8 @@ from pathlib import Path
 
 from spelgen.emission.assemble import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
-from spelgen.fitting.fit import AUTOMATIC, QUIET, RunOptions, fit, sample_rates
+from spelgen.fitting.fit import AUTOMATIC, QUIET, FitOptions, RunOptions, choose_config, fit, sample_rates
 from spelgen.fitting.fitted import Fit
-from spelgen.fitting.objectives import FitOptions, choose_config
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import BoundedLogs, read_bounded_logs
@@ -57,6 +56,7 @@ def train(
         if preprocessing is AUTOMATIC:
             preprocessing = record.preprocessing
         options = replace(options, mapping=options.mapping or record.mapping)
+        # its weights come from the checkpoint
         model = run.untrained_model()
     else:
         model = load_module(module) if module is not None else fitted_model(RunFolder(source or folder))
@@ -88,21 +88,24 @@ def robot_of(
         path = module.parent / spec.urdf
     else:
         return None, []
-    if not path.is_file():
-        if urdf is not None:
-            raise RunError("no such file", file=path, expected="the URDF the module was built from")
+    exists = path.is_file()
+    if exists and hashlib.sha256(urdf_bytes(path)).hexdigest() == spec.urdf_sha256:
+        return path, []
+    if urdf is not None and exists:
+        do = "build the module again"
+        raise ModuleError("another URDF than the module was built from", file=path, do=do)
+    if urdf is not None:
+        raise RunError("no such file", file=path, expected="the URDF the module was built from")
+    # a file beside the module was not asked for: the fit goes on without it
+    if exists:
+        code = "changed-urdf"
+        message = (
+            f"{spec.urdf} beside the module has changed since the module was built; it is left out of the run"
+        )
+    else:
+        code = "no-urdf"
         message = (
             f"no {spec.urdf} beside the module; pass it by --robot. Without it, evaluation has no baseline with the "
             "URDF's values, and the run cannot be exported"
         )
-        return None, [Diagnostic("warning", "no-urdf", "run", None, message)]
-    if hashlib.sha256(urdf_bytes(path)).hexdigest() == spec.urdf_sha256:
-        return path, []
-    if urdf is not None:
-        raise ModuleError(
-            "another URDF than the module was built from", file=path, do="build the module again"
-        )
-    message = (
-        f"{spec.urdf} beside the module has changed since the module was built; it is left out of the run"
-    )
-    return None, [Diagnostic("warning", "changed-urdf", "run", None, message)]
+    return None, [Diagnostic("warning", code, "run", None, message)]

@@ -33,7 +33,7 @@ class FittingTuning:
     # [1] Training windows on which the integration error is monitored.
     probe_windows: int = 64
 
-    # Steps on windows (`fitting.window.momentum`).
+    # Steps on windows (`fitting.momentum_objective`).
 
     # [1] Smallest number of steps per epoch; few windows are passed several times between validations.
     epoch_steps: int = 20
@@ -46,7 +46,7 @@ class FittingTuning:
     # [1] Factor on the learning rate of momentum steps, which are cheap and noisy.
     momentum_factor: float = 10.0
 
-    # Epochs of predicted windows (`fitting.window.rollout`).
+    # Epochs of predicted windows (`fitting.rollout_objective`).
 
     # [1] Largest fraction of all steps or minutes during which residual terms of rigid bodies are constant.
     first_stage: float = 0.8

@@ -24,8 +24,8 @@ class ContactState(NamedTuple):
 class ContactObserver:
     """First-order low-pass filter of the momentum balance, updated with each sample.
 
-    Each low-passed term is a state: the torque, friction and momenta of the arm, (5, n), and the payload's regressor,
-    (n, 10).
+    Each low-passed term is a state, (15, n): torque, friction, its uncertainty, the momenta of the arm at two
+    bandwidths, and the regressor of the payload.
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -34,9 +34,8 @@ class ContactObserver:
 
     def restart(self) -> None:
         """Discard the filter states; the next sample initialises them."""
-        n = len(self.factor)
         self.t: float | None = None
-        self.inputs, self.load_inputs = np.zeros((5, n)), np.zeros((n, 10))
+        self.inputs = self.low = np.zeros((15, len(self.factor)))
 
     def step(
         self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
@@ -53,32 +52,25 @@ class ContactObserver:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the low-pass filtered torque residual of model, payload and drift, and its variance, (n,) each."""
         rate = TUNING.bandwidth
-        inputs = np.stack(
-            [
-                at.torque - at.friction + rate * at.momentum,
-                at.friction,
-                at.uncertainty,
-                at.momentum,
-                at.momentum,
-            ]
-        )
         load = at.load_torque + rate * at.load_momentum
+        free = at.torque - at.friction + rate * at.momentum
+        inputs = np.stack([free, at.friction, at.uncertainty, at.momentum, at.momentum, *load.T])
         if self.t is None:
             # the steady state for constant inputs
-            self.low, self.load = inputs.copy(), load.copy()
+            self.low = inputs
         else:
-            step = t - self.t
-            slow, fast = 1 - np.exp(-rate * step), 1 - np.exp(-2 * rate * step)
-            gains = np.array([slow, slow, slow, slow, fast])
-            self.low += gains[:, None] * (0.5 * (inputs + self.inputs) - self.low)
-            self.load += slow * (0.5 * (load + self.load_inputs) - self.load)
-        self.t, self.inputs, self.load_inputs = t, inputs, load
+            gains = np.full((len(inputs), 1), 1 - np.exp(-rate * (t - self.t)))
+            # the second momentum, at twice the bandwidth: the difference of both tells the change of acceleration
+            gains[4] = 1 - np.exp(-2 * rate * (t - self.t))
+            self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
+        self.t, self.inputs = t, inputs
+        torque, friction, uncertainty, slow, fast = self.low[:5]
         # regressor Phi of the payload, (n, 10), as in `Block`
-        regressor = rate * at.load_momentum - self.load
-        signal = self.low[0] - rate * at.momentum - regressor @ payload.parameters - self.low[1] * scale
-        jerk = 2 * rate * (at.momentum - self.low[4]) - rate * (at.momentum - self.low[3])
+        regressor = rate * at.load_momentum - self.low[5:].T
+        signal = torque - rate * at.momentum - regressor @ payload.parameters - friction * scale
+        jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
         resting = TUNING.resting_friction * self.levels.coulomb * np.exp(-np.abs(qd) / self.levels.rest_speed)
-        variance = self.levels.observer**2 + resting**2 + jerk**2 + TUNING.uncertainty * self.low[2] ** 2
+        variance = self.levels.observer**2 + resting**2 + jerk**2 + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)
         return signal, variance
 

@@ -9,17 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import is_stateful
 from spelgen.errors import RunError
 from spelgen.fitting.fitted import Fit
-from spelgen.live.blocks import Block, Blocks, joined
 from spelgen.live.contact import ContactObserver, ContactState
-from spelgen.live.cross_validation import noise_levels
-from spelgen.live.filters import DriftFilter
-from spelgen.live.hypotheses import PayloadEstimate
-from spelgen.live.intake import IGNORED, Intake, Refusal
-from spelgen.live.momentum import Balance, balance, load_torque
+from spelgen.live.filters import Block, Blocks, JointFilters, PayloadEstimate
+from spelgen.live.intake import Intake, Refusal, balance_along
+from spelgen.live.levels import noise_levels
+from spelgen.live.momentum import Balance
 from spelgen.live.noise import NoiseLevels
 from spelgen.live.payload import NO_REPORT, Payload, find_payload
 from spelgen.live.tuning import TUNING
@@ -74,9 +73,9 @@ class Estimator:
         """Reset to unknown payload, friction drift and friction state."""
         n = self.model.n
         self.intake = Intake(self.levels, self.reach)
-        self.blocks = Blocks(n, self.levels.rest_speed)
+        self.blocks = Blocks(self.levels.rest_speed)
         self.estimate = PayloadEstimate(self.levels)
-        self.drift = DriftFilter(self.levels.drift)
+        self.drift = JointFilters.of_drift(self.levels.drift)
         self.observer = ContactObserver(self.levels, self.alarms_per_minute)
         self.payload = NO_REPORT
         self.half: Block | None = None
@@ -101,24 +100,11 @@ class Estimator:
         self, t: np.ndarray, q: np.ndarray, qd: np.ndarray, tau: np.ndarray
     ) -> Iterator[EstimatorState]:
         """Use samples, (T,) and (T, n); return their estimates."""
-        checked: list[Refusal] = []
-        bounds: list[tuple[np.ndarray, np.ndarray]] = []
-        for sample in zip(t.tolist(), q, qd, tau, strict=True):
-            checked.append(self.intake.accept(*sample))
-            bounds.append((self.intake.low, self.intake.high))
-        used = [k for k, refusal in enumerate(checked) if refusal not in IGNORED]
-        low, high = (np.array([pair[side] for pair in bounds]) for side in (0, 1))
-        rows: Iterator[tuple[np.ndarray, ...]] = iter(())
-        if used:
-            bounded = [x[used] for x in (low, high)]
-            terms = balance(self.model, self.levels.point, [x[used] for x in (q, qd, tau)], bounded)
-            rows = iter(zip(*terms, strict=True))
-        for k, refusal in enumerate(checked):
-            changed = False
-            if refusal not in IGNORED:
-                changed = self._advance(float(t[k]), qd[k], Balance(*next(rows)), refusal)
-            a, d = self.drift.a, self.drift.d
-            yield EstimatorState(float(t[k]), refusal, self.contact, self.payload, changed, 1 + a, d)
+        refusals, terms = balance_along(self.model, self.levels, self.intake, t, (q, qd, tau))
+        for now, speed, refusal, at in zip(t.tolist(), qd, refusals, terms, strict=True):
+            changed = at is not None and self._advance(now, speed, at, refusal)
+            a, d = self.drift.x.T
+            yield EstimatorState(now, refusal, self.contact, self.payload, changed, 1 + a, d)
 
     def _advance(self, t: float, qd: np.ndarray, at: Balance, refusal: Refusal) -> bool:
         """Update all filters with the terms of a sample; return True if a change of the load was detected."""
@@ -127,17 +113,13 @@ class Estimator:
             self.half = None
             if refusal == "gap":
                 self.observer.restart()
-        theta = self.payload.parameters
-        self.contact = self.observer.step(t, qd, at, self.payload, self.drift.a)
-        if refusal != "saturated":
-            block = self.blocks.add(t, qd, at)
-            if block is not None:
-                self.drift.update(block, theta)
-                if self.half is None:
-                    self.half = block
-                else:
-                    self.estimate.start(joined(self.half, block))
-                    self.half = None
+        self.contact = self.observer.step(t, qd, at, self.payload, self.drift.x[:, 0])
+        block = None if refusal == "saturated" else self.blocks.add(t, qd, at)
+        if block is not None:
+            self.drift.update(block, block.y - block.load @ self.payload.parameters)
+            if self.half is not None:
+                self.estimate.start(self.half.joined(block))
+            self.half = block if self.half is None else None
         self.estimate.step()
         changed, self.estimate.changed = self.estimate.changed, False
         if changed or self.estimate.moved - self.reported >= TUNING.report:
@@ -146,19 +128,15 @@ class Estimator:
 
     def report(self) -> Payload:
         """Estimate the payload and use it from the next step on; ``step`` calls this after each second of motion."""
-        main = self.estimate.filters[0]
+        main, before = self.estimate.filters[0], self.payload
         self.reported = self.estimate.moved
-        before, self.payload = (
-            self.payload,
-            find_payload(main.x[:10], main.P[:10, :10], self.levels.load_variance),
-        )
+        self.payload = find_payload(main.x[:10], main.P[:10, :10], self.levels.load_variance)
         if (before.status == "payload") != (self.payload.status == "payload"):
             # the drift filter has attributed torques of the load to friction: it starts from the payload filter
-            n = self.model.n
-            joints = np.arange(10, 10 + n)
-            self.drift = DriftFilter(self.levels.drift)
-            self.drift.a = main.x[joints].copy()
-            self.drift.P[0] = main.P[joints, joints]
+            joints = slice(10, 10 + self.model.n)
+            self.drift = JointFilters.of_drift(self.levels.drift)
+            self.drift.x[:, 0] = main.x[joints]
+            self.drift.P[:, 0, 0] = main.P.diagonal()[joints]
         return self.payload
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float = 0.0) -> np.ndarray:
@@ -174,11 +152,15 @@ class Estimator:
         with torch.no_grad():
             torque = self.model.inverse_dynamics(*at, *past)
             friction = self.model.friction_torque(*at[:2], *past)
-            q_, qd_, qdd_ = (x.unsqueeze(0) for x in at)
-            load = load_torque(self.model, q_, qd_, qdd_, torch.from_numpy(self.payload.parameters))[0]
-            a, d = map(torch.from_numpy, self.drift.ahead(ahead))
-            at_configuration = self.model.at(at[0])
-            return (torque + self.model.input_torque(at_configuration, load + a * friction + d)).numpy()
+            # the payload moves with the last body
+            regressor = regressor_of(self.model.chain, *at)[..., -10:]
+            load = regressor @ torch.from_numpy(self.payload.parameters)
+            decay = np.zeros(1)
+            if ahead <= TUNING.disturbance_ahead:
+                decay = np.exp(-ahead / self.levels.drift.time_constant)
+            a, d = self.drift.x.T
+            drift = torch.from_numpy(a) * friction + torch.from_numpy(d * decay)
+            return (torque + self.model.input_torque(self.model.at(at[0]), load + drift)).numpy()
 
 
 def torque_model(fit: Fit) -> RigidBodyDynamics:

@@ -7,72 +7,127 @@ a control loop can spread them over its samples.
 
 from __future__ import annotations
 
+import copy
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
 import numpy as np
 
-from spelgen.live.blocks import Block
-from spelgen.live.noise import BlockNoise
-from spelgen.live.payload import LOAD_PRIOR
+from spelgen.live.momentum import Balance
+from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.tuning import TUNING
 
 
-def huber(squared: float, variance: float) -> float:
-    """Return the variance for a residual: `variance` of the model, increased for an outlier; squared: residual^2."""
-    return max(variance, squared / TUNING.outlier**2)
+class Block(NamedTuple):
+    """Means of the terms of the momentum balance over a block of samples.
+
+    duration [s]. y: torque residual of the model, (n,) [Nm, N]. load: regressor Phi of the payload, (n, 10).
+    friction: of the model, (n,) [Nm, N]. uncertainty: of friction whose state is not known exactly, (n,) [Nm, N].
+    moving: whether each joint moved, (n,).
+    """
+
+    duration: float
+    y: np.ndarray
+    load: np.ndarray
+    friction: np.ndarray
+    uncertainty: np.ndarray
+    moving: np.ndarray
+
+    def joined(self, later: Block) -> Block:
+        """Return one block for this block and the next one."""
+        duration = self.duration + later.duration
+        # means over time, so that the longer block counts more
+        weight = later.duration / duration
+        y, load, friction, uncertainty = (
+            a + weight * (b - a) for a, b in zip(self[1:5], later[1:5], strict=True)
+        )
+        return Block(duration, y, load, friction, uncertainty, self.moving & later.moving)
+
+
+class Blocks:
+    """Accumulator of samples that returns a `Block` after each period of `TUNING.block` seconds; no low-pass filter."""
+
+    def __init__(self, rest_speed: np.ndarray) -> None:
+        self.rest_speed = rest_speed
+        self.restart()
+
+    def restart(self) -> None:
+        """Discard the samples of the current block, after a gap."""
+        self.samples: list[tuple[float, np.ndarray, Balance]] = []
+        self.duration = 0.0
+
+    def add(self, t: float, qd: np.ndarray, at: Balance) -> Block | None:
+        """Add a sample: time [s], velocities (n,) and terms of the balance; return the block if it is complete."""
+        step = t - self.samples[-1][0] if self.samples else 0.0
+        self.samples.append((t, np.abs(qd), at))
+        # the sum of the steps, as the C code has it: t minus the first t rounds differently
+        self.duration += step
+        # nearest to the length of a block: a sample more would be further from it
+        if len(self.samples) == 1 or self.duration < TUNING.block - step / 2:
+            return None
+        block = self._block(self.duration)
+        # the last sample of a block is the first of the next one
+        self.samples, self.duration = self.samples[-1:], 0.0
+        return block
+
+    def _block(self, duration: float) -> Block:
+        t, speeds, terms = zip(*self.samples, strict=True)
+        sums = [np.trapezoid(np.array(term), t, axis=0) / duration for term in zip(*terms, strict=True)]
+        _, torque, friction, uncertainty, _, load_torque, _ = sums
+        first, last = terms[0], terms[-1]
+        load = (last.load_momentum - first.load_momentum) / duration - load_torque
+        y = torque - friction - (last.momentum - first.momentum) / duration
+        return Block(duration, y, load, friction, uncertainty, np.max(speeds[1:], axis=0) > self.rest_speed)
 
 
 class LoadFilter:
     """Filter of theta, a, b and d, in this order.
 
     x: (10 + 3 n,). P: its covariance. log_likelihood: of the rows since its last reset. surprise: sum of the
-    normalised squared residuals of moving joints in the last block. factor: multiplies the standard deviation of the
-    disturbance.
+    normalised squared residuals of moving joints in the last block. disturbance: stationary variance of d, (n,).
     """
 
-    def __init__(self, noise: BlockNoise, effort: np.ndarray, factor: float = 1.0) -> None:
-        n = len(effort)
-        self.n, self.noise = n, noise
-        self.disturbance = TUNING.variance * np.square(factor * noise.disturbance)
-        self.x = np.zeros(10 + 3 * n)
-        offset = np.square(TUNING.offset * effort)
-        friction = np.full(n, TUNING.friction**2)
-        self.P = np.diag(np.concatenate([np.square(LOAD_PRIOR), friction, offset, self.disturbance]))
+    def __init__(self, noise: BlockNoise, effort: np.ndarray) -> None:
+        self.n, self.noise = len(effort), noise
+        self.disturbance = TUNING.variance * np.square(noise.disturbance)
+        self.x = np.zeros(10 + 3 * self.n)
+        offset, friction = np.square(TUNING.offset * effort), np.full(self.n, TUNING.friction**2)
+        self.P = np.diag(np.concatenate([TUNING.load_prior**2, friction, offset, self.disturbance]))
         self.log_likelihood = self.surprise = 0.0
 
     def forget_load(self) -> None:
         """Reset the payload to its prior distribution."""
         self.x[:10] = 0.0
         self.P[:10] = self.P[:, :10] = 0.0
-        self.P[range(10), range(10)] = np.square(LOAD_PRIOR)
+        self.P[:10, :10] = np.diag(TUNING.load_prior**2)
 
     def predict(self, duration: float) -> None:
         """Advance the state by a time [s]."""
-        n = self.n
-        decay = np.exp(-duration / self.noise.time_constant)
-        d = slice(10 + 2 * n, None)
-        self.x[d] *= decay
-        self.P[d] *= decay[:, None]
-        self.P[:, d] *= decay
-        diagonal = np.arange(10 + 2 * n, 10 + 3 * n)
-        self.P[diagonal, diagonal] += (1 - decay**2) * self.disturbance
-        self.P[range(10, 10 + n), range(10, 10 + n)] += TUNING.friction_walk * duration
+        decay, growth = np.ones_like(self.x), np.zeros_like(self.x)
+        decay[10 + 2 * self.n :] = np.exp(-duration / self.noise.time_constant)
+        growth[10 : 10 + self.n] = TUNING.friction_walk * duration
+        growth[10 + 2 * self.n :] = (1 - decay[10 + 2 * self.n :] ** 2) * self.disturbance
+        self.x *= decay
+        self.P = self.P * np.outer(decay, decay) + np.diag(growth)
         self.surprise = 0.0
 
     def update(self, block: Block, joint: int) -> None:
         """Update the state with the row of a joint; a joint at rest updates only its disturbance."""
-        n = self.n
-        columns = np.array([*range(10), 10 + joint, 10 + n + joint, 10 + 2 * n + joint])
+        columns = [*range(10), *range(10 + joint, 10 + 3 * self.n, self.n)]
         row = np.array([*block.load[joint], block.friction[joint], 1.0, 1.0])
         covariance = self.P[:, columns] @ row
         noise = TUNING.variance * self.noise.white[joint] ** 2
         noise += TUNING.uncertainty * block.uncertainty[joint] ** 2
         expected = float(row @ covariance[columns]) + noise
         residual = float(block.y[joint] - self.x[columns] @ row)
-        variance = huber(residual**2, expected)
+        # Huber: the noise of an outlier is larger
+        variance = max(expected, residual**2 / TUNING.outlier**2)
         gain = covariance / variance
-        if not block.moving[joint]:
-            gain[: 10 + 2 * n + joint] = gain[10 + 2 * n + joint + 1 :] = 0.0
-        else:
+        if block.moving[joint]:
             self.surprise += residual**2 / expected
+        else:
+            gain[np.arange(len(gain)) != columns[-1]] = 0.0
         self.x += gain * residual
         # Joseph's form: valid for a gain that is not the optimal one
         product = np.outer(gain, covariance)
@@ -80,41 +135,125 @@ class LoadFilter:
         self.log_likelihood -= 0.5 * (np.log(variance) + residual**2 / variance)
 
 
-class DriftFilter:
-    """Independent filters of a and d of each joint, for the reported payload.
+class JointFilters:
+    """Independent filters of the friction scale a and the disturbance d of each joint, for a known payload.
 
-    a, d: (n,). P: covariance of (a, d): aa, ad, dd, (3, n).
+    All joints are filtered at a time, and all hypotheses about their noise (...). K states: a first, d last, and the
+    offset b between them if there is one.
+
+    x: (..., n, K). P: its covariance, (..., n, K, K).
     """
 
-    def __init__(self, noise: BlockNoise) -> None:
-        self.noise = noise
-        self.a, self.d = np.zeros((2, len(noise.white)))
-        self.disturbance = TUNING.variance * np.square(noise.disturbance)
-        self.P = np.stack([np.full_like(self.a, TUNING.friction**2), np.zeros_like(self.a), self.disturbance])
+    def __init__(
+        self, deviations: np.ndarray, white: np.ndarray, time_constant: np.ndarray, *, drifts: bool = False
+    ) -> None:
+        """Begin with x = 0.
 
-    def update(self, block: Block, theta: np.ndarray) -> None:
-        """Predict the state over a block, and update it with the block; theta: payload, (10,)."""
-        decay = np.exp(-block.duration / self.noise.time_constant)
-        aa = self.P[0] + TUNING.friction_walk * block.duration
-        ad = self.P[1] * decay
-        dd = self.P[2] * decay**2 + (1 - decay**2) * self.disturbance
-        self.d = self.d * decay
-        f = block.friction
-        residual = block.y - block.load @ theta - f * self.a - self.d
-        by_a, by_d = f * aa + ad, f * ad + dd
-        noise = TUNING.variance * self.noise.white**2 + TUNING.uncertainty * block.uncertainty**2
-        variance = np.maximum(f * by_a + by_d + noise, residual**2 / TUNING.outlier**2)
-        gain_a, gain_d = np.where(block.moving, by_a / variance, 0.0), by_d / variance
-        self.a = self.a + gain_a * residual
-        self.d = self.d + gain_d * residual
-        self.P = np.stack([
-            aa - 2 * gain_a * by_a + variance * gain_a**2,
-            ad - gain_a * by_d - gain_d * by_a + variance * gain_a * gain_d,
-            dd - 2 * gain_d * by_d + variance * gain_d**2,
-        ])  # fmt: skip
+        Args:
+            deviations: prior standard deviations of the states, of d also the stationary one, (..., n, K).
+            white: standard deviations of white noise, (..., n).
+            time_constant: of d, (..., n) [s].
+            drifts: whether a is a random walk, and d is updated for joints at rest, too.
+        """
+        self.x, self.P = np.zeros_like(deviations), deviations[..., None] ** 2 * np.eye(deviations.shape[-1])
+        self.disturbance, self.white, self.time_constant = deviations[..., -1] ** 2, white**2, time_constant
+        self.drifts = drifts
 
-    def ahead(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return friction scale minus one and the disturbance, (n,) each, predicted for a time from now [s]."""
-        if seconds > TUNING.disturbance_ahead:
-            return self.a, np.zeros_like(self.d)
-        return self.a, self.d * np.exp(-seconds / self.noise.time_constant)
+    @classmethod
+    def of_drift(cls, noise: BlockNoise) -> JointFilters:
+        """Return the filters of a and d that the estimator runs."""
+        factor = np.sqrt(TUNING.variance)
+        deviations = np.stack(
+            [np.full_like(noise.white, TUNING.friction), factor * noise.disturbance], axis=-1
+        )
+        return cls(deviations, factor * noise.white, noise.time_constant, drifts=True)
+
+    def update(self, block: Block, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Predict the state over a block, and update it with the torque of the block without the payload, (n,) [Nm, N].
+
+        Returns:
+            the residual of the prediction, and its variance by the model, (..., n).
+        """
+        decay = np.ones_like(self.x)
+        decay[..., -1] = np.exp(-block.duration / self.time_constant)
+        self.x = self.x * decay
+        self.P = self.P * decay[..., None] * decay[..., None, :]
+        self.P[..., 0, 0] += self.drifts * TUNING.friction_walk * block.duration
+        self.P[..., -1, -1] += (1 - decay[..., -1] ** 2) * self.disturbance
+        row = np.ones_like(self.x)
+        row[..., 0] = block.friction
+        covariance = (self.P @ row[..., None])[..., 0]
+        expected = (row * covariance).sum(axis=-1) + self.white + TUNING.uncertainty * block.uncertainty**2
+        residual = torque - (row * self.x).sum(axis=-1)
+        variance = np.maximum(expected, residual**2 / TUNING.outlier**2)
+        used = np.repeat(block.moving[:, None], self.x.shape[-1], axis=1)
+        used[:, -1] |= self.drifts
+        gain = np.where(used, covariance / variance[..., None], 0.0)
+        self.x = self.x + gain * residual[..., None]
+        # Joseph's form, for a gain that is optimal in some states and zero in the others
+        product = gain[..., None] * covariance[..., None, :]
+        self.P = self.P - np.where(used[..., None], product, product.swapaxes(-1, -2))
+        return residual, expected
+
+
+class PayloadEstimate:
+    """The payload filter, and two more filters for the hypotheses of a changed load and of a contact.
+
+    The rows of a block (one per joint and filter) are spread over the samples of the next block, to bound the time per
+    sample. moved: time in motion since the start or the last change of load [s].
+    """
+
+    def __init__(self, levels: NoiseLevels) -> None:
+        self.filters = [LoadFilter(levels.load, levels.effort)]
+        self.rows: Iterator[None] = iter(())
+        self.moved = self.hypotheses_moved = 0.0
+        self.changed = False
+        self.samples = self.per_sample = 0
+
+    def start(self, block: Block) -> None:
+        """Process the remaining rows of the former block, and begin with this block."""
+        for _ in self.rows:
+            pass
+        if block.moving.any():
+            self.moved += block.duration
+            self.hypotheses_moved += block.duration
+        self.per_sample = -(-len(self.filters) * len(block.y) // max(self.samples - 1, 1))
+        self.samples = 0
+        self.rows = self._rows(block)
+
+    def step(self) -> None:
+        """Process the share of rows of one sample."""
+        self.samples += 1
+        for _ in range(self.per_sample):
+            next(self.rows, None)
+
+    def _rows(self, block: Block) -> Iterator[None]:
+        for each in self.filters:
+            each.predict(block.duration)
+        rows = [(each, joint) for each in self.filters for joint in range(len(block.y))]
+        for number, (each, joint) in enumerate(rows, start=1):
+            each.update(block, joint)
+            if number == len(rows):
+                self._compare(int(block.moving.sum()))
+            yield
+
+    def _compare(self, moving: int) -> None:
+        """Begin, accept or drop the hypotheses of a changed load and of a contact; moving: number of moving joints."""
+        main = self.filters[0]
+        if len(self.filters) > 1:
+            _, candidate, contact = self.filters
+            ratio = candidate.log_likelihood - max(main.log_likelihood, contact.log_likelihood)
+            if self.hypotheses_moved >= TUNING.changed_after and ratio > TUNING.changed:
+                self.filters, self.changed, self.moved = [candidate], True, self.hypotheses_moved
+                return
+            least = TUNING.changed_after if ratio < TUNING.unlikely else TUNING.dropped_after
+            if self.hypotheses_moved >= least:
+                self.filters = [main]
+        is_surprise = moving and main.surprise > moving + TUNING.surprise * math.sqrt(2 * moving)
+        # not before the payload filter has used the first second of motion
+        if len(self.filters) == 1 and is_surprise and self.moved >= TUNING.changed_after:
+            main.log_likelihood = self.hypotheses_moved = 0.0
+            candidate, contact = copy.deepcopy(main), copy.deepcopy(main)
+            candidate.forget_load()
+            contact.disturbance = main.disturbance * TUNING.contact_disturbance**2
+            self.filters = [main, candidate, contact]

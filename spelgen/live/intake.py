@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import Literal, get_args
 
 import numpy as np
 
 from spelgen.dynamics.bristles import BristleReach
+from spelgen.live.momentum import Balance, balance
 from spelgen.live.noise import NoiseLevels
 from spelgen.live.tuning import TUNING
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 Refusal = Literal["used", "not finite", "repeated", "reversed", "jump", "saturated", "gap"]
-REFUSALS: tuple[Refusal, ...] = ("used", "not finite", "repeated", "reversed", "jump", "saturated", "gap")
+REFUSALS: tuple[Refusal, ...] = get_args(Refusal)
 IGNORED: tuple[Refusal, ...] = ("not finite", "repeated", "reversed", "jump")
 """Reasons for which nothing of a sample is used."""
 
@@ -27,17 +30,9 @@ class Intake:
         self.levels, self.bristles = levels, bristles
         self.limit = bristles.values
         self.counts = dict.fromkeys(REFUSALS, 0)
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget the last sample and the friction state."""
-        self.t = -np.inf
+        self.t, self.ignored = -np.inf, 0
         self.q = self.path = np.zeros(len(self.limit))
-        self.ignored = 0
-        self._unknown()
-
-    def _unknown(self) -> None:
-        self.low, self.high = -self.limit, self.limit.copy()
+        self.low, self.high = -self.limit, self.limit
 
     def accept(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
         """Check a sample, q, qd, tau (n,), update the bounds of the friction state, and return "used" or the reason."""
@@ -46,19 +41,16 @@ class Intake:
         self.ignored += refusal in ("reversed", "jump")
         restarts = self.ignored >= TUNING.restart
         if refusal == "gap" or restarts or self.t == -np.inf:
-            self._unknown()
+            self.low, self.high = -self.limit, self.limit
             self.path = q.copy()
         elif refusal not in IGNORED:
-            step = self.levels.encoder
-            path = np.clip(self.path, q - step, q + step)
-            moved = (
-                path - self.path
-                if self.bristles.motors is None
-                else self.bristles.motors @ (path - self.path)
-            )
-            self.low, self.high = (
-                np.clip(z + moved[:, None], -self.limit, self.limit) for z in (self.low, self.high)
-            )
+            # the friction state does not follow the rounding of an encoder
+            path = np.clip(self.path, q - self.levels.encoder, q + self.levels.encoder)
+            moved = path - self.path
+            if self.bristles.motors is not None:
+                moved = self.bristles.motors @ moved
+            self.low = np.clip(self.low + moved[:, None], -self.limit, self.limit)
+            self.high = np.clip(self.high + moved[:, None], -self.limit, self.limit)
             self.path = path
         if restarts or refusal not in IGNORED:
             refusal = "gap" if restarts else refusal
@@ -67,7 +59,7 @@ class Intake:
         return refusal
 
     def _check(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
-        if not (np.isfinite(t) and np.isfinite(q).all() and np.isfinite(qd).all() and np.isfinite(tau).all()):
+        if not np.isfinite([t, *q, *qd, *tau]).all():
             return "not finite"
         if t <= self.t:
             return "repeated" if t == self.t else "reversed"
@@ -77,8 +69,39 @@ class Intake:
         if t - self.t > TUNING.gap:
             return "used" if self.t == -np.inf else "gap"
         # allowance for one encoder step, and for a sample with a delayed time stamp
-        if (
-            np.abs(q - self.q) > speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
-        ).any():
+        furthest = speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
+        if (np.abs(q - self.q) > furthest).any():
             return "jump"
         return "saturated" if (np.abs(tau) >= self.levels.effort).any() else "used"
+
+
+def balance_along(
+    model: RigidBodyDynamics,
+    levels: NoiseLevels,
+    intake: Intake,
+    t: np.ndarray,
+    samples: Sequence[np.ndarray],
+) -> tuple[list[Refusal], list[Balance | None]]:
+    """Check samples; return the reasons why they are not used, and the terms of each that is not ignored.
+
+    Args:
+        model: in double precision.
+        levels: with the point whose Jacobian is among the terms.
+        intake: is updated.
+        t: times, (T,) [s].
+        samples: q, qd and tau, (T, n).
+    """
+    refusals: list[Refusal] = []
+    bounds: list[tuple[np.ndarray, np.ndarray]] = []
+    for sample in zip(t.tolist(), *samples, strict=True):
+        refusals.append(intake.accept(*sample))
+        bounds.append((intake.low, intake.high))
+    used = [k for k, refusal in enumerate(refusals) if refusal not in IGNORED]
+    terms: list[Balance | None] = [None] * len(t)
+    if used:
+        # all samples at once: a call of torch takes longer than the arithmetic of a sample
+        low, high = np.array([bounds[k] for k in used]).swapaxes(0, 1)
+        columns = balance(model, levels.point, [x[used] for x in samples], (low, high))
+        for k, *row in zip(used, *columns, strict=True):
+            terms[k] = Balance(*row)
+    return refusals, terms

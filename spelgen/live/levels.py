@@ -1,53 +1,152 @@
-"""Noise levels from the training logs of a fit, by cross-validation over logs."""
+"""Noise levels of a fit: read from its run folder, or else estimated by cross-validation on its logs.
+
+The torque residual of each log is of a model that was fitted to other logs: the residual of the fit would be too small.
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from spelgen.arm.configured_arm import Arm
+from spelgen.baselines.registry import arm_of_model
 from spelgen.dynamics.bristles import bristle_reach, encoder_step
-from spelgen.live.blocks import Block, Blocks, joined
+from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
+from spelgen.dynamics.protocol import residual_terms
+from spelgen.dynamics.tip_frame import tip_frame
+from spelgen.emission.assemble import assemble
+from spelgen.errors import LogError, RunError
+from spelgen.files import read_json, write_json
+from spelgen.fitting.fitted import Fit, required_spec
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_record import require
+from spelgen.fitting.torque.fit import fit_torque
+from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.tuning import TUNING as TORQUE
 from spelgen.live.contact import ContactObserver
-from spelgen.live.filters import DriftFilter, LoadFilter
-from spelgen.live.intake import IGNORED, Intake
-from spelgen.live.momentum import Balance, balance
+from spelgen.live.filters import Block, Blocks, JointFilters, LoadFilter
+from spelgen.live.intake import Intake, balance_along
+from spelgen.live.momentum import Balance
 from spelgen.live.noise import TAIL, BlockNoise, NoiseLevels
 from spelgen.live.payload import NO_REPORT
 from spelgen.live.tuning import TUNING
+from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.trajectory import Trajectory, joined_column
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-
-_TIME_CONSTANTS = np.geomspace(0.1, 6.4, 7)  # [s] time constants of the disturbance
-# [1] standard deviation of the disturbance divided by the one of white noise
-_RATIOS = np.array([0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5])
-
-WINDOWS = (25, 50)  # lengths of the trials of the payload filter, in blocks: 5 and 10 s
+from spelgen.settings.fits import TorqueFit
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOut:
-    """A held-out log, its used samples, and the terms of the momentum balance of a model that was not fitted to it."""
+def noise_levels(fit: Fit) -> NoiseLevels:
+    """Return the noise levels of a fit. Raises RunError if they are unknown, and cannot be found."""
+    levels = stored_levels(fit)
+    if levels is not None:
+        return levels
+    if not fit.logs:
+        raise RunError(
+            "no noise levels of the estimator", file=fit.folder, expected="a run with estimator.json",
+            do=f"fit it again by `spelgen train` to torques, with at least {TUNING.min_samples} samples of motion",
+        )  # fmt: skip
+    levels = cross_validated_levels(fit)
+    keep_levels(fit, levels)
+    return levels
 
-    log: Trajectory
-    used: list[int]
-    terms: Balance
+
+def keep_levels(fit: Fit, levels: NoiseLevels | None = None) -> None:
+    """Write noise levels into the run folder of a fit; None: estimate them first, if the fit is to torques."""
+    of_torques = isinstance(fit.config, TorqueFit) and isinstance(fit.model, RigidBodyDynamics)
+    if levels is None and of_torques and fit.logs:
+        levels = cross_validated_levels(fit)
+    if levels is not None and fit.folder is not None:
+        write_json(RunFolder(fit.folder).estimator, levels.model_dump(mode="json"))
 
 
-def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> HeldOut:
-    """Return the terms of the momentum balance of a model at the accepted samples of a log."""
-    intake = Intake(levels, bristle_reach(model))
-    used: list[int] = []
-    low, high = [], []
-    for k, sample in enumerate(zip(log.t.tolist(), log.q, log.qd, log.tau, strict=True)):
-        if intake.accept(*sample) not in IGNORED:
-            used.append(k)
-            low.append(intake.low)
-            high.append(intake.high)
-    samples = [x[used] for x in (log.q, log.qd, log.tau)]
-    return HeldOut(log, used, balance(model, levels.point, samples, (np.array(low), np.array(high))))
+def stored_levels(fit: Fit) -> NoiseLevels | None:
+    """Return the noise levels in the run folder of a fit; None if there are none."""
+    file = None if fit.folder is None else RunFolder(fit.folder).estimator
+    if file is None or not file.exists():
+        return None
+    return require(NoiseLevels, read_json(file, RunError), file)
+
+
+def cross_validated_levels(fit: Fit) -> NoiseLevels:
+    """Return the noise levels by cross-validation: each fold of the logs is held out of a fit."""
+    logs, count = list(fit.logs), TUNING.folds
+    if len(logs) == 1:
+        # parts of one log
+        ends = np.linspace(0, len(logs[0]), count + 1).astype(int)
+        logs = [logs[0][start:stop] for start, stop in itertools.pairwise(ends)]
+    folds = [logs[k::count] for k in range(min(count, len(logs)))]
+    effort, tip = np.full(fit.model.n, np.inf), np.zeros(3)
+    if fit.urdf is not None and fit.urdf.exists():
+        effort, tip = limits(arm_of_model(fit.model, fit.urdf))
+    tested = []
+    for k, fold in enumerate(folds):
+        others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
+        tested.append((fitted_to(fit, others), fold))
+    levels = find_levels(tested, effort, tip)
+    # rounded to the digits that a run folder contains
+    return NoiseLevels.model_validate(levels.model_dump(mode="json"))
+
+
+def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
+    """Return the model of a fit, fitted to other logs from its initial parameters. Raises LogError for too little
+    motion.
+
+    A part of the samples suffices to estimate the error on other logs. Without residual terms in the fit, none are
+    selected.
+    """
+    model = assemble(required_spec(fit.model)).double()
+    if residual_terms(without_idle_residuals(fit.model)) is None:
+        model = without_residuals(model)
+    samples = dynamics_samples(logs, preprocessing=fit.preprocessing, reach=bristle_reach(model))
+    samples = [x for x in samples if len(x.q)]
+    if sum(len(x.q) for x in samples) < TUNING.min_samples:
+        raise LogError(
+            "too little motion to find noise levels of the estimator",
+            expected=f"{TUNING.min_samples} samples that move in two thirds of the logs", do="record longer",
+        )  # fmt: skip
+    fit_torque(model, TorqueSamples.of(samples, TORQUE.decimation).subsampled(TUNING.max_samples))
+    fitted = model.requires_grad_(False).eval()
+    assert isinstance(fitted, RigidBodyDynamics)
+    return fitted
+
+
+def limits(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
+    """Return the torque limits of an arm, (n,), infinite if unknown, and its tip in the last body's frame, (3,)."""
+    effort = np.array([joint.effort or np.inf for joint in arm.chain.coordinates])
+    tip = tip_frame(arm)
+    is_last = tip.carrier == len(arm.chain.bodies) - 1
+    return effort, tip.pose[:3, 3] if is_last else np.zeros(3)
+
+
+class HeldOutSample(NamedTuple):
+    """A sample of a log, with its terms by a model that was not fitted to the log; vectors are (n,).
+
+    t [s]. is_resumed: whether it is the first one after a gap. block: that it ends.
+    """
+
+    t: float
+    qd: np.ndarray
+    at: Balance
+    is_resumed: bool
+    block: Block | None
+
+
+def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> list[HeldOutSample]:
+    """Return the accepted samples of a log, with the terms of the momentum balance."""
+    intake, blocks = Intake(levels, bristle_reach(model)), Blocks(levels.rest_speed)
+    refusals, terms = balance_along(model, levels, intake, log.t, (log.q, log.qd, log.tau))
+    samples = []
+    for t, qd, refusal, at in zip(log.t.tolist(), log.qd, refusals, terms, strict=True):
+        if at is None:
+            continue
+        if refusal == "gap":
+            blocks.restart()
+        samples.append(HeldOutSample(t, qd, at, refusal == "gap", blocks.add(t, qd, at)))
+    return samples
 
 
 def find_levels(
@@ -61,15 +160,15 @@ def find_levels(
         point: the tip in the frame of the last body, (3,) [m].
     """
     logs = [log for _, fold in folds for log in fold]
-    n = len(effort)
+    unknown = np.ones(len(effort))
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    unknown = BlockNoise(white=np.ones(n), disturbance=np.ones(n), time_constant=np.ones(n))
+    noise = BlockNoise(white=unknown, disturbance=unknown, time_constant=unknown)
     levels = NoiseLevels(
-        drift=unknown,
-        load=unknown,
-        observer=np.ones(n),
-        peak_start=np.ones(n),
-        peak_scale=np.ones(n),
+        drift=noise,
+        load=noise,
+        observer=0 * unknown,
+        peak_start=unknown,
+        peak_scale=unknown,
         load_variance=TUNING.variance,
         coulomb=np.mean([model.coulomb.numpy() for model, _ in folds], axis=0),
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
@@ -80,8 +179,8 @@ def find_levels(
         point=point,
     )
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
-    segments = [blocks_along(each, levels) for each in tested]
-    pairs = [list(itertools.starmap(joined, zip(x[::2], x[1::2], strict=False))) for x in segments]
+    segments = [[x.block for x in samples if x.block is not None] for samples in tested]
+    pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
     levels = levels.model_copy(update={"load_variance": load_variance(pairs, levels)})
     return _with_observer(levels, tested)
@@ -94,7 +193,7 @@ def load_variance(segments: Sequence[Sequence[Block]], levels: NoiseLevels) -> f
     moments, (4,), the larger one of two lengths of windows: errors of the model average out slowly.
     """
     factors = [TUNING.variance]
-    for window in WINDOWS:
+    for window in TUNING.trial_blocks:
         squares: list[float] = []
         for blocks in segments:
             for start in range(0, len(blocks) - window + 1, window):
@@ -109,37 +208,20 @@ def load_variance(segments: Sequence[Sequence[Block]], levels: NoiseLevels) -> f
     return max(factors)
 
 
-def blocks_along(tested: HeldOut, levels: NoiseLevels) -> list[Block]:
-    """Return the consecutive blocks of a held-out log."""
-    sums, blocks = Blocks(len(levels.speed), levels.rest_speed), []
-    before = -np.inf
-    for k, row in zip(tested.used, zip(*tested.terms, strict=True), strict=True):
-        t = float(tested.log.t[k])
-        if t - before > TUNING.gap:
-            sums.restart()
-        before = t
-        block = sums.add(t, tested.log.qd[k], Balance(*row))
-        if block is not None:
-            blocks.append(block)
-    return blocks
-
-
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
     """Return the noise of maximum likelihood over a grid, per joint; segments: consecutive blocks, for each log.
 
     The model is y = f a + b + d + w per joint (see `live.filters`); white noise has its own scale for each point of
     the grid.
     """
-    grid = np.array(list(itertools.product(_TIME_CONSTANTS, _RATIOS)))
-    n = len(segments[0][0].y)
-    scale = np.full(
-        (len(grid), n), np.median(np.abs([x.y for blocks in segments for x in blocks]), axis=0) + 1e-9
-    )
+    grid = np.array(list(itertools.product(TUNING.time_constants, TUNING.disturbance_ratios)))
+    typical = np.median(np.abs([x.y for blocks in segments for x in blocks]), axis=0) + 1e-9
+    scale = np.tile(typical, (len(grid), 1))
     for _ in range(3):
         _cost, squares = _likelihood(segments, grid, scale)
         scale = scale * np.sqrt(squares)
     best = _likelihood(segments, grid, scale)[0].argmin(axis=0)
-    white = scale[best, np.arange(n)]
+    white = scale[best, np.arange(len(best))]
     return BlockNoise(white=white, disturbance=white * grid[best, 1], time_constant=grid[best, 0])
 
 
@@ -155,61 +237,42 @@ def _likelihood(
     """
     constant, ratio = grid.T[:, :, None]
     cost, squares, count = np.zeros((3, *scale.shape))
-    disturbance = np.square(scale * ratio)
+    # of a, b and d; the offset is within a few standard deviations of the noise
+    prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
-        x = np.zeros((*scale.shape, 3))
-        P = np.zeros((*scale.shape, 3, 3))
-        P[..., 0, 0] = TUNING.friction**2
-        P[..., 1, 1] = np.square(4 * scale)
-        P[..., 2, 2] = disturbance
+        # the noise of motion is estimated from moving joints only
+        filters = JointFilters(prior, scale, constant)
         for block in blocks:
-            decay = np.ones_like(x)
-            decay[..., 2] = np.exp(-block.duration / constant)
-            x *= decay
-            P *= decay[..., None] * decay[..., None, :]
-            P[..., 2, 2] += (1 - decay[..., 2] ** 2) * disturbance
-            row = np.ones(x.shape)
-            row[..., 0] = block.friction
-            covariance = (P @ row[..., None])[..., 0]
-            expected = (row * covariance).sum(axis=-1) + np.square(scale)
-            expected = expected + TUNING.uncertainty * np.square(block.uncertainty)
-            residual = block.y - (row * x).sum(axis=-1)
+            residual, expected = filters.update(block, block.y)
             squared = np.minimum(np.square(residual) / expected, TUNING.outlier**2)
-            gain = covariance / np.maximum(expected, np.square(residual) / TUNING.outlier**2)[..., None]
-            # the noise of motion is estimated from moving joints only
-            gain = gain * block.moving[:, None]
             cost += 0.5 * (np.log(expected) + squared) * block.moving
             squares += squared * block.moving
             count += block.moving
-            x += gain * residual[..., None]
-            P -= gain[..., None] * covariance[..., None, :]
     return cost, squares / np.maximum(count, 1)
 
 
-def _with_observer(levels: NoiseLevels, tested: Sequence[HeldOut]) -> NoiseLevels:
+def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
     """Return the levels completed by the noise of the momentum observer and the exponential tail of its peaks."""
     signals: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-    zero = levels.model_copy(update={"observer": np.zeros_like(levels.observer)})
-    for each in tested:
-        observer, drift = ContactObserver(zero, TUNING.alarms_per_minute), DriftFilter(levels.drift)
-        sums = Blocks(len(levels.speed), levels.rest_speed)
-        for k, row in zip(each.used, zip(*each.terms, strict=True), strict=True):
-            t, qd, at = float(each.log.t[k]), each.log.qd[k], Balance(*row)
-            if observer.t is not None and t - observer.t > TUNING.gap:
+    for samples in tested:
+        observer, drift = (
+            ContactObserver(levels, TUNING.alarms_per_minute),
+            JointFilters.of_drift(levels.drift),
+        )
+        for t, qd, at, is_resumed, block in samples:
+            if is_resumed:
                 observer.restart()
-                sums.restart()
-            signal, variance = observer.residual(t, qd, at, NO_REPORT, drift.a)
+            signal, variance = observer.residual(t, qd, at, NO_REPORT, drift.x[:, 0])
             signals.append((np.array(t), signal, variance, np.abs(qd) > levels.rest_speed))
-            block = sums.add(t, qd, at)
             if block is not None:
-                drift.update(block, NO_REPORT.parameters)
+                drift.update(block, block.y)
     times, signal, variance, moving = (np.array(column) for column in zip(*signals, strict=True))
     # of a moving joint: 0.455 is the median of the squared standard normal distribution
     squares = np.nanmedian(np.where(moving, np.square(signal), np.nan), axis=0) / 0.455
     observer_level = np.maximum(np.sqrt(squares), TUNING.min_observer_noise * levels.effort)
     ratio = np.abs(signal) / np.sqrt(variance + observer_level**2)
-    window = np.concatenate([[0], np.cumsum(np.abs(np.diff(times // TUNING.window)) > 0)])
-    starts = np.flatnonzero(np.diff(window, prepend=-1))
+    # peaks of neighbouring samples are one event: the largest of each window counts
+    starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
     peaks = np.maximum.reduceat(ratio, starts, axis=0)
     start = np.quantile(peaks, 1 - TAIL, axis=0)
     tail = np.where(peaks > start, peaks - start, np.nan)

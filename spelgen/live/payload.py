@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy.linalg import solve_triangular
+from scipy.special import logsumexp, softmax
 
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.live.tuning import TUNING
@@ -23,16 +24,6 @@ from spelgen.live.tuning import TUNING
 Status = Literal["not yet", "no payload", "payload"]
 _UNITS = pseudo_inertia(torch.eye(10).double()).numpy()
 """dJ/dtheta, (10, 4, 4)."""
-LOAD_PRIOR = np.array([TUNING.load_mass] + 3 * [TUNING.load_moment] + 6 * [TUNING.load_inertia])
-_DEGREES = 6  # of freedom of the Wishart distribution
-ITERATIONS = 40
-WEIGHTS = 12  # weights of the likelihood below one, powers of 1/4
-# Constant of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of the Gaussian of Laplace's
-# approximation.
-_LOG_GAMMA = 3 * math.log(math.pi) + sum(math.lgamma((_DEGREES - k) / 2) for k in range(4))
-EVIDENCE = -2 * _DEGREES * math.log(2) - _LOG_GAMMA - math.log(2) + 5 * math.log(2 * math.pi)
-_NORMAL = 1.96  # standard deviations of a 95 % interval
-_INERTIA = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,24 +67,17 @@ def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> P
     """Return the payload; arguments: see `find_payload`. Raises LinAlgError if a matrix is not positive definite."""
     precision = _inverse(covariance)
     linear = precision @ mean / factor
-    precision = (precision - np.diag(LOAD_PRIOR**-2.0)) / factor
+    precision = (precision - np.diag(TUNING.load_prior**-2.0)) / factor
     found: list[tuple[np.ndarray, np.ndarray, float]] = []
-    theta = None
     for scale in TUNING.scales:
-        found.append(_at_scale(precision, linear, scale, theta))
-        theta = found[-1][0]
-    evidence = np.array([each[2] for each in found])
-    best = evidence.max()
-    weights = np.exp(evidence - best)
-    log_odds = -(best + math.log(weights.sum() / len(weights)))
-    weights /= weights.sum()
-    theta = np.zeros(10)
-    for weight, (parameters, _, _) in zip(weights, found, strict=True):
-        theta += weight * parameters
-    spread = np.zeros((10, 10))
-    for weight, (parameters, inverse, _) in zip(weights, found, strict=True):
-        spread += weight * (inverse + np.outer(parameters - theta, parameters - theta))
-    limit = theta[0] + _NORMAL * math.sqrt(spread[0, 0])
+        found.append(_at_scale(precision, linear, scale, found[-1][0] if found else None))
+    thetas, inverses, evidence = (np.array(column) for column in zip(*found, strict=True))
+    log_odds = float(math.log(len(found)) - logsumexp(evidence))
+    weights = softmax(evidence)
+    theta = weights @ thetas
+    # of a mixture: the mean covariance, and the covariance of the means
+    spread = np.tensordot(weights, inverses, 1) + np.cov(thetas.T, ddof=0, aweights=weights)
+    limit = theta[0] + TUNING.normal * math.sqrt(spread[0, 0])
     if log_odds > TUNING.payload_odds:
         return Payload("no payload" if log_odds > TUNING.no_payload_odds else "not yet", log_odds, limit)
     return _described(theta, spread, log_odds, limit)
@@ -116,17 +100,17 @@ def _at_scale(
     of consistent parameters, at whose boundary Newton's method would stall (Boyd and Vandenberghe, Convex
     Optimization, 2004, 11.3). Twice the cost is self-concordant: steps damped by its decrement are feasible (9.6.4).
     """
-    variances = np.array([TUNING.radius**2 / 5] * 3)
-    height = TUNING.distance
-    around = scale * (variances[0] + variances[1] + np.array([height**2, height**2, 0.0]))
-    mean = np.array([scale, 0, 0, scale * height, around[0], 0, 0, around[1], 0, around[2]])
-    width = np.einsum("i,iab->ab", mean, _UNITS) / _DEGREES
+    # a ball, whose centre is off the origin along z
+    height, about_z = TUNING.distance, 2 / 5 * TUNING.radius**2
+    about_x = about_z + height**2
+    mean = scale * np.array([1, 0, 0, height, about_x, 0, 0, about_x, 0, about_z])
+    width = np.einsum("i,iab->ab", mean, _UNITS) / TUNING.degrees
     pull = 0.5 * np.einsum("iab,ba->i", _UNITS, _inverse(width))
     theta = mean if start is None else start
 
-    for power in range(0 if start is not None else -WEIGHTS, 1):
+    for power in range(0 if start is not None else -TUNING.weights, 1):
         weight = 4.0**power
-        for _ in range(ITERATIONS):
+        for _ in range(TUNING.iterations):
             ratios = _inverse(np.einsum("i,iab->ab", theta, _UNITS)) @ _UNITS
             gradient = weight * (precision @ theta - linear) - 0.5 * np.einsum("iaa->i", ratios) + pull
             hessian = weight * precision + 0.5 * np.einsum("iab,jba->ij", ratios, ratios)
@@ -137,39 +121,30 @@ def _at_scale(
             # the error after a full step is about the square of the one before
             if decrement < (0.1 if power else 1e-8):
                 break
-    _, log_width = np.linalg.slogdet(width)
-    _, log_hessian = np.linalg.slogdet(hessian)
-    _, log_inertia = np.linalg.slogdet(np.einsum("i,iab->ab", theta, _UNITS))
+    inertia = np.einsum("i,iab->ab", theta, _UNITS)
+    log_width, log_hessian, log_inertia = (np.linalg.slogdet(x)[1] for x in (width, hessian, inertia))
     cost = 0.5 * theta @ precision @ theta - linear @ theta - 0.5 * log_inertia + pull @ theta
-    return theta, inverse, float(EVIDENCE - _DEGREES / 2 * log_width - cost - 0.5 * log_hessian)
+    return theta, inverse, float(TUNING.evidence - TUNING.degrees / 2 * log_width - cost - 0.5 * log_hessian)
 
 
 def _described(theta: np.ndarray, covariance: np.ndarray, log_odds: float, limit: float) -> Payload:
     """Return the payload with parameters (10,) and their covariance (10, 10); intervals by linearisation."""
-    mass, moment = theta[0], theta[1:4]
-    center = moment / mass
-    by_center = np.zeros((3, 10))
-    by_center[:, 0] = -center / mass
-    by_center[:, 1:4] = np.eye(3) / mass
-    # inertia about the centre of mass: I - (|h|^2 1 - h h^T) / m, with h = m c
-    inertia, by_inertia = np.zeros(6), np.zeros((6, 10))
-    for k, (row, column) in enumerate(_INERTIA):
-        same = float(row == column)
-        shift = same * (center @ center) - center[row] * center[column]
-        inertia[k] = theta[4 + k] - mass * shift
-        by_inertia[k, 4 + k] = 1.0
-        by_inertia[k, 0] = shift
-        by_inertia[k, 1:4] = -2 * same * center
-        by_inertia[k, 1 + row] += center[column]
-        by_inertia[k, 1 + column] += center[row]
-    half = _NORMAL * math.sqrt(covariance[0, 0])
-
-    def interval(values: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-        """Return 95 % intervals (K, 2) of values (K,) with derivatives (K, 10)."""
-        widths = _NORMAL * np.sqrt(np.einsum("ki,ij,kj->k", jacobian, covariance, jacobian))
-        return np.stack([values - widths, values + widths], axis=1)
-
+    values = _mass_center_inertia(theta)
+    # derivatives by complex steps, which have no rounding error (Squire and Trapp, SIAM Review 40:110, 1998)
+    tiny = 1e-30
+    steps = [_mass_center_inertia(theta + tiny * 1j * unit).imag for unit in np.eye(10)]
+    jacobian = np.array(steps).T / tiny
+    half = TUNING.normal * np.sqrt(np.einsum("ki,ij,kj->k", jacobian, covariance, jacobian))
+    intervals = np.stack([values - half, values + half], axis=1)
+    low, high = intervals[0].tolist()
     return Payload(
-        "payload", log_odds, limit, mass, (max(mass - half, 0.0), mass + half), center, interval(center, by_center),
-        inertia, interval(inertia, by_inertia), theta, covariance,
+        "payload", log_odds, limit, float(values[0]), (max(low, 0.0), high), values[1:4], intervals[1:4],
+        values[4:], intervals[4:], theta, covariance,
     )  # fmt: skip
+
+
+def _mass_center_inertia(theta: np.ndarray) -> np.ndarray:
+    """Return mass, centre of mass and inertia about it (xx, xy, xz, yy, yz, zz), (10,), of parameters (10,)."""
+    center = theta[1:4] / theta[0]
+    about_origin = theta[0] * (center @ center * np.eye(3) - np.outer(center, center))
+    return np.concatenate([theta[:1], center, theta[4:] - about_origin[np.triu_indices(3)]])

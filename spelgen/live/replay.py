@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,8 +16,6 @@ from spelgen.live.estimator import Estimator, EstimatorState
 from spelgen.live.payload import Payload
 from spelgen.live.tuning import TUNING
 from spelgen.logs.trajectory import Trajectory, require_torques
-
-MERGED = 0.2  # [s] contacts closer than this are one
 
 
 @dataclass(frozen=True)
@@ -123,14 +122,28 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
     """
     require_torques(logs)
     estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
-    results = []
+    joints, results = fit.model.joint_names, []
     for log in logs:
         if log.q.shape[1] != fit.model.n:
             raise LogError(
                 f"{log.q.shape[1]} joints", file=log.file, expected=f"{fit.model.n}, as the model has"
             )
         estimator.reset()
-        results.append(_along(estimator, log, fit.model.joint_names))
+        states = estimator.replay(log)
+        times = log.t - log.t[0]
+        reported = [state.payload.status == "payload" for state in states]
+        drift = 100 * (states[-1].friction_scale - 1)
+        results.append(LogEstimate(
+            log=log,
+            joints=joints,
+            states=states,
+            payload=states[-1].payload,
+            since=float(times[reported][0]) if any(reported) else None,
+            changes=tuple(times[[state.load_changed for state in states]].tolist()),
+            contacts=tuple(contact_events(states, joints)),
+            drift={joint: round(percent, 2) for joint, percent in zip(joints, drift.tolist(), strict=True)},
+            refused=estimator.refused,
+        ))  # fmt: skip
     return results
 
 
@@ -146,45 +159,24 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
     return estimator.report()
 
 
-def _along(estimator: Estimator, log: Trajectory, joints: tuple[str, ...]) -> LogEstimate:
-    states = estimator.replay(log)
-    reported = [state.t for state in states if state.payload.status == "payload"]
-    scale = states[-1].friction_scale
-    return LogEstimate(
-        log=log,
-        joints=joints,
-        states=states,
-        payload=states[-1].payload,
-        since=reported[0] - float(log.t[0]) if reported else None,
-        changes=tuple(state.t - float(log.t[0]) for state in states if state.load_changed),
-        contacts=tuple(contact_events(states, joints)),
-        drift={joint: round(100 * (s - 1), 2) for joint, s in zip(joints, scale.tolist(), strict=True)},
-        refused=estimator.refused,
-    )
-
-
 def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> list[ContactEvent]:
     """Return the contacts in consecutive estimates."""
-    groups: list[list[EstimatorState]] = []
-    for state in states:
-        if not state.contact.touched.any():
-            continue
-        if groups and state.t - groups[-1][-1].t <= MERGED:
-            groups[-1].append(state)
-        else:
-            groups.append([state])
+    touching = [state for state in states if state.contact.touched.any()]
+    ends = np.flatnonzero(np.diff([state.t for state in touching]) > TUNING.merged) + 1
     events = []
-    for group in groups:
+    for first, last in pairwise([0, *ends.tolist(), len(touching)] if touching else []):
+        group = touching[first:last]
         torques = np.array([state.contact.external_torque for state in group])
         touched = np.array([state.contact.touched for state in group])
-        peaks = np.where(touched, np.abs(torques), 0.0).argmax(axis=0)
         named = np.flatnonzero(touched.any(axis=0)).tolist()
+        # the largest torque of a joint, among the samples at which this joint is touched
+        peaks = np.where(touched, np.abs(torques), 0.0).argmax(axis=0)[named]
         events.append(
             ContactEvent(
                 begin=group[0].t - states[0].t,
                 end=group[-1].t - states[0].t,
                 joints=tuple(joints[k] for k in named),
-                torques=tuple(float(torques[peaks[k], k]) for k in named),
+                torques=tuple(torques[peaks, named].tolist()),
                 force=float(max(np.linalg.norm(state.contact.force) for state in group)),
             )
         )

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import multigammaln
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,45 @@ class LiveTuning:
     payload_odds: float = -5.0
     no_payload_odds: float = 3.0
 
+    # [1] Degrees of freedom of the Wishart prior of the pseudo-inertia.
+    degrees: int = 6
+    # [1] Weights of the likelihood below one, powers of 1/4, and Newton steps for each.
+    weights: int = 12
+    iterations: int = 40
+    # [1] Standard deviations of a 95 % interval.
+    normal: float = 1.96
+
     # [s] Predictions up to this time ahead contain the disturbance.
     disturbance_ahead: float = 0.3
+
+    # Noise levels (`live.levels`).
+
+    # [1] Folds of the logs, samples of motion that a fit to the others needs, and samples that it uses at most.
+    folds: int = 3
+    min_samples: int = 300
+    max_samples: int = 2**11
+    # [s] Time constants of the disturbance that are compared, and [1] its standard deviation divided by the one of
+    # white noise.
+    time_constants: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
+    disturbance_ratios: tuple[float, ...] = (0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5)
+    # [1] Lengths of the trials of the payload filter, in blocks: 5 and 10 s.
+    trial_blocks: tuple[int, ...] = (25, 50)
+
+    # Reports (`live.replay`).
+
+    # [s] Contacts closer than this are one.
+    merged: float = 0.2
+
+    @property
+    def load_prior(self) -> np.ndarray:
+        """Prior standard deviations of the inertial parameters of a payload, (10,)."""
+        return np.repeat([self.load_mass, self.load_moment, self.load_inertia], [1, 3, 6])
+
+    @property
+    def evidence(self) -> float:
+        """Constant of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of Laplace's Gaussian."""
+        wishart = 2 * self.degrees * math.log(2) + float(multigammaln(self.degrees / 2, 4))
+        return 5 * math.log(2 * math.pi) - math.log(2) - wishart
 
 
 TUNING = LiveTuning()

@@ -1,7 +1,5 @@
 """The joints of logs and the mapping of their columns, from an arm, a model, or names of joints."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -85,6 +83,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
 
 def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
     """Return a mapping as an object; keys that a file or a dict does not have are from the settings, `stated`."""
+    # a complete mapping replaces the one of the settings; keys of a file or a dict complete it
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):

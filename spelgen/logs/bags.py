@@ -4,8 +4,6 @@ MCAP files without an end are read here: a recorder that was killed writes no su
 one another: an operation code (1 byte), a length (8 bytes) and a body. https://mcap.dev/spec
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -52,6 +50,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[tuple[int, Any]]:
     """Return times [ns] of one clock, and the states; the clocks of header and recorder may differ by hours."""
+    # a stamp of 0 means that the publisher has set none
     stamped = [(stamp, state) for stamp, _, state in messages if stamp]
     if messages and not stamped:
         remarks.append("no message has a stamp: times are those at which the recorder received them")
@@ -214,6 +213,7 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
         code, length = struct.unpack_from("<BQ", data, start)
         body = data[start + 9 : start + 9 + length]
         start += 9 + length
+        # a chunk that is cut off still has complete records before the cut
         if code == CHUNK:
             yield from _records(_unpacked(body))
         elif len(body) == length:

@@ -4,8 +4,6 @@ A check is a code, a severity and a function of a subject, registered in CHECKS.
 individually, so that only one need be in memory. Package `log_checks` has the checks that need the robot.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reader of CSV logs in the dialects of spreadsheets and loggers."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace

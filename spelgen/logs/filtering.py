@@ -1,7 +1,5 @@
 """Zero-phase filters, resampling and differentiation of signals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

@@ -3,8 +3,6 @@
 A new format is a file like `csv_files.py`, and its name in FORMATS.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
@@ -78,6 +76,7 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
     if not logs:
         packed = next(filter(None, map(_unpacking, sorted(path.iterdir()))), None)
         raise LogError("a folder without logs", file=path, expected=formats, do=packed)
+    # other names state no role: all logs of the folder are then used
     selected = [log for log in logs if log.stem == role]
     if selected or role is None or {"train", "test"}.isdisjoint(log.stem for log in logs):
         return selected or logs

@@ -6,8 +6,6 @@ the acceleration is H(f) = J_m + J_l / (1 - (f / f_0)^2), with the resonance f_0
 joint has H = J + c / f^2, with a constant c due to gravity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 

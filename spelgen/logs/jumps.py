@@ -4,8 +4,6 @@ Every function takes one signal (T,) or the columns of a log (T, C), of any form
 difference between neighbouring samples, the typical step the median of the steps that are not 0.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -133,9 +131,8 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     index = np.arange(len(columns)) - np.repeat(starts, lengths)
     if len(starts) < 4 or not index.any():
         return np.repeat(is_held, lengths), 1
-    steps = np.abs(
-        np.diff(columns[starts, :positions], axis=0)
-    )  # after each block of equal rows except the last
+    # after each block of equal rows except the last
+    steps = np.abs(np.diff(columns[starts, :positions], axis=0))
     speeds = steps[1:] / lengths[1:-1, None]
     quantum = np.min(np.where(steps > 0, steps, np.inf), axis=0)
     makes_up = (steps[:-1] > 2.5 * quantum) & (steps[:-1] > 0.6 * lengths[:-2, None] * speeds)

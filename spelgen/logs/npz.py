@@ -1,7 +1,5 @@
 """Reader of NPZ archives, with an array per column, or matrices with a column per joint."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

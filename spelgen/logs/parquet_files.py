@@ -1,7 +1,5 @@
 """Reader of the columns of Parquet logs, and of LeRobot 3 data sets, which consist of Parquet files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain

@@ -1,7 +1,5 @@
 """Reading and writing of log files, in SI units and with the URDF's signs; without filter and resampling."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -139,6 +137,7 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
 def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
     """Return the trajectories with the shortest names that are unique."""
     names: list[str] = []
+    # short names first: they occur in tables and messages
     for form in ("{0.name}", "{0.file.stem}/{0.name}", "{0.file}/{0.name}"):
         names = list(map(form.format, trajectories))
         if len(set(names)) == len(names):

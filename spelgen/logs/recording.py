@@ -1,7 +1,5 @@
 """Conversion of rows in SI units to trajectories: order, wraps, repeats, outliers, velocities, delay of torques."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from math import pi

@@ -1,10 +1,8 @@
 """Collector of recordings from log tables: complete, or as evenly spread segments within a bound of memory."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from dataclasses import dataclass
 from math import inf
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -20,8 +18,7 @@ Piece = tuple[int, str, np.ndarray]
 """Number and name of a recording, and rows of it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Segment:
+class Segment(NamedTuple):
     """Consecutive rows of one recording.
 
     Attributes:
@@ -95,6 +92,7 @@ class LogSegments:
             if size <= self._kept_bytes or len(self._segments) + len(kept) <= 1:
                 self._count += len(pieces)
                 return kept
+            # halving keeps the rest evenly spread, whatever was read before
             self.every *= 2
             self._segments = self._segments[::2]
             self._bytes = sum(x.values.nbytes for x in self._segments)

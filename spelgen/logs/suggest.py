@@ -3,8 +3,6 @@
 Units that neither names nor times specify remain SI: the checks of logs detect degrees, and state the lines to write.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import re
@@ -85,8 +83,10 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         raise LogError(got, file=file, expected="one of times, called t or time")
     # a header has the time of measurement, other columns may be times of receipt; else the shortest name is used
     clock = min(found.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
+    # loggers have orders of their own, ROS often the alphabetical one
     order = _order_in_cells(table, joints)
     by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in found.items()}
+    # velocities of some joints only are worth less than those of all by differentiation
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)

@@ -1,7 +1,5 @@
 """Result of all readers of logs: a table, and its columns for the quantities of an arm."""
 
-from __future__ import annotations
-
 import difflib
 import re
 import zipfile
@@ -11,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, starmap
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
 
@@ -58,8 +57,7 @@ class Layout:
 LogTable = tuple[Layout, pa.Table]
 
 
-@dataclass(frozen=True)
-class LogFormat:
+class LogFormat(NamedTuple):
     """A format of logs: its files and its reader.
 
     read: function of a path, the joints and the mapping that returns tables, or raises LogError. suffixes: of its
@@ -131,6 +129,7 @@ def missing_columns(
     patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]
     of_joints = dict(zip(joints, zip(*of_quantity.values(), strict=True), strict=True))
     unlogged = [joint for joint, names in of_joints.items() if set(names) <= set(missing)]
+    # a joint without any column was not logged; a wrong name affects one of its columns
     if unlogged and len(unlogged) < len(joints):
         logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (

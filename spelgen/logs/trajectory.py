@@ -75,6 +75,7 @@ class Trajectory:
                 is_finite = np.isfinite(values[row]).all()
                 expected = f"numbers below {largest:g}" if is_finite else "finite numbers"
                 raise self.error(f"{values[row].tolist()} at sample {row}", expected, column=column)
+        # a step of nearly zero would give infinite velocities
         backward = np.flatnonzero(np.diff(self.t) < TUNING.shortest_step)
         if backward.size:
             k = backward[0]

@@ -1,7 +1,5 @@
 """Constants of reading, checking and preparing logs, and the limits of their sample rates."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

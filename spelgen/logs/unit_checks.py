@@ -118,6 +118,7 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 
 def time_unit(step: float) -> str | None:
     """Return the unit of time in which a step between samples is plausible for a robot's log; None if there is none."""
+    # units differ by a factor of 1000, the range of plausible steps by 5000: the first plausible unit is the largest
     slowest, fastest = SIGNALS.slowest_step, SIGNALS.fastest_step
     return next((unit for unit, size in TIMES.items() if fastest <= step * size <= slowest), None)
 

@@ -1,7 +1,5 @@
 """Conversion of logged columns to numbers in SI units with the URDF's signs; errors name rows without a number."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import starmap
 from typing import TypeAlias
@@ -31,13 +29,11 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         # subtracted as integers: 1.7e18 ns as a double has no microseconds
         times = pa.compute.subtract(times, start)
     logged = [_floats(times, layout.columns[0], layout, rows)]
-    for name in layout.columns[1:]:
-        logged.append(_floats(_column(table, name), name, layout, rows))
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
-    for k, signal in enumerate(signals, start=1):
+    for name, signal in zip(layout.columns[1:], signals, strict=True):
+        values = _floats(_column(table, name), name, layout, rows)
         sign_bit = mapping.word("sign_bit", *signal)
-        if sign_bit:
-            logged[k] = signed(logged[k], sign_bit)
+        logged.append(signed(values, sign_bit) if sign_bit else values)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
     offsets = np.array([0.0, *starmap(mapping.offset, signals)])
     # overflows are reported below, with their rows

@@ -204,7 +204,7 @@ def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]
     count = len(mass.raw_constants)
     # dM / d constant, (constants, n, n): M is linear in its functions and constants
     functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
-    # unit vectors of the constants give the basis of each one, whatever entries it occurs in
+    # unit vectors of the constants give the basis of each one
     zeros = torch.zeros(functions, count, dtype=torch.float64)
     units = torch.eye(count, dtype=torch.float64)
     rows = []

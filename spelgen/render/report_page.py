@@ -154,7 +154,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 def _rendered(run: Run, robot: Path | str | None) -> str:
     spec, record, metrics = run.spec, run.config, run.folder.read_metrics()
     model = _trained(run)
-    # the page of a run that is not evaluated has the same sections, and states what is missing
+    # the page of a run that is not evaluated has the same sections, which state that they are empty
     traces, tables = Traces({}), []
     if run.results is not None:
         traces, tables = run.results.traces, result_tables(run.results)

@@ -1,7 +1,6 @@
 """The classes that a module written by `spelgen build` is made of; they depend on PyTorch only."""
 
-from spelgen.runtime.dense_mass import DenseMass
-from spelgen.runtime.derived_mass import ConstantMass, DerivedMass
+from spelgen.runtime.derived_mass import ConstantMass, DenseMass, DerivedMass
 from spelgen.runtime.friction_laws import FrictionLaws, SlidingFriction
 from spelgen.runtime.motors import MotorInputs, PositionServo
 from spelgen.runtime.network_dynamics import DenseFriction, DenseInputDynamics, JointFriction, NetworkDynamics

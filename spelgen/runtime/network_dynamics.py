@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.networks import JointEncoding, MaskedNetwork
-from spelgen.runtime.parts import Friction, Inputs, Intermediates, Layers, Mass, Parameters
+from spelgen.runtime.parts import Inputs, Intermediates, Layers, Mass, Parameters
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 from spelgen.runtime.rows import Joint, vector
 
@@ -34,7 +34,7 @@ class NetworkDynamics(PortHamiltonian):
         mass: Mass,
         potential: MaskedNetwork,
         potential_scale: float,
-        friction: Friction,
+        friction: NetworkFriction,
         inputs: Inputs | None = None,
     ) -> None:
         super().__init__(joints, inputs)
@@ -131,6 +131,20 @@ class DenseInputDynamics(NetworkDynamics):
         return force / self._gains(cache)
 
 
+class NetworkFriction(nn.Module):
+    """Friction by a network, in units of typical friction and typical speed."""
+
+    prepare: Callable[[], Parameters]  # all that depends on the parameters only
+    # D(q, qd) right, (..., n, k), of the encoding, qd, the parameters and right, (..., n, k)
+    forward: Callable[[Tensor, Tensor, Parameters, Tensor], Tensor]
+
+    def __init__(self, joints: Sequence[Joint], network: MaskedNetwork) -> None:
+        super().__init__()
+        self.speed = nn.Buffer(vector(joint.speed for joint in joints))
+        self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
+        self.network = network
+
+
 class JointFrictionParameters(NamedTuple):
     """All that depends on the parameters only."""
 
@@ -139,7 +153,7 @@ class JointFrictionParameters(NamedTuple):
     smoothing: Tensor  # squared smoothing velocity, (n,)
 
 
-class JointFriction(nn.Module):
+class JointFriction(NetworkFriction):
     """A diagonal D(q, qd), positive for all parameters: viscous constants, and a network for dry friction."""
 
     parameter_groups = (
@@ -148,12 +162,9 @@ class JointFriction(nn.Module):
     )
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork) -> None:
-        super().__init__()
-        self.speed = nn.Buffer(vector(joint.speed for joint in joints))
-        self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
+        super().__init__(joints, network)
         self.raw_smoothing = nn.Parameter(torch.zeros_like(self.speed))
         self.raw_viscous = nn.Parameter(torch.full_like(self.speed, -2.0))
-        self.network = network
 
     def viscous(self) -> Tensor:
         """Return the viscous coefficients, (n,) [Nm s/rad, N s/m]."""
@@ -180,16 +191,14 @@ class JointFriction(nn.Module):
         return diagonal.unsqueeze(-1) * right
 
 
-class DenseFriction(nn.Module):
+class DenseFriction(NetworkFriction):
     """D(q, qd) = L L^T, with ``axes`` rows of L for each joint.
 
     A joint moves along the last of its axes only, so only those rows of L are computed.
     """
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:
-        super().__init__()
-        self.speed = nn.Buffer(vector(joint.speed for joint in joints))
-        self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
+        super().__init__(joints, network)
         rows = axes * len(joints)
         row, column = torch.tril_indices(rows, rows)
         # from the entries of a lower triangle, rows in sequence, to the matrix: (rows, rows, entries)
@@ -197,7 +206,6 @@ class DenseFriction(nn.Module):
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
         # of L, relative to the root of typical friction per typical speed
         self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
-        self.network = network
 
     def prepare(self) -> Layers:
         """Return the layers that give the rows of L."""

@@ -35,16 +35,6 @@ class Mass(Protocol):
         """Return dM/dt, (..., n, n), for this rate of the encoding."""
 
 
-class Friction(Protocol):
-    """The dissipation matrix D(q, qd)."""
-
-    def prepare(self) -> Parameters:
-        """Return the parameter cache: all that depends on the parameters only."""
-
-    def forward(self, encoded: Tensor, qd: Tensor, parameters: Parameters, right: Tensor) -> Tensor:
-        """Return D(q, qd) right, (..., n, k)."""
-
-
 class Inputs(Protocol):
     """The input matrix G of motors that drive several joints, or none."""
 

@@ -3,8 +3,6 @@
 `OWNERS` lists the objectives of each option; an option of another objective is an `OptionError`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
@@ -98,6 +96,7 @@ class FitConfig(Group):
     @classmethod
     def _refuse_foreign(cls, options: object) -> object:
         for name in options if isinstance(options, Mapping) else ():
+            # an option of another objective has a message of its own, since it exists
             if name not in cls.model_fields:
                 owners = OWNERS.get(name)
                 if owners is None:
@@ -116,6 +115,7 @@ class FitConfig(Group):
 
     def require(self, *, rigid_bodies: bool) -> None:
         """Raise OptionError if an option was set that does not apply to this type of model."""
+        # rigid bodies are fitted to torques directly, without the weak form
         if rigid_bodies and self.objective == "momentum":
             raise OptionError(
                 "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
@@ -191,6 +191,7 @@ class OnWindows(FitConfig):
 
     def resolved(self, windows: int) -> Self:
         """Return the configuration with optimizer, batch, learning rate and weight decay for a number of windows."""
+        # L-BFGS with all windows per step converges in few steps, but each one takes all windows
         optimizer = self.optimizer or ("lbfgs" if windows <= DEFAULTS.few_windows else "adamw")
         update: dict[str, object] = {"optimizer": optimizer, "batch": None, "learning_rate": None}
         decay = DEFAULTS.lbfgs_decay
@@ -271,6 +272,7 @@ def fit_config(
     for name, (condition, _, excluded) in UNLESS.items():
         if options.get(condition, settings.get(condition)) == excluded:
             settings.pop(name, None)
+        # an option of the caller implies the choice that it depends on
         elif name in options and condition not in options and settings.get(condition) == excluded:
             settings.pop(condition)
     config = validated(config_type, settings | options)

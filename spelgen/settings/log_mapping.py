@@ -242,6 +242,7 @@ class LogMapping(Group):
     @property
     def quantities(self) -> tuple[str, ...]:
         """Required quantities of a log."""
+        # fits of position servos compare positions only: velocities are not needed
         if self.input == "position":
             return ("q", "u")
         # Velocities are computed from the positions: no column is read for them.
@@ -273,6 +274,7 @@ class LogMapping(Group):
 
     def of_trajectory(self, text: str) -> LogMapping:
         """Return the mapping for one recording of a file: `{trajectory}` in the columns' names is its text."""
+        # without a pattern in a name the column is common to all recordings
         named = {key: name.replace("{trajectory}", text) for key, name in self.columns}
         return self.model_copy(update={"columns": LogColumns(**named)})
 
@@ -289,6 +291,7 @@ class LogMapping(Group):
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
+            # a stated period may be that of a register, which is larger than a turn
             unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
             turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
             period = logged.period.model_copy(update=turns)
@@ -297,6 +300,7 @@ class LogMapping(Group):
 
     def in_si(self) -> LogMapping:
         """Return the mapping of a file in SI units with default names; only input and periods of one turn are kept."""
+        # angles of turning joints may be logged in any interval of one turn, also in files of spelgen
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
@@ -308,6 +312,7 @@ class LogMapping(Group):
     def unit(self, quantity: str, joint: str) -> str | None:
         """Return the unit of "q", "qd", "tau" or "u" of a joint, None without a setting; u has the unit of q."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
+        # commands and positions come from one controller
         if unit is None and quantity == "u":
             return self.unit("q", joint)
         return unit
@@ -318,6 +323,7 @@ class LogMapping(Group):
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain
+        # -100..100 covers the calibrated range, and drive_mode 1 reverses it
         elif unit == NORMALISED:
             motor = self.calibration[self.log_name(joint)]
             counts = (motor.range_max - motor.range_min) / 200
@@ -349,6 +355,7 @@ class LogMapping(Group):
         return errors
 
     def _missing(self, unit: str | None, joint: str, logged: JointLog, kind: str | None) -> str | None:
+        # a motor current has no torque without its motor constant
         if unit in CURRENTS and logged.gain is None:
             return "a gain beside it"
         if unit == NORMALISED and joint not in self.calibration:

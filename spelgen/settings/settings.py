@@ -5,7 +5,7 @@ An error in a group of keys that only one step reads is raised by that step only
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
@@ -51,11 +51,13 @@ class JointSettings(Group):
     @property
     def armature(self) -> float:
         """Rotor inertia on the joint side of the gear [kg m^2]."""
+        # a rotor turns gear times as fast, and its torque acts gear times as strongly
         return self.rotor_inertia * self.gear**2
 
     @field_validator("coulomb")
     @classmethod
     def _resists(cls, value: tuple[float, float]) -> tuple[float, float]:
+        # friction of the opposite sense would drive the joint
         if value[0] < 0 or value[1] > 0:
             raise ValueError("the torque for qd > 0 (not negative), then for qd < 0 (not positive)")
         return value
@@ -91,6 +93,7 @@ class Unusable:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> NoReturn:
+        # names with underscores are asked for by copy and pickle, which must not fail
         if not name.startswith("__"):
             collect(self.errors)
         raise AttributeError(name)
@@ -133,14 +136,17 @@ class Settings(Group):
     @field_validator("joints", mode="before")
     @classmethod
     def _by_name(cls, joints: object) -> object:
+        # a frequent confusion, for which the message of pydantic would not name the other key
         if isinstance(joints, list):
             raise ValueError("settings by the name of a joint; `moving_joints` lists the joints that move")
         return joints
 
     @model_validator(mode="after")
     def _drives(self) -> Settings:
+        # both define the last joint, and could contradict each other
         if self.tip is not None and self.moving_joints is not None:
             raise ValueError("'tip' or 'moving_joints', not both")
+        # a position servo commands a joint, and its logs have no torques
         if self.input == "position" and (self.torque == "motor" or self.couplings):
             raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
         # A joint in two couplings would have two different motor torques.
@@ -164,7 +170,7 @@ class Settings(Group):
         return self.joints.get(name, JointSettings())
 
 
-def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) -> Settings:
+def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) -> Settings:
     """Return the settings of a URDF (`arm.yaml` for `arm.urdf`); the defaults if the file does not exist.
 
     Args:
@@ -184,11 +190,12 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
         return Settings()
     document = read_document(path)
     content = document.value()
-    joint_names = None if joints is None else list(joints)
     unusable: dict[str, tuple[SpelgenError, ...]] = {}
     while True:
         try:
-            settings = _read(document, content, joint_names)
+            settings = validated(Settings, content, document)
+            if joints is not None:
+                _require_joints(_joint_names(settings), joints, document)
             break
         except SpelgenError as error:
             errors = error.errors if isinstance(error, SpelgenErrors) else (error,)
@@ -207,27 +214,19 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
     return settings.model_copy(update=update)
 
 
-def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
+def load_mapping(path: Path | str, joints: Collection[str]) -> LogMapping:
     """Return the mapping of logs in a separate YAML file, which has the keys of `logs` in the settings.
 
     Raises SettingsError as `load_settings` does, and for joints that are not among `joints`.
     """
-    document, joint_names = read_document(Path(path)), list(joints)
+    document = read_document(Path(path))
     mapping = validated(LogMapping, document.value(), document)
-    _require_joints(((("joints", name), name) for name in mapping.joints), joint_names, document)
+    _require_joints(((("joints", name), name) for name in mapping.joints), joints, document)
     return mapping
 
 
-def _read(document: YamlDocument, content: object, joint_names: list[str] | None) -> Settings:
-    """Return the settings in ``content``. Raises the errors of `validated`, and SettingsError for unknown joints."""
-    settings = validated(Settings, content, document)
-    if joint_names is not None:
-        _require_joints(_joint_names(settings), joint_names, document)
-    return settings
-
-
 def _require_joints(
-    found: Iterable[tuple[Location, str]], names: Sequence[str], document: YamlDocument
+    found: Iterable[tuple[Location, str]], names: Collection[str], document: YamlDocument
 ) -> None:
     """Raise SettingsError, or SpelgenErrors, for the joints of a file that are not among `names`."""
     collect(

@@ -1,7 +1,5 @@
 """Settings of `spelgen simulate`: motions, torques and measurement."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -100,6 +98,7 @@ class TrackingSettings(Group):
 
     @model_validator(mode="after")
     def _used(self) -> Self:
+        # without this error the keys would have no effect
         sines = {"amplitude", "frequency"} & self.model_fields_set
         if self.paths == "excitation" and sines:
             raise ValueError(f"{' and '.join(sorted(sines))} of sines, beside paths: excitation")

@@ -1,7 +1,5 @@
 """The settings file of `spelgen init`: the main keys with their defaults, commented out and explained."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

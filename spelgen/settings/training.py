@@ -1,7 +1,5 @@
 """Settings of `spelgen train` and `spelgen compare` for one robot."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator

@@ -1,7 +1,5 @@
 """Types of the values in a settings file, and the base class of its groups of keys."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field

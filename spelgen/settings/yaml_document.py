@@ -1,7 +1,5 @@
 """Read YAML with the line of each value, and check it key by key; unsafe or ambiguous constructs are errors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,11 +72,13 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     def compose_node(self, parent: yaml.Node | None, index: object) -> yaml.Node:
         event = self.peek_event()
         mark = event.start_mark
+        # aliases of aliases expand a small file to gigabytes
         if self.check_event(yaml.AliasEvent):
             raise ComposerError(None, None, "an alias", mark)
         is_tagged = isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag is not None
         if is_tagged:  # a tag may contradict its value, as in "!!bool maybe"
             raise ComposerError(None, None, f"the tag {event.tag}", mark)
+        # settings have six levels at most; the parser is recursive
         if self.depth == 16:
             raise ComposerError(None, None, "more than 16 levels", mark)
         self.depth += 1
@@ -92,6 +92,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 raise ComposerError(None, None, "a key that is no plain word", key.start_mark)
+            # YAML would silently keep the last one
             if key.value in seen:
                 raise ComposerError(None, None, f"the key {key.value!r} a second time", key.start_mark)
             seen.add(key.value)
@@ -135,6 +136,7 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
     document: None for values of the command line, which have no lines.
     """
     location, error_type = detail["loc"], detail["type"]
+    # misspelt keys are the most frequent error: the closest known key is named
     if error_type == "extra_forbidden":
         names = _group_at(group, location[:-1]).model_fields
         return unknown_name(location, "key", str(location[-1]), names, document)

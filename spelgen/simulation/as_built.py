@@ -15,7 +15,7 @@ from lxml import etree
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SpelgenError
-from spelgen.excitation.trajectory import SPEEDS, motion_bounds
+from spelgen.excitation.bounds import SPEEDS, motion_bounds
 from spelgen.files import write_bytes, write_text
 from spelgen.simulation.tuning import AS_BUILT
 from spelgen.structure.nominal import parameters_of, pseudo_inertia

@@ -9,7 +9,8 @@ import numpy as np
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import DriveFriction, joint_friction
 from spelgen.errors import SettingsError, SpelgenError, collect
-from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, MotionBounds
+from spelgen.excitation.bounds import SPEEDS, MotionBounds
+from spelgen.excitation.trajectory import ExcitationTrajectory, Motion
 from spelgen.excitation.tuning import TUNING as EXCITATION
 from spelgen.logs.trajectory import Trajectory, trajectory_listing
 from spelgen.settings.settings import Settings

@@ -21,11 +21,7 @@ from spelgen.simulation.tuning import TUNING
 
 
 def servo_motions(
-    arm: Chain,
-    settings: Settings,
-    drives: Drives | None = None,
-    *,
-    progress: Progress = silent,
+    arm: Chain, settings: Settings, drives: Drives | None = None, *, progress: Progress = silent
 ) -> SimulatedLogs:
     """Return trajectories under random commands; the same settings give the same logs.
 
@@ -74,9 +70,8 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
     """
     dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
     limit = np.array([coordinate.effort or TUNING.servo_effort for coordinate in arm.coordinates])
-    kp = 2 * limit
-    for joint, coordinate in enumerate(arm.coordinates):
-        kp[joint] = settings.joint(coordinate.name).kp or kp[joint]
+    known = [settings.joint(coordinate.name).kp for coordinate in arm.coordinates]
+    kp = np.array([gain or 2 * effort for gain, effort in zip(known, limit, strict=True)])
     kd = TUNING.servo_lag * kp
     interval = t[1] - t[0]
     steps = int(np.ceil(interval / TUNING.servo_step))

@@ -33,11 +33,7 @@ from spelgen.simulation.tuning import TUNING
 
 
 def random_inputs(
-    arm: Chain,
-    settings: Settings,
-    drives: Drives | None = None,
-    *,
-    progress: Progress = silent,
+    arm: Chain, settings: Settings, drives: Drives | None = None, *, progress: Progress = silent
 ) -> SimulatedLogs:
     """Return trajectories under random inputs; the same settings give the same logs.
 

@@ -50,11 +50,7 @@ class Recording:
 
 
 def track(
-    arm: Chain,
-    settings: Settings,
-    drives: Drives | None = None,
-    *,
-    progress: Progress = silent,
+    arm: Chain, settings: Settings, drives: Drives | None = None, *, progress: Progress = silent
 ) -> SimulatedLogs:
     """Return logs of the arm under feedback control along paths.
 

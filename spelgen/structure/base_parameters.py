@@ -6,8 +6,6 @@ Gautier and Khalil, *Direct calculation of minimum set of inertial parameters of
 and Automation 6(3), 1990, derive the same parameters by symbolic rules.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass

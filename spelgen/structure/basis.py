@@ -7,13 +7,12 @@ entries of M before sums of entries. Independent functionals are the independent
 greedy selection is optimal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import combinations
 from math import gcd
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,8 +44,7 @@ class Term:
     basis: Weights
 
 
-@dataclass(frozen=True)
-class _Functional:
+class _Functional(NamedTuple):
     """A linear functional of M, (n(n+1)/2,), in the prime field (``weights``) and in double precision (``values``)."""
 
     joints: tuple[int, ...]

@@ -8,8 +8,6 @@ its pseudo-inertia J = [[S, h], [h^T, m]] with S = tr(I)/2 1 - I is positive def
 RA-L 3:60, 2018).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction

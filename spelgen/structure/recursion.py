@@ -6,14 +6,11 @@ and polynomials (``expansion``). Each body has ten inertial parameters (m, h = m
 frame), in which M and V are linear. A body rotates about, or translates along, the z axis of its joint's frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from itertools import combinations, combinations_with_replacement
 from math import cos, lcm, sin, tan
-from typing import Any
+from typing import Any, NamedTuple
 
 from spelgen.arm.arm import Body, Chain
 
@@ -27,8 +24,7 @@ TENSOR = tuple(combinations_with_replacement(range(3), 2))
 """Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
 
 
-@dataclass(frozen=True)
-class Position:
+class Position(NamedTuple):
     """The position of a coordinate: cosine and sine of its base angle (see ``base_denominators``), and its value."""
 
     cos: Element
@@ -36,16 +32,14 @@ class Position:
     value: Element
 
 
-@dataclass(frozen=True)
-class Energies:
+class Energies(NamedTuple):
     """The lower triangle of the mass matrix, {(row, column): element} from 0, and the potential energy."""
 
     mass: dict[tuple[int, int], Element]
     potential: Element
 
 
-@dataclass(frozen=True)
-class _Inertia:
+class _Inertia(NamedTuple):
     """A composite inertia: mass, first moment, and inertia tensor about the origin of the frame."""
 
     mass: Element
@@ -53,8 +47,7 @@ class _Inertia:
     tensor: tuple[Element, ...]
 
 
-@dataclass(frozen=True)
-class _Pose:
+class _Pose(NamedTuple):
     """The pose of a body in its parent, or the motion of a joint: sparse, with the elements 1 and -1 as integers."""
 
     rotation: tuple[Terms, ...]

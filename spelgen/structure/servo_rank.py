@@ -5,9 +5,7 @@ equations are linear and homogeneous in kp, kd, armature, dry and pi: logs deter
 space of the system. The ratio of a parameter to kp is identifiable if both change by the same factor in the null space.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +16,7 @@ from spelgen.structure.sampling import float_energies
 PARAMETERS = ("kp", "kd", "armature", "dry")
 
 
-@dataclass(frozen=True)
-class ServoRank:
+class ServoRank(NamedTuple):
     """Identifiable ratios of the parameters of servos.
 
     groups: joints whose kp have identifiable ratios: one known kp, mass or load determines all parameters of a group.

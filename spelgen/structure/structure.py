@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import compress
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from spelgen.arm.arm import Chain
 from spelgen.errors import ArmError
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from spelgen.urdf.robot import Assume
 
 
-@dataclass(frozen=True)
-class MassEntry:
+class MassEntry(NamedTuple):
     """An entry of the mass matrix, with indices from 0, and the coordinates that it depends on."""
 
     row: int

@@ -1,10 +1,8 @@
 """Bytes -> XML tree of a URDF; unsafe content and other formats are refused."""
 
-from __future__ import annotations
-
 import re
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from lxml import etree
 
@@ -26,8 +24,7 @@ _OTHER_FORMATS = {
 }
 
 
-@dataclass(frozen=True)
-class UrdfDocument:
+class UrdfDocument(NamedTuple):
     """The bytes of a URDF, its ``<robot>`` element, and the lines of ``<xacro:property>`` elements in it.
 
     ``path`` is the name of the file in errors. For a xacro file, bytes and lines refer to the expanded document, and

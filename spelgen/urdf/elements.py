@@ -1,7 +1,5 @@
 """A <link>, <joint> or <transmission> element -> its dataclass; defects are reported, not repaired."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from lxml import etree

@@ -1,7 +1,5 @@
 """Visual and collision shapes of links: boxes, cylinders and spheres as numbers, meshes as triangles."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json
@@ -13,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from lxml import etree
@@ -44,8 +42,7 @@ class LinkShape:
     mesh: Mesh | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class LinkShapes:
+class LinkShapes(NamedTuple):
     """The shapes of links that were read, and the unread ones: name of the link -> names of files, or kind."""
 
     shapes: tuple[LinkShape, ...]
@@ -77,6 +74,7 @@ def link_shapes(
     for link in root.iterfind("link"):
         name = link.get("name", "")
         for each in link.iterfind(element) if name in links else ():
+            # one invalid shape must not hide the others, which are only drawn
             try:
                 shapes.append(_shape(name, each))
             except ValueError as error:

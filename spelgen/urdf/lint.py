@@ -1,7 +1,5 @@
 """Warnings about physically inconsistent values and probable mistakes in a URDF."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -94,6 +92,7 @@ def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
     }
     texts = []
     for limit, names in lacking.items():
+        # most URDFs lack all limits of a kind or none
         which = "all joints" if len(names) == len(joints) else ", ".join(names)
         if names:
             texts.append(f"{limit} of {which}")

@@ -1,7 +1,5 @@
 """URDF file -> Robot, with the values of the file: all elements are checked, and no defect is repaired silently."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,6 +29,7 @@ def read_urdf(path: Path) -> Robot:
     """
     document = read_document(path)
     notes = Notes(document.path)
+    # line numbers would be searched for in the wrong file
     if document.path != path:
         message = f"expanded by xacro: lines are those of the document that `xacro {path.name}` prints"
         notes.diagnostics.append(Diagnostic("info", "expanded-xacro", "robot", None, message))
@@ -134,6 +133,7 @@ def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
         if leader is None:
             got = f"no joint is named {joint.mimic.joint!r}"
             notes.error(joint.line, where, got, do=suggestion(joint.mimic.joint, by_name))
+        # a follower of a fixed joint would be a fixed joint that looks as if it moves
         elif not leader.moves:
             got = f"the {leader.type} joint {leader.name!r}"
             notes.error(joint.line, where, got, "a revolute, continuous or prismatic joint to follow")

@@ -1,11 +1,9 @@
 """A robot with the values of its URDF: links, joints and transmissions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from spelgen.errors import Diagnostic, UrdfError
 
@@ -21,8 +19,7 @@ MOVING = ("revolute", "continuous", "prismatic")
 """Types of joints with one degree of freedom."""
 
 
-@dataclass(frozen=True)
-class Inertial:
+class Inertial(NamedTuple):
     """Mass [kg], centre of mass and orientation of the inertial frame in the link frame [m, rad].
 
     ``tensor`` is (ixx, ixy, ixz, iyy, iyz, izz) [kg m2] about the centre of mass, in the inertial frame.
@@ -35,8 +32,7 @@ class Inertial:
     line: int
 
 
-@dataclass(frozen=True)
-class UrdfLink:
+class UrdfLink(NamedTuple):
     """A link; ``inertial`` is None if absent."""
 
     name: str
@@ -44,8 +40,7 @@ class UrdfLink:
     line: int
 
 
-@dataclass(frozen=True)
-class Mimic:
+class Mimic(NamedTuple):
     """A joint that follows another: q = multiplier * q_joint + offset [rad or m]."""
 
     joint: str
@@ -53,8 +48,7 @@ class Mimic:
     offset: float
 
 
-@dataclass(frozen=True)
-class UrdfJoint:
+class UrdfJoint(NamedTuple):
     """A joint at ``xyz`` [m] and ``rpy`` [rad] in the frame of the parent link; ``axis`` is in the frame of the joint.
 
     Limits are in rad or m, N m or N, and per second, None if absent. ``axis`` is not normalised; (1, 0, 0) if absent.
@@ -82,8 +76,7 @@ class UrdfJoint:
         return self.type in MOVING
 
 
-@dataclass(frozen=True)
-class Transmission:
+class Transmission(NamedTuple):
     """Actuators (name, reduction) that drive joints (name, reduction, offset); None for an absent number.
 
     ``errors`` are raised by a step that needs the transmission.

@@ -79,6 +79,7 @@ class Element:
 
     def text(self, key: str) -> str | None:
         """Return an attribute, None if it is absent."""
+        # an absent element reads as one without attributes, so that callers need no branch
         text: str | None = None if self.xml is None else self.xml.get(key)
         return text
 
@@ -134,6 +135,7 @@ class Element:
             self.error(f"{len(words)} numbers ({excerpt!r})", expected, key=key)
             return []
         for word in words:
+            # no exporter writes so many digits: the file is damaged
             if len(word) > longest:
                 self.error(f"a number of {len(word)} characters", f"at most {longest}", key=key)
                 return []

@@ -6,16 +6,14 @@ a separate process with limited time and memory, but with the permissions of the
 FILE -> stdout, messages -> stderr.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from spelgen.errors import UrdfError
 
@@ -25,8 +23,7 @@ MISSING = 3  # exit code of the process where the package xacro is not installed
 _BY_HAND = "expand it where that works: xacro FILE name:=value ... > ROBOT.urdf"
 
 
-@dataclass(frozen=True)
-class XacroOutput:
+class XacroOutput(NamedTuple):
     """The expanded URDF, and the warnings of xacro."""
 
     data: bytes
@@ -57,6 +54,7 @@ def expand(path: Path, max_bytes: int) -> XacroOutput:
             raise UrdfError(f"xacro still running after {MAX_SECONDS} s", file=path, do=_BY_HAND) from None
         lines = run.stderr.decode(errors="replace").splitlines()
         warnings = tuple(line.removeprefix("warning: ") for line in lines if line.startswith("warning: "))
+        # messages before the failure are often its cause: they are all part of the error
         if run.returncode:
             raise _failure(path, run.returncode, [line for line in lines if not line.startswith("warning: ")])
         size = output.seek(0, 2)

@@ -11,15 +11,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import COULOMB, DEAD_ZONE, ServoParameters
-from spelgen.fitting.servo.problem import MAX_STEP, ServoProblem
-from spelgen.fitting.servo.tuning import ServoLawTuning, ServoSolverTuning
+from spelgen.fitting.servo.problem import ServoProblem
+from spelgen.fitting.servo.tuning import TUNING
 from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.runtime.friction_laws import FrictionLaws
-
-TUNING, SOLVER = ServoLawTuning(), ServoSolverTuning()
 
 
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
@@ -41,7 +40,7 @@ def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> Servo
     return replace(x, joints=joints, active=active)
 
 
-def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, torch.Tensor]:
+def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, Tensor]:
     """Minimize the cost of each joint over its own parameters; return the parameters and the costs, (n,).
 
     The n joints have independent Levenberg-Marquardt solvers in one batch, each with its own damping and termination:
@@ -51,18 +50,18 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
     costs = problem.joint_costs(x, errors)
     damping, active = torch.full_like(costs, DAMPING.initial_damping), torch.ones_like(costs).bool()
     p, n = x.joints.shape
-    for _ in range(TUNING.steps):
+    for _ in range(TUNING.joint_steps):
         normal = problem.normal_equations(x, errors)
         # the block (p, p) of each joint: (n, p, p) and (n, p)
         blocks = normal.curvature[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)
         joints = NormalEquations(blocks.permute(2, 0, 1), normal.descent[: p * n].view(p, n).mT)
-        steps = joints.step(damping).clamp(-MAX_STEP, MAX_STEP)
+        steps = joints.step(damping).clamp(-TUNING.max_step, TUNING.max_step)
         candidate = replace(x, joints=x.joints + steps.mT * x.active)
         candidate_errors = problem.residual(candidate)
         candidate_costs = problem.joint_costs(candidate, candidate_errors)
         better = active & (candidate_costs < costs)
         # a joint ends after a small decrease, or if no step with a damping below one lowers its cost
-        active &= torch.where(better, costs - candidate_costs >= SOLVER.min_decrease, damping < 1.0)
+        active &= torch.where(better, costs - candidate_costs >= TUNING.min_decrease, damping < 1.0)
         x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
         errors = torch.where(better, candidate_errors, errors)
         costs = torch.where(better, candidate_costs, costs)
@@ -89,7 +88,7 @@ def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) 
     return replace(x, joints=joints, active=torch.ones_like(x.active))
 
 
-def sliding_friction(friction: FrictionLaws, qd: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
+def sliding_friction(friction: FrictionLaws, qd: Tensor, gravity: Tensor) -> Tensor:
     """Return the mean of the dry friction magnitude of each joint over its path, (n,) [Nm, N].
 
     Args:
@@ -99,5 +98,5 @@ def sliding_friction(friction: FrictionLaws, qd: torch.Tensor, gravity: torch.Te
     """
     speed = qd.abs() + 1e-9  # so that the mean of joints at rest is defined
     dry = friction.prepare().dry(qd, gravity) * speed
-    mean: torch.Tensor = dry.flatten(0, -2).sum(dim=0) / speed.flatten(0, -2).sum(dim=0)
+    mean: Tensor = dry.flatten(0, -2).sum(dim=0) / speed.flatten(0, -2).sum(dim=0)
     return mean

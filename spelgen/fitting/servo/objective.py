@@ -1,6 +1,6 @@
 """The objective servo: fit position servos, friction and gravity load of an arm to positions under its commands.
 
-The initial guess is the least-squares solution of the command error (`initial_guess`). Outer iterations then minimize
+The initial guess is the least-squares solution of the command error (`least_squares`). Outer iterations then minimize
 the error of predicted windows (`problem`): each recomputes the load of the bodies along the predicted motion and the
 scale of the errors. Dead zones are selected after the first iteration (`laws`); the last one uses all windows.
 """
@@ -12,34 +12,30 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import encoder_step
 from spelgen.errors import Diagnostic
-from spelgen.fitting.dataset import digest
+from spelgen.fitting.dataset import FitRequest, PreparedLogs, digest
 from spelgen.fitting.levenberg_marquardt import SolverState, initial_state, levenberg_marquardt
-from spelgen.fitting.objective import FitRequest, Objective, PreparedLogs, Status
+from spelgen.fitting.objective import Objective, Status
+from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.servo.initial_guess import set_initial_guess
 from spelgen.fitting.servo.laws import select_dead_zones, without_small_dead_zones
-from spelgen.fitting.servo.linear_servos import fit_linear_servos
+from spelgen.fitting.servo.least_squares import fit_linear_servos, set_initial_guess
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.rollouts import ServoRollouts
-from spelgen.fitting.servo.tuning import ServoSolverTuning
+from spelgen.fitting.servo.tuning import TUNING
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
-if TYPE_CHECKING:
-    from spelgen.fitting.process import TrainingProgress
-
-TUNING = ServoSolverTuning()
 # On few windows with half the integration steps; on few windows with dead zones; on all windows.
 OUTER_ITERATIONS = 3
 
@@ -69,14 +65,11 @@ class ServoObjective(Objective):
         notes = check(self._logs, model.joint_names, model.joint_types)
         self._windows = servo_windows(self._logs, request.preprocessing)
         return PreparedLogs(
-            config=request.config,
             preprocessing=request.preprocessing,
             digest=digest(self._logs),
-            training=[log.name for log in self._logs],
-            validation=[],
-            training_windows=len(self._windows.q),
-            validation_windows=0,
-            notes=notes,
+            training_names=[log.name for log in self._logs],
+            window_counts=(len(self._windows.q), 0),
+            diagnostics=notes,
         )
 
     def begin(self) -> list[Diagnostic]:
@@ -164,19 +157,11 @@ class ServoObjective(Objective):
 
     def _update_checkpoint(self, rms: float) -> None:
         """Set the content of checkpoint.pt; rms: of the position errors [rad, m]."""
-        self._checkpoint = {
-            "epoch": 0,
-            "step": self._steps,
-            "best_epoch": 0,
-            "best_loss": rms,
-            "best_weights": copy.deepcopy(self.model.state_dict()),
-            "seconds": time.monotonic() - self._since,
-            "substeps": self._windows.steps,
-            "servo": {
-                "start": self._initial_weights,
-                "rounds": [vars(x) for x in self._iterates],
-                "steps": self._first_steps,
-            },
+        self._make_checkpoint(rms, time.monotonic() - self._since, self._windows.steps, self._steps)
+        self._checkpoint["servo"] = {
+            "start": self._initial_weights,
+            "rounds": [vars(x) for x in self._iterates],
+            "steps": self._first_steps,
         }
 
 

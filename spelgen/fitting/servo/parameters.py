@@ -4,28 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.autograd.functional import jacobian
 
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.dynamics.parameters import parameters_of_kind
-from spelgen.fitting.functional_model import evaluate_with
-from spelgen.fitting.servo.tuning import ServoPriorTuning
+from spelgen.dynamics.parameters import evaluate_with, parameters_of_kind
+from spelgen.emission.assemble import ArmModel
+from spelgen.fitting.servo.tuning import TUNING
 
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-TUNING = ServoPriorTuning()
 DEAD_ZONE = "servo.dead_zone"
 COULOMB = "friction.raw_coulomb"
 STRIBECK_VELOCITY = "friction.raw_stribeck_velocity"
-# Prior standard deviation of a parameter that is not fitted.
-FIXED = 1e-9
-# Smallest effect of a direction of the body parameters on gravity, relative to the largest effect.
-MIN_EFFECT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +29,12 @@ class ServoParameters:
     dead zones are fitted only at joints that have one.
     """
 
-    joints: torch.Tensor
-    bodies: torch.Tensor
+    joints: Tensor
+    bodies: Tensor
     delay: float
-    active: torch.Tensor
+    active: Tensor
 
-    def after(self, step: torch.Tensor) -> ServoParameters:
+    def after(self, step: Tensor) -> ServoParameters:
         """Return the parameters after a step (k,); the delay is clamped at zero."""
         joints, bodies, delay = step.split([self.joints.numel(), len(self.bodies), 1])
         return replace(
@@ -53,7 +45,7 @@ class ServoParameters:
         )
 
     @property
-    def flat(self) -> torch.Tensor:
+    def flat(self) -> Tensor:
         """All parameters as one vector, (k,)."""
         delay = torch.tensor([self.delay], dtype=torch.float64)
         return torch.cat([self.joints.flatten(), self.bodies, delay])
@@ -71,9 +63,9 @@ class ParameterMap:
         q: (M, n) positions of the logs [rad, m], which determine the directions.
     """
 
-    def __init__(self, model: ArmModel, q: torch.Tensor) -> None:
+    def __init__(self, model: ArmModel, q: Tensor) -> None:
         self._model, self._n = model, model.n
-        tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
+        tensors = dict(model.named_parameters()) | dict(model.named_buffers())
         # without raw_viscous: logs of positions determine only the sum of viscous friction and kd, which is fitted as
         # kd
         rows = [
@@ -100,7 +92,7 @@ class ParameterMap:
         """Return the index of the first row of a parameter."""
         return self.names.index(name)
 
-    def named(self, joints: torch.Tensor) -> dict[str, torch.Tensor]:
+    def named(self, joints: Tensor) -> dict[str, Tensor]:
         """Return P sets of joint parameters (P, p, n) as tensors by name, each (P, 1, n) or (P, 1, n, K)."""
         columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)  # (P, 1, n, K)
         named = {}
@@ -116,28 +108,28 @@ class ParameterMap:
             self._model.get_parameter(self._bodies).copy_(self._log_cholesky(x.bodies))
             self._model.servo.delay.fill_(x.delay)
 
-    def precision(self, x: ServoParameters) -> torch.Tensor:
+    def precision(self, x: ServoParameters) -> Tensor:
         """Return the precision of the prior, (k,): inverse variances of independent parameters."""
-        joints = torch.where(x.active, self._deviations, FIXED)
+        joints = torch.where(x.active, self._deviations, TUNING.fixed)
         shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
         return torch.cat([joints.flatten(), shared]) ** -2
 
-    def inertial(self, bodies: torch.Tensor) -> torch.Tensor:
+    def inertial(self, bodies: Tensor) -> Tensor:
         """Return the inertial parameters of all bodies, (10 B,), at coordinates (r,) along the directions."""
         return self._inertial(self._log_cholesky(bodies)).flatten()
 
-    def _log_cholesky(self, bodies: torch.Tensor) -> torch.Tensor:
+    def _log_cholesky(self, bodies: Tensor) -> Tensor:
         """Return the log-Cholesky parameters (B, 10) at coordinates (r,)."""
         return self._mean_bodies + (self.directions @ bodies).view_as(self._mean_bodies)
 
-    def _inertial(self, log_cholesky: torch.Tensor) -> torch.Tensor:
+    def _inertial(self, log_cholesky: Tensor) -> Tensor:
         """Return inertial parameters, (B, 10), for log-Cholesky parameters (B, 10)."""
-        parameters: torch.Tensor = evaluate_with(
+        parameters: Tensor = evaluate_with(
             self._model, {self._bodies: log_cholesky}, lambda model: model.inertial_parameters
         )
         return parameters
 
-    def _body_directions(self, q: torch.Tensor) -> torch.Tensor:
+    def _body_directions(self, q: Tensor) -> Tensor:
         """Return the directions (10 B, r) with the largest effect on gravity at q (M, n).
 
         They are right singular vectors of d gravity / d log-Cholesky parameters. The length of each is its prior
@@ -151,6 +143,6 @@ class ParameterMap:
                 self._mean_bodies.numel(), -1
             )
         _, effects, directions = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
-        strong = effects[: TUNING.body_directions] > MIN_EFFECT * effects[:1].clamp(min=1e-12)
-        result: torch.Tensor = TUNING.bodies * directions[: len(strong)][strong].mT
+        strong = effects[: TUNING.body_directions] > TUNING.min_effect * effects[:1].clamp(min=1e-12)
+        result: Tensor = TUNING.bodies * directions[: len(strong)][strong].mT
         return result

@@ -15,26 +15,23 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import ParameterMap, ServoParameters
 from spelgen.fitting.servo.rollouts import ServoRollouts
-from spelgen.fitting.servo.tuning import ServoCostTuning
-
-TUNING = ServoCostTuning()
-# Largest step of any parameter; most are logarithms.
-MAX_STEP = 1.0
+from spelgen.fitting.servo.tuning import TUNING
 
 
 @dataclass(frozen=True, eq=False)
 class Likelihood:
     """Student-t likelihood of position errors. scale: (n,) [rad, m]. samples_per_error: (n,)."""
 
-    scale: torch.Tensor
-    samples_per_error: torch.Tensor
+    scale: Tensor
+    samples_per_error: Tensor
 
     @classmethod
-    def of(cls, errors: torch.Tensor, noise: torch.Tensor, max_samples: int) -> Likelihood:
+    def of(cls, errors: Tensor, noise: Tensor, max_samples: int) -> Likelihood:
         """Return the likelihood with the scale and the correlation of given errors.
 
         Args:
@@ -53,12 +50,12 @@ class Likelihood:
         of_samples = blocks.square().sum(dim=2).mean(dim=(0, 1))
         return cls(scale, (of_sums / of_samples.clamp(min=1e-300)).clamp(1.0, float(size)))
 
-    def costs(self, errors: torch.Tensor) -> torch.Tensor:
+    def costs(self, errors: Tensor) -> Tensor:
         """Return the negative log likelihood per joint, (n,), of errors (W, K', n)."""
         costs = 2 * torch.log1p((errors / self.scale).square() / 4) / self.samples_per_error
         return costs.sum(dim=(0, 1))
 
-    def weights(self, errors: torch.Tensor) -> torch.Tensor:
+    def weights(self, errors: Tensor) -> Tensor:
         """Return weights (W, K', n) of errors (W, K', n), with which weighted least squares has the same gradient."""
         robust = 1 / (1 + (errors / self.scale).square() / 4)
         return robust / self.scale**2 / self.samples_per_error
@@ -72,11 +69,11 @@ class ServoProblem:
     """
 
     rollouts: ServoRollouts
-    noise: torch.Tensor
+    noise: Tensor
     likelihood: Likelihood
 
     @classmethod
-    def of(cls, rollouts: ServoRollouts, noise: torch.Tensor, errors: torch.Tensor) -> ServoProblem:
+    def of(cls, rollouts: ServoRollouts, noise: Tensor, errors: Tensor) -> ServoProblem:
         """Return the problem with the likelihood of given errors, (W, K', n) [rad, m]."""
         max_samples = max(1, round(TUNING.correlation_time * rollouts.windows.rate))
         return cls(rollouts, noise, Likelihood.of(errors, noise, max_samples))
@@ -97,30 +94,30 @@ class ServoProblem:
         """The map of the parameters to the model, and their prior."""
         return self.rollouts.parameters
 
-    def residual(self, x: ServoParameters) -> torch.Tensor:
+    def residual(self, x: ServoParameters) -> Tensor:
         """Return predicted minus measured positions after the burn-in, (W, K', n) [rad, m]."""
         return self.rollouts.residual(x)
 
-    def joint_costs(self, x: ServoParameters, errors: torch.Tensor) -> torch.Tensor:
+    def joint_costs(self, x: ServoParameters, errors: Tensor) -> Tensor:
         """Return the cost per joint (n,) for errors (W, K', n), without the prior of shared parameters."""
         prior = self._prior(x)[: x.joints.numel()].view_as(x.joints)
         return self.likelihood.costs(errors) + prior.sum(dim=0)
 
-    def cost(self, x: ServoParameters, errors: torch.Tensor) -> float:
+    def cost(self, x: ServoParameters, errors: Tensor) -> float:
         """Return the cost for errors (W, K', n); infinite if a rollout diverged."""
         if not errors.isfinite().all():
             return float("inf")
         return float(self.likelihood.costs(errors).sum() + self._prior(x).sum())
 
-    def _prior(self, x: ServoParameters) -> torch.Tensor:
+    def _prior(self, x: ServoParameters) -> Tensor:
         """Return the negative log prior of each parameter, (k,)."""
         return self.parameters.precision(x) * (x.flat - self.parameters.prior_mean.flat).square() / 2
 
-    def candidates(self, x: ServoParameters, step: torch.Tensor) -> Iterable[ServoParameters]:
+    def candidates(self, x: ServoParameters, step: Tensor) -> Iterable[ServoParameters]:
         """Return the parameters after a step (k,), which is clamped; see `LeastSquaresProblem`."""
-        return [x.after(step.clamp(-MAX_STEP, MAX_STEP))]
+        return [x.after(step.clamp(-TUNING.max_step, TUNING.max_step))]
 
-    def normal_equations(self, x: ServoParameters, errors: torch.Tensor) -> NormalEquations:
+    def normal_equations(self, x: ServoParameters, errors: Tensor) -> NormalEquations:
         """Return Gauss-Newton Hessian (k, k) and negative gradient (k,) at x, of errors (W, K', n) and the prior."""
         return self.with_prior(self.window_equations(x, errors), x)
 
@@ -130,7 +127,7 @@ class ServoProblem:
         descent = windows.descent.sum(dim=0) - precision * (x.flat - self.parameters.prior_mean.flat)
         return NormalEquations(windows.curvature.sum(dim=0) + torch.diag(precision), descent)
 
-    def window_equations(self, x: ServoParameters, errors: torch.Tensor) -> NormalEquations:
+    def window_equations(self, x: ServoParameters, errors: Tensor) -> NormalEquations:
         """Return the normal equations of each window, (W, k, k) and (W, k), without the prior; errors: (W, K', n)."""
         of_joints, of_shared = self.rollouts.jacobian(x)
         weights = self.likelihood.weights(errors)

@@ -8,27 +8,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from scipy.special import stdtrit
+from torch import Tensor
 
-from spelgen.fitting.functional_model import evaluate_with
+from spelgen.dynamics.parameters import evaluate_with
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import sliding_friction
 from spelgen.fitting.servo.parameters import DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
-from spelgen.fitting.servo.tuning import ServoIntervalTuning
+from spelgen.fitting.servo.tuning import TUNING
 from spelgen.identification.intervals import jackknife_covariance
 from spelgen.listing import Listing, number
 
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-TUNING = ServoIntervalTuning()
-# Of Student's t, since there are few blocks: a two-sided 95 % interval.
-QUANTILE = 0.975
 RATIOS = {
     "kd": ("kd/kp", "s"),
     "lag": ("lag", "s"),
@@ -68,13 +63,14 @@ class ServoSolution:
     """
 
     blocks: NormalEquations
-    precision: torch.Tensor
-    covariance: torch.Tensor
+    precision: Tensor
+    covariance: Tensor
 
     @property
     def quantile(self) -> float:
         """Half the width of an interval, in standard deviations."""
-        return float(stdtrit(max(1, len(self.blocks.curvature) - 1), QUANTILE))
+        # of Student's t, since there are few blocks: a two-sided 95 % interval
+        return float(stdtrit(max(1, len(self.blocks.curvature) - 1), 0.975))
 
 
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
@@ -85,8 +81,8 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     """
     # dead zones of all joints: fixed at zero, they would make dry friction seem better determined
     free, errors = replace(x, active=torch.ones_like(x.active)), problem.residual(x)
-    blocks = problem.window_equations(free, errors)
-    blocks = sum_by_block(blocks, problem.rollouts.windows.blocks(TUNING.min_logs, TUNING.min_blocks))
+    numbers = problem.rollouts.windows.blocks(TUNING.min_logs, TUNING.min_blocks)
+    blocks = NormalEquations(*(_sums(x, numbers) for x in problem.window_equations(free, errors)))
     precision = problem.parameters.precision(free)
     step = problem.with_prior(blocks, x).step()
     # at the end of the fit the gradients of all windows and of the prior add up to zero
@@ -100,18 +96,12 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
-def sum_by_block(windows: NormalEquations, numbers: torch.Tensor) -> NormalEquations:
-    """Return sums of normal equations, (W, k, k) and (W, k), over the windows of each block, by number (W,)."""
-
-    def summed(terms: torch.Tensor) -> torch.Tensor:
-        """Return the sums of the terms per log, (logs, ...)."""
-        sums = terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:])
-        return sums.index_add(0, numbers, terms)
-
-    return NormalEquations(*map(summed, windows))
+def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
+    """Return the sums of terms (W, ...) over the windows of each block, (B, ...); numbers: of the blocks, (W,)."""
+    return terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:]).index_add(0, numbers, terms)
 
 
-def identifiable(blocks: NormalEquations, precision: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:
+def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
     """Test by variance inflation factors if the logs distinguish parameters from all others; return (m,) booleans.
 
     Derivatives of the errors with respect to a dead zone and to dry friction are proportional at joints without gravity
@@ -124,11 +114,11 @@ def identifiable(blocks: NormalEquations, precision: torch.Tensor, indices: torc
     """
     curvature = blocks.curvature.sum(dim=0)
     inverse = torch.linalg.inv(curvature + torch.diag(precision))
-    inflation: torch.Tensor = (curvature.diagonal() * inverse.diagonal())[indices]
+    inflation: Tensor = (curvature.diagonal() * inverse.diagonal())[indices]
     return inflation < TUNING.variance_inflation
 
 
-def ratios(model: ArmModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
+def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
     """Return the ratios to kp by name, (n,) each.
 
     Args:
@@ -150,7 +140,7 @@ def ratios(model: ArmModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str
 
 def ratios_with_deviations(
     problem: ServoProblem, solution: ServoSolution
-) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+) -> dict[str, tuple[Tensor, Tensor]]:
     """Return the ratios to kp by name, and the standard deviations of their logarithms, (n,) each."""
     rollouts, parameters = problem.rollouts, problem.parameters
     tensors = {name: x.detach().clone().requires_grad_() for name, x in parameters.tensors.items()}
@@ -176,7 +166,7 @@ def ratios_with_deviations(
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
     """Return the content for config.json: delay [s], RMS errors [rad, m], and per joint kp and the ratios to kp.
 
-    Intervals are of 95 %. determined: whether an interval is narrower than a factor of `ServoIntervalTuning`.
+    Intervals are of 95 %. determined: whether an interval is narrower than a factor of `ServoTuning`.
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},
@@ -217,41 +207,28 @@ def servo_summary(record: Content | None) -> FitSummary | None:
     """Return the summary of a `servo_record`; None if the fit has not finished, or if the arm has no servos."""
     if record is None:
         return None
-    listing = _listing(record)
-    delay = f"{1000 * record['delay']['value']:.1f} ms, +- {1000 * record['delay']['half']:.1f} ms"
-    errors = ", ".join(number(1000 * rms) for rms in record["rms"])
-    undetermined = _undetermined(record)
-    text = f"delay {delay}\nerrors on training windows, RMS by joint: {errors} mrad\n{listing.text()}\n{undetermined}"
-    listing = replace(listing, note=f"{listing.note} {undetermined}.")
-    return FitSummary(text, listing, (delay, "delay of the commands"))
-
-
-def _listing(record: Content) -> Listing:
-    """Return a table of kp and the ratios to kp per joint; half dead zones are a column if any joint has one."""
     columns = [ratio for ratio in RATIOS if any(ratio in joint for joint in record["joints"])]
-    rows = []
+    rows, open_ratios = [], []
     for joint in record["joints"]:
-        cells = [_cell(joint.get(column)) for column in columns]
+        cells = []
+        for column in columns:
+            interval = joint.get(column)
+            if interval is None:  # a dead zone that this joint does not have
+                cells.append("none")
+            elif interval["determined"]:
+                width = 100 * (interval["high"] / interval["value"] - 1)
+                cells.append(f"{number(interval['value'])} +- {width:.2g} %")
+            else:
+                cells.append("open")
+                open_ratios.append((column, joint["joint"]))
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
-    return Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
-
-
-def _undetermined(record: Content) -> str:
-    """Return a sentence that lists the ratios that the logs do not determine, except for dead zones."""
-    names = []
-    for joint in record["joints"]:
-        for ratio, (label, _) in RATIOS.items():
-            if ratio != "dead_zone" and ratio in joint and not joint[ratio]["determined"]:
-                names.append(f"{label} of {joint['joint']}")
-    if not names:
-        return "All ratios are determined"
-    return f"Not determined by these logs: {', '.join(names)}"
-
-
-def _cell(interval: Content | None) -> str:
-    if interval is None:
-        return "none"
-    if not interval["determined"]:
-        return "open"
-    return f"{number(interval['value'])} +- {100 * (interval['high'] / interval['value'] - 1):.2g} %"
+    listing = Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
+    # a dead zone that is open makes dry friction open, too, which is named
+    names = [f"{RATIOS[column][0]} of {joint}" for column, joint in open_ratios if column != "dead_zone"]
+    end = f"Not determined by these logs: {', '.join(names)}" if names else "All ratios are determined"
+    delay = f"{1000 * record['delay']['value']:.1f} ms, +- {1000 * record['delay']['half']:.1f} ms"
+    errors = ", ".join(number(1000 * rms) for rms in record["rms"])
+    text = f"delay {delay}\nerrors on training windows, RMS by joint: {errors} mrad\n{listing.text()}\n{end}"
+    listing = replace(listing, note=f"{listing.note} {end}.")
+    return FitSummary(text, listing, (delay, "delay of the commands"))

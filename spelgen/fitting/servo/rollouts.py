@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
+from spelgen.dynamics.parameters import evaluate_with
 from spelgen.dynamics.servo_rollout import Load, ServoDrives, advanced, balanced, servo_drives
-from spelgen.fitting.functional_model import evaluate_with
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.servo.parameters import ParameterMap, ServoParameters
-from spelgen.fitting.servo.tuning import ServoCostTuning
+from spelgen.fitting.servo.tuning import TUNING
 from spelgen.fitting.servo.windows import BodyLoad, MidpointMotion, ServoWindows, body_load
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-# Number of samples for the directions of the body parameters.
-GRAVITY_SAMPLES = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +32,14 @@ class ServoRollouts:
     parameters: ParameterMap
     motion: MidpointMotion
     load: BodyLoad
-    inertial: torch.Tensor
-    difference_step: float = ServoCostTuning().difference_step
+    inertial: Tensor
+    difference_step: float = TUNING.difference_step
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
         """Return the rollouts under the load of the model along the measured motion."""
         q = windows.q.flatten(0, 1)
-        parameters = ParameterMap(model, q[:: max(1, len(q) // GRAVITY_SAMPLES)])
+        parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()
         inertial = parameters.inertial(parameters.prior_mean.bodies)
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
@@ -55,7 +50,7 @@ class ServoRollouts:
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
         return replace(self, motion=motion, load=load, inertial=inertial)
 
-    def residual(self, x: ServoParameters) -> torch.Tensor:
+    def residual(self, x: ServoParameters) -> Tensor:
         """Return predicted minus measured positions after the burn-in, (W, K', n) [rad, m]."""
         return self._errors(self._rollout_at(x)[0])[0]
 
@@ -64,7 +59,7 @@ class ServoRollouts:
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])
 
-    def jacobian(self, x: ServoParameters) -> tuple[torch.Tensor, torch.Tensor]:
+    def jacobian(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
         """Return derivatives of the residual with respect to joint and to shared parameters.
 
         Returns:
@@ -87,19 +82,17 @@ class ServoRollouts:
         of_joints[rows] = derivatives[:p]
         return of_joints, derivatives[p:]
 
-    def _errors(self, q: torch.Tensor) -> torch.Tensor:
+    def _errors(self, q: Tensor) -> Tensor:
         """Return errors after the burn-in (P, W, K', n) for positions (P, W, K, n)."""
         first = self.windows.burn_in + 1
         return q[:, :, first:] - self.windows.q[:, first:]
 
-    def _rollout_at(self, x: ServoParameters) -> tuple[torch.Tensor, torch.Tensor]:
+    def _rollout_at(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
         """Return q and qd, (1, W, K, n)."""
         commands = self.windows.commands(x.delay)
         return self._rollout(x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
 
-    def _rollout(
-        self, joints: torch.Tensor, bodies: torch.Tensor, commands: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def _rollout(self, joints: Tensor, bodies: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
         """Return q and qd (P, W, K, n) for parameters (P, p, n), (P, r) under commands (P, W, K-1, S, n)."""
         named = self.parameters.named(joints)
         tensors = {name: tensor.detach() for name, tensor in named.items()}
@@ -111,8 +104,8 @@ class ServoRollouts:
             return self._integrate(drives, armature, added, commands)
 
     def _integrate(
-        self, drives: ServoDrives, armature: torch.Tensor, added: torch.Tensor, commands: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+        self, drives: ServoDrives, armature: Tensor, added: Tensor, commands: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return q and qd (P, W, K, n); armature: (P, 1, n), added: load (P, W, K-1, n), commands as in `_rollout`."""
         windows, load = self.windows, self.load
         h = windows.dt.unsqueeze(-1) / commands.shape[3]
@@ -131,5 +124,5 @@ class ServoRollouts:
         return torch.stack(positions, dim=2), torch.stack(velocities, dim=2)
 
 
-def _drives(model: ArmModel) -> tuple[ServoDrives, torch.Tensor]:
+def _drives(model: ArmModel) -> tuple[ServoDrives, Tensor]:
     return servo_drives(model), model.armature

@@ -6,21 +6,24 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class ServoWindowTuning:
-    """Windows that a servo fit predicts."""
+class ServoTuning:
+    """Constants of fits of position servos, by the file that reads them."""
+
+    # Windows that a fit predicts (`servo.windows`).
 
     # [s] Length of a window: gravity and friction need as long to become visible, and longer windows diverge with the
     # delay.
     length: float = 4.0
+    # [1] Smallest number of samples of a window.
+    min_samples: int = 8
     # [s] Burn-in at the beginning of a window, during which the friction state forms; its errors do not count.
     burn_in: float = 1.0
     # [1] Largest number of windows, evenly spread: ten minutes of motion.
     count: int = 200
+    # [1] Samples whose load is computed at once, which bounds the memory.
+    batch: int = 2**13
 
-
-@dataclass(frozen=True)
-class ServoPriorTuning:
-    """Standard deviations of the Gaussian prior of a servo fit, about the initial parameters."""
+    # Standard deviations of the Gaussian prior, about the initial parameters (`servo.parameters`).
 
     # [1] Logarithms of a joint's gains, armature and friction: a factor of seven.
     logarithm: float = 2.0
@@ -35,21 +38,23 @@ class ServoPriorTuning:
     # [1] Directions of the body parameters that are fitted, those with the largest effect on gravity; further ones
     # stay within their prior.
     body_directions: int = 6
+    # [1] Smallest effect of such a direction on gravity, relative to the largest effect.
+    min_effect: float = 1e-3
+    # [1] Prior standard deviation of a parameter that is not fitted.
+    fixed: float = 1e-9
 
-
-@dataclass(frozen=True)
-class ServoCostTuning:
-    """Cost of a servo fit and its derivatives."""
+    # Cost and its derivatives (`servo.problem`, `servo.rollouts`).
 
     # [s] Largest correlation time of the errors; most measured ones are above 0.2 s.
     correlation_time: float = 0.5
     # [1] Finite-difference step of the parameters: rollouts in double precision lose half of their digits.
     difference_step: float = 1e-4
+    # [1] Largest step of any parameter; most are logarithms.
+    max_step: float = 1.0
+    # [1] Samples for the directions of the body parameters.
+    gravity_samples: int = 2000
 
-
-@dataclass(frozen=True)
-class ServoSolverTuning:
-    """Convergence of a servo fit."""
+    # Convergence (`servo.objective`).
 
     # [1] Largest number of windows in all outer iterations but the last.
     sparse_windows: int = 32
@@ -68,24 +73,18 @@ class ServoSolverTuning:
     # determined.
     last_difference_step: float = 1e-3
 
-
-@dataclass(frozen=True)
-class ServoLawTuning:
-    """Selection of the joints that have a dead zone."""
+    # Selection of the joints that have a dead zone (`servo.laws`).
 
     # [1] Initial dead zone, as a fraction of the static error.
     dead_zone_fraction: float = 0.25
     # [1] Largest number of steps of the fit of a single joint.
-    steps: int = 6
+    joint_steps: int = 6
     # [1] Standard deviations by which a dead zone must be more probable; other friction effects need 3.
     significance: float = 4.0
     # [rad, m] Smallest dead zone: the step of a 12-bit encoder is 1.5e-3 rad.
     min_dead_zone: float = 1e-3
 
-
-@dataclass(frozen=True)
-class ServoIntervalTuning:
-    """Intervals and identifiability of the fitted parameters."""
+    # Intervals and identifiability of the fitted parameters (`servo.report`).
 
     # [1] Smallest number of logs of which each is one block of the covariance: halves of one motion are not
     # independent.
@@ -99,28 +98,21 @@ class ServoIntervalTuning:
     # [1] A value whose interval reaches beyond this factor is not determined.
     max_factor: float = 1.25
 
-
-@dataclass(frozen=True)
-class ServoStartTuning:
-    """Initial parameters of a servo fit."""
+    # Initial guess and baseline (`servo.least_squares`).
 
     # [1] Number of standard deviations above which kp is computed from the coefficient of gravity; large, since
     # neighbouring windows are correlated.
-    significance: float = 8.0
+    kp_significance: float = 8.0
     # [1] Largest factor between the initial and the nominal kp (of the settings, or 2 efforts per radian).
     kp_range: float = 20.0
     # Smallest dry friction as a fraction of nominal friction [1]. Its square and its cube are the smallest kd/kp [s]
     # and armature/kp [s^2]: positive, since logarithms are fitted.
     min_friction: float = 0.05
-
-
-@dataclass(frozen=True)
-class LinearServoTuning:
-    """Fit of linear second-order servos, the baseline."""
-
-    # [s] Upper bound of the delays.
+    # [s] Upper bound of the delays of linear servos, and their initial delay.
     max_delay: float = 0.4
-    # [s] Initial delay.
-    delay: float = 0.02
+    initial_delay: float = 0.02
     # [rad/s] Initial natural frequency; the initial damping ratio is 1.
     frequency: float = 20.0
+
+
+TUNING = ServoTuning()

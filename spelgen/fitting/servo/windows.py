@@ -8,34 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import LogError
-from spelgen.fitting.servo.tuning import ServoWindowTuning
+from spelgen.fitting.servo.tuning import TUNING
 from spelgen.logs.filtering import derivative, velocities
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split_at_gaps, steps_between
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-TUNING = ServoWindowTuning()
-# Smallest number of samples of a window.
-MIN_SAMPLES = 8
-# Number of samples whose load is computed at once.
-BATCH = 2**13
 
 
 class MidpointMotion(NamedTuple):
     """q, qd and qdd (W, K-1, n) of windows, as means over the intervals between samples."""
 
-    q: torch.Tensor
-    qd: torch.Tensor
-    qdd: torch.Tensor
+    q: Tensor
+    qd: Tensor
+    qdd: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +41,9 @@ class ServoWindows:
     """
 
     rows: tuple[LogRows, ...]
-    q: torch.Tensor
-    qd: torch.Tensor
-    dt: torch.Tensor
+    q: Tensor
+    qd: Tensor
+    dt: Tensor
     burn_in: int
     steps: int
 
@@ -65,7 +58,7 @@ class ServoWindows:
         q, qd, dt = self.q[selection], self.qd[selection], self.dt[selection]
         return ServoWindows(self.rows[selection], q, qd, dt, self.burn_in, -(-self.steps // 2))
 
-    def blocks(self, min_logs: int, min_blocks: int) -> torch.Tensor:
+    def blocks(self, min_logs: int, min_blocks: int) -> Tensor:
         """Return the number of the block of each window, (W,): errors are assumed independent between blocks.
 
         Each log is one block if there are at least `min_logs`; fewer logs are divided into equal segments, at least
@@ -80,7 +73,7 @@ class ServoWindows:
         # consecutive numbers: some segments of a log with fewer windows than segments are empty
         return torch.from_numpy(np.unique(blocks, return_inverse=True)[1])
 
-    def motion(self, q: torch.Tensor | None = None, qd: torch.Tensor | None = None) -> MidpointMotion:
+    def motion(self, q: Tensor | None = None, qd: Tensor | None = None) -> MidpointMotion:
         """Return the measured motion between samples.
 
         The derivatives of a prediction q, qd (W, K, n), if there is one, are used, plus smoothed derivatives of
@@ -94,13 +87,13 @@ class ServoWindows:
         velocity = _midpoints(slow_qd) + _midpoints(qd)
         return MidpointMotion(_midpoints(self.q), velocity, _midpoints(slow_qdd) + acceleration)
 
-    def commands(self, delay: float) -> torch.Tensor:
+    def commands(self, delay: float) -> Tensor:
         """Return the commands of ``delay`` [s] earlier, at the steps between samples, (W, K-1, S, n) [rad, m]."""
         commands = [delayed_commands(log, rows, delay, self.steps) for log, rows in self.rows]
         return torch.from_numpy(np.stack(commands))
 
 
-def _midpoints(x: torch.Tensor) -> torch.Tensor:
+def _midpoints(x: Tensor) -> Tensor:
     """Return means of neighbouring samples, (W, K-1, n)."""
     return x[:, 1:] / 2 + x[:, :-1] / 2
 
@@ -118,7 +111,7 @@ def servo_windows(
     rate = float(np.median([segment.sample_rate for segment in segments]))
     length = min(round(TUNING.length * rate), max(map(len, segments)))
     burn_in = min(round(TUNING.burn_in * rate), length // 2)
-    if length < MIN_SAMPLES:
+    if length < TUNING.min_samples:
         raise LogError(f"at most {length} samples without a gap", expected="a second of motion or more")
     rows: list[LogRows] = []
     for segment in segments:
@@ -144,10 +137,10 @@ class BodyLoad(NamedTuple):
     B), derivatives of the torque with respect to the inertial parameters of B bodies.
     """
 
-    inertia: torch.Tensor
-    bias: torch.Tensor
-    gravity: torch.Tensor
-    regressor: torch.Tensor
+    inertia: Tensor
+    bias: Tensor
+    gravity: Tensor
+    regressor: Tensor
 
 
 def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
@@ -155,7 +148,7 @@ def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
     batches: list[BodyLoad] = []
     with torch.no_grad():
         prepared, armature = model.prepare(), model.armature
-        flat = [x.flatten(0, 1).split(BATCH) for x in motion]
+        flat = [x.flatten(0, 1).split(TUNING.batch) for x in motion]
         for q, qd, qdd in zip(*flat, strict=True):
             configuration = model.configuration(q, prepared)
             mass = configuration.mass

@@ -10,10 +10,9 @@ import torch
 from torch.autograd import grad as gradient
 
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.dynamics.parameters import friction_factor, residual_torque
+from spelgen.dynamics.parameters import NamedTensors, evaluate_with, friction_factor, residual_torque
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.functional_model import NamedTensors, evaluate_with
 from spelgen.fitting.torque import linearization
 from spelgen.fitting.torque.linearization import (
     NO_TERMS,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -17,14 +16,14 @@ from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.protocol import known_past, motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.dataset import TrainingData, Validation
-from spelgen.fitting.objective import PreparedLogs, TorqueLogObjective
+from spelgen.fitting.dataset import PreparedLogs, TrainingData, Validation, prepare_data
+from spelgen.fitting.objective import Objective
 from spelgen.fitting.torque.fit import TorqueSolution, fit_torque
 from spelgen.fitting.torque.networks import BLOCK, adapt_networks, fit_networks
 from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
-from spelgen.fitting.urdf_regularizer import UrdfRegularizer
+from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -42,7 +41,7 @@ FITTED = {
 }
 
 
-class TorqueObjective(TorqueLogObjective):
+class TorqueObjective(Objective):
     """Fit to torques, which takes seconds to minutes: `begin` runs all of it, before there is a run folder."""
 
     name: ClassVar[str] = "torque"
@@ -57,8 +56,8 @@ class TorqueObjective(TorqueLogObjective):
             self.request = replace(self.request, preprocessing=preprocessing)
         # windows are for validation only: few suffice
         stride = -(-sum(map(len, self.request.logs)) // TUNING.max_windows)
-        self.data = self._cut_windows(SAMPLES, stride)
-        return self._prepared(self.data, self.config)
+        self.data = prepare_data(self.request, SAMPLES, stride)
+        return self.data
 
     def begin(self) -> list[Diagnostic]:
         """Fit the model. Raises LogError if no log is sampled densely enough for accelerations."""
@@ -73,8 +72,9 @@ class TorqueObjective(TorqueLogObjective):
                 do="fit windows: the objective rollout",
             )
         regularizer = None
-        if not isinstance(model, RigidBodyDynamics):  # rigid bodies have a prior of their own at the URDF
-            regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
+        # rigid bodies have a prior of their own at the URDF
+        if self.config.urdf_weight and not isinstance(model, RigidBodyDynamics):
+            regularizer = urdf_regularizer(self.request.urdf, model, self.data.training, notes)
         fit_notes, solution = fit_torques(model, samples, self.config, regularizer)
         self.results = {"notes": [note.message for note in fit_notes]}
         notes += fit_notes
@@ -82,16 +82,9 @@ class TorqueObjective(TorqueLogObjective):
         subset = replace(self.data, validation=thinned(self.data.validation, TUNING.validation_windows))
         validation = Validation(without_idle_residuals(model), subset, self.request.options.device)
         substeps = validation.substeps()
-        self._checkpoint = {
-            "epoch": 0,
-            "step": 0,
-            "best_epoch": 0,
-            "best_loss": validation.loss(substeps),
-            "best_weights": copy.deepcopy(model.state_dict()),
-            "seconds": time.monotonic() - self.request.began,
-            "substeps": substeps,
-            "torque_nmse": torque_nmse(model, samples),
-        }
+        loss = validation.loss(substeps)
+        self._make_checkpoint(loss, time.monotonic() - self.request.began, substeps)
+        self._checkpoint["torque_nmse"] = torque_nmse(model, samples)
         if solution is not None and not self.config.adapt:  # an adapted model has parameters of two fits
             self._checkpoint["posterior"] = {
                 "covariance": solution.covariance,

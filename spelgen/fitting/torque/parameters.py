@@ -15,10 +15,9 @@ from functools import cached_property
 
 import torch
 
-from spelgen.dynamics.parameters import parameter_table
+from spelgen.dynamics.parameters import NamedTensors, parameter_table
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.functional_model import NamedTensors
 from spelgen.fitting.torque.samples import SampleBlock
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.logs.tuning import SAMPLES

@@ -8,9 +8,11 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from spelgen.dynamics.parameters import idle_residuals
 from spelgen.errors import Diagnostic, RunError
+from spelgen.fitting.momentum_objective import MomentumObjective
 from spelgen.fitting.objective import Status
 from spelgen.fitting.optimizers import WindowOptimizer
 from spelgen.fitting.process import TrainingProgress
@@ -18,7 +20,6 @@ from spelgen.fitting.rollout import rollout_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.objective import fit_torques, torque_samples
 from spelgen.fitting.tuning import TUNING
-from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.logs.tuning import SLOWEST
 from spelgen.logs.windows import Windows
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
@@ -49,13 +50,11 @@ class RolloutObjective(MomentumObjective):
             else:
                 message = f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
                 self.notes.append(Diagnostic("warning", "no-torque-fit", "logs", None, message))
-        self._set_up_epochs()
-        return self.notes
+        return super().begin()
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
         """Resume from the last complete epoch."""
-        self._set_up_epochs()
-        self._restore(checkpoint)
+        super().resume(checkpoint, history)
         self.optimizer = self._optimizer()
         self.model.load_state_dict(checkpoint["model"])
         self.optimizer.load_state_dict(checkpoint["optimizer"])
@@ -81,9 +80,9 @@ class RolloutObjective(MomentumObjective):
         state = {"model": self.model.state_dict(), "optimizer": self.optimizer.state_dict()}
         return super().checkpoint() | state | {"generator": self.generator.get_state()}
 
-    def _set_up_epochs(self) -> None:
+    def _set_up(self) -> None:
         """Validate the current model and create its optimizer."""
-        self._set_up(self.config.solver, self.config.substeps)
+        super()._set_up()
         self.generator = torch.Generator().manual_seed(self.request.seed)
         self.fixed, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
         self.optimizer = self._optimizer()
@@ -96,7 +95,7 @@ class RolloutObjective(MomentumObjective):
             parameter.requires_grad_(name not in self.fixed)
         return self._new_optimizer(self.generator)
 
-    def _rollout_loss(self, windows: Windows) -> torch.Tensor:
+    def _rollout_loss(self, windows: Windows) -> Tensor:
         scales, solver = self.scales, self.config.solver
         return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.penalty()
 
@@ -130,32 +129,24 @@ class RolloutObjective(MomentumObjective):
             self._roll_back(*state)
         self.epoch += 1
         if validation < self.best_loss:
-            self.best_loss, self.best_epoch = validation, self.epoch
-            self.best_weights = copy.deepcopy(self.model.state_dict())
+            self._keep(self.substeps, validation)
         record = {
-            "epoch": self.epoch,
-            "step": self.step,
-            "loss": loss,
-            "validation": validation,
-            "best": self.best_loss,
-            "learning_rate": self._rate(),
-            "substeps": self.substeps,
-            "rollbacks": self.rollbacks,
-        }
+            "epoch": self.epoch, "step": self.step, "loss": loss, "validation": validation, "best": self.best_loss,
+            "learning_rate": self._rate(), "substeps": self.substeps, "rollbacks": self.rollbacks,
+        }  # fmt: skip
         if self.epoch % TUNING.probe_every == 0:
             self.substeps = self.validation.substeps(self.substeps)
         return record
 
     def _steps_in_time(self) -> int:
         """Return the number of steps of the next epoch, limited by the remaining time."""
-        steps = self.epoch_steps
         if math.isinf(self.allowed):
-            return steps
+            return self.epoch_steps
         # Nothing has been measured yet: a short epoch, which measures the time of a step.
         if not self._step_seconds:
-            return min(steps, self.call_steps)
+            return min(self.epoch_steps, TUNING.epoch_steps)
         remaining = self.allowed - self.seconds_now() - self._validation_seconds
-        return max(1, min(steps, int(remaining / self._step_seconds)))
+        return max(1, min(self.epoch_steps, int(remaining / self._step_seconds)))
 
     def _rate(self, ahead: int = 0) -> float:
         """Return the learning rate `ahead` steps from now."""
@@ -186,14 +177,12 @@ class RolloutObjective(MomentumObjective):
         self.rollbacks += 1
         self.model.load_state_dict(weights)
         if self.rollbacks > TUNING.max_rollbacks:
-            advice = "check units and signs of the logs"
-            if self.request.folder is not None:
-                advice += "; the best model so far is kept in model.pt"
+            attempts = f"after {TUNING.max_rollbacks} attempts at half the learning rate each"
+            kept = "; the best model so far is kept in model.pt" if self.request.folder else ""
             raise RunError(
-                f"losses that are not finite, after {TUNING.max_rollbacks} attempts at half the learning rate each",
-                file=self.request.folder,
-                do=advice,
-            )
+                f"losses that are not finite, {attempts}", file=self.request.folder,
+                do=f"check units and signs of the logs{kept}",
+            )  # fmt: skip
         self.optimizer.load_state_dict(optimizer)
         self.step = step
         self.learning_rate_factor /= 2

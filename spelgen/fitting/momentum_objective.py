@@ -9,25 +9,26 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from spelgen.errors import Diagnostic
-from spelgen.fitting.dataset import Validation
-from spelgen.fitting.objective import FitRequest, PreparedLogs, Status, TorqueLogObjective
+from spelgen.fitting.dataset import FitRequest, PreparedLogs, Validation, prepare_data
+from spelgen.fitting.objective import Objective, Status
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import momentum_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.tuning import TUNING
+from spelgen.fitting.urdf_regularizer import urdf_regularizer
 from spelgen.logs.windows import Windows
-from spelgen.settings.fits import DEFAULTS, Solver, WindowConfig
+from spelgen.settings.fits import DEFAULTS, Rollout, WindowConfig
 
 
-class MomentumObjective(TorqueLogObjective):
+class MomentumObjective(Objective):
     """Steps on the weak form, kept if they lower the validation loss. All windows are in memory.
 
     best_loss, best_weights: of the model with the lowest validation loss so far. substeps: of the integrator between
-    samples. seconds: elapsed part of the allowed time. call_steps, epoch_steps: in a call of the optimizer, and in an
-    epoch.
+    samples. seconds: elapsed part of the allowed time. epoch_steps: steps in an epoch.
     """
 
     name: ClassVar[str] = "momentum"
@@ -46,11 +47,13 @@ class MomentumObjective(TorqueLogObjective):
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
-        self.data = self._cut_windows(self.config.window, self.config.stride)
+        self.data = prepare_data(self.request, self.config.window, self.config.stride)
         self.config = self.config.resolved(len(self.data.training))
-        # relative to the model before any fit, also in a resumed run
-        self.regularizer = self._regularizer(self.data, self.config.urdf_weight, self.notes)
-        return self._prepared(self.data, self.config)
+        self.regularizer = None
+        if self.config.urdf_weight:
+            # relative to the model before any fit, also in a resumed run
+            self.regularizer = urdf_regularizer(self.request.urdf, self.model, self.data.training, self.notes)
+        return self.data
 
     def begin(self) -> list[Diagnostic]:
         """Validate the initial model."""
@@ -60,7 +63,9 @@ class MomentumObjective(TorqueLogObjective):
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
         """Resume from the best weights so far; an incomplete momentum stage is repeated."""
         self._set_up()
-        self._restore(checkpoint)
+        for name in self.saved_attributes:
+            setattr(self, name, checkpoint[name])
+        self.model.load_state_dict(self.best_weights)
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """See `Objective`."""
@@ -77,33 +82,29 @@ class MomentumObjective(TorqueLogObjective):
         """See `Objective`."""
         return {name: vars(self)[name] for name in self.saved_attributes}
 
-    def _set_up(self, solver: Solver = "rk4", substeps: int | None = None) -> None:
-        """Validate the current model; solver, substeps: of the validation, see `Rollout`."""
-        device = self.request.options.device
+    def _set_up(self) -> None:
+        """Validate the current model."""
+        device, config = self.request.options.device, self.config
+        # the time to read and prepare the logs is part of the allowed time
         self.seconds = time.monotonic() - self.request.began
         self.model.to(device)
         self.training, self.scales = self.data.training.to(device), self.data.scales.to(device)
         if self.regularizer is not None:
             self.regularizer = self.regularizer.to(device)
-        self.batch = min(self.config.batch or DEFAULTS.batch, len(self.training))
-        self.call_steps = self.epoch_steps = TUNING.epoch_steps
-        if not self._takes_all:
+        self.batch = min(config.batch or DEFAULTS.batch, len(self.training))
+        self.epoch_steps = TUNING.epoch_steps
+        if config.optimizer != "lbfgs":
             self.epoch_steps = max(TUNING.epoch_steps, -(-len(self.training) // self.batch))
+        solver, substeps = (config.solver, config.substeps) if isinstance(config, Rollout) else ("rk4", None)
         self.validation = Validation(
             self.model, self.data, device, batch=self.batch, solver=solver, substeps=substeps
         )
         self._keep(*self.validation.measure())
-        self.momentum_done = not self.config.momentum_steps
-
-    def _restore(self, checkpoint: Content) -> None:
-        """Restore the attributes of a checkpoint, and its best weights."""
-        for name in self.saved_attributes:
-            setattr(self, name, checkpoint[name])
-        self.model.load_state_dict(self.best_weights)
+        self.momentum_done = not config.momentum_steps
 
     def _keep(self, substeps: int, loss: float) -> None:
         """Set the current model, which was validated, as the best so far."""
-        self.substeps, self.best_loss = substeps, loss
+        self.substeps, self.best_loss, self.best_epoch = substeps, loss, self.epoch
         self.best_weights = copy.deepcopy(self.model.state_dict())
 
     def _start_clock(self) -> None:
@@ -117,19 +118,14 @@ class MomentumObjective(TorqueLogObjective):
         """Return the fraction of the allowed time; 0 without a limit."""
         return seconds / self.allowed if self.allowed else math.inf
 
-    @property
-    def _takes_all(self) -> bool:
-        """Whether a step uses all windows at once."""
-        return self.config.optimizer == "lbfgs"
-
     def _new_optimizer(self, generator: torch.Generator) -> WindowOptimizer:
         """Return an optimizer of the weights that require a gradient; generator: for the order of batches."""
         decay = self.config.weight_decay or 0.0
-        if self._takes_all:
+        if self.config.optimizer == "lbfgs":
             return LBFGS(self.model, decay)
         return MiniBatchAdamW(self.model, self.batch, decay, generator)
 
-    def penalty(self) -> torch.Tensor | float:
+    def penalty(self) -> Tensor | float:
         """Return the regularization loss, ()."""
         if self.regularizer is None:
             return 0.0
@@ -139,6 +135,7 @@ class MomentumObjective(TorqueLogObjective):
         """Return the learning rate at a fraction of the training: a linear warm-up times a cosine decay."""
         cosine = (1 + math.cos(math.pi * min(fraction, 1.0))) / 2
         decay = TUNING.final_rate + (1 - TUNING.final_rate) * cosine
+        # 1e-3: the first step has a learning rate above zero
         warm_up = min(1.0, (fraction + 1e-3) / TUNING.warm_up)
         return (self.config.learning_rate or DEFAULTS.learning_rate) * warm_up * decay
 
@@ -147,12 +144,12 @@ class MomentumObjective(TorqueLogObjective):
 
         After an interruption the stage is repeated.
         """
-        model, call, steps = self.model, self.call_steps, self.config.momentum_steps
+        call, steps = TUNING.epoch_steps, self.config.momentum_steps
         optimizer = self._new_optimizer(torch.Generator().manual_seed(self.request.seed))
 
-        def loss(windows: Windows) -> torch.Tensor:
+        def loss(windows: Windows) -> Tensor:
             """Return the momentum loss of the windows plus the regularization loss, ()."""
-            return momentum_loss(model, windows, self.scales) + self.penalty()
+            return momentum_loss(self.model, windows, self.scales) + self.penalty()
 
         for start in range(0, steps, call):
             spent = self.fraction(self.seconds_now()) / TUNING.momentum_fraction
@@ -170,5 +167,5 @@ class MomentumObjective(TorqueLogObjective):
         if validation < self.best_loss:
             self._keep(substeps, validation)
         else:
-            model.load_state_dict(self.best_weights)
+            self.model.load_state_dict(self.best_weights)
         self.momentum_done, self.seconds = True, self.seconds_now()

@@ -1,0 +1,109 @@
+"""Bounds of a motion: ranges of the joints, and the surroundings of an arm, from a YAML file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import nan, pi
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from spelgen.arm.arm import Chain
+from spelgen.errors import ArmError, SpelgenError, collect
+from spelgen.excitation.tuning import TUNING
+from spelgen.settings.values import Group, Number, Positive
+from spelgen.settings.yaml_document import read_document, validated
+from spelgen.urdf.robot import UrdfJoint
+
+SPEEDS = {"revolute": TUNING.revolute_speed, "prismatic": TUNING.prismatic_speed}
+"""Speed limits of joints without a velocity limit [rad/s], [m/s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionBounds:
+    """Bounds of a motion, (n,) each: lowest and highest position [rad, m], speed, acceleration (by default none)."""
+
+    low: np.ndarray
+    high: np.ndarray
+    speed: np.ndarray
+    acceleration: np.ndarray | None = None
+
+    def narrowed(self, factor: float) -> MotionBounds:
+        """Return bounds with a fraction of the position ranges about the same middle."""
+        middle, half = (self.low + self.high) / 2, factor * (self.high - self.low) / 2
+        return replace(self, low=middle - half, high=middle + half)
+
+
+def motion_bounds(
+    arm: Chain,
+    range_fraction: float,
+    speed_fraction: float,
+    joints: Mapping[str, UrdfJoint] | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+) -> MotionBounds:
+    """Return the central fraction of the position ranges, and a fraction of the velocity limits.
+
+    joints: of the URDF by name, so that <mimic> joints keep their own limits. ranges: of joints by name, in place of
+    their limits; continuous joints without a range move by half a turn to both sides. Raises ArmError for a joint
+    without a range, or whose limits are not increasing.
+    """
+    limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
+    for k, coordinate in enumerate(arm.coordinates):
+        default = (-pi, pi) if coordinate.continuous else (nan, nan)
+        limits[k] = sorted((ranges or {}).get(coordinate.name) or coordinate.limits or default)
+        speeds[k] = coordinate.velocity or SPEEDS[coordinate.joint_type]
+    for body in arm.bodies:
+        k, factor = body.coordinate, float(body.multiplier)
+        mimic = (joints or {}).get(body.name)
+        if mimic is None or body.name == arm.coordinates[k].name or not factor:
+            continue
+        if mimic.type != "continuous" and mimic.lower is not None and mimic.upper is not None:
+            low, high = sorted((end - body.offset) / factor for end in (mimic.lower, mimic.upper))
+            limits[k] = max(low, limits[k, 0]), min(high, limits[k, 1])
+        if mimic.velocity:
+            speeds[k] = min(speeds[k], mimic.velocity / abs(factor))
+    errors: list[SpelgenError] = []
+    for coordinate, (low, high) in zip(arm.coordinates, limits, strict=True):
+        if np.isnan(low):
+            line = f"simulation: {{positions: {{{coordinate.name}: [LOWEST, HIGHEST]}}}}"
+            errors.append(ArmError(
+                "no position limits", element=f"joint {coordinate.name!r}", expected="a range to move in",
+                do=f"write '{line}' into the robot's YAML",
+            ))  # fmt: skip
+        elif not low < high:
+            errors.append(ArmError(
+                f"the limits {low:g} .. {high:g}", element=f"joint {coordinate.name!r}",
+                expected="room to move", do="correct them, or omit the joint by --joints",
+            ))  # fmt: skip
+    collect(errors)
+    return MotionBounds(limits[:, 0], limits[:, 1], speed_fraction * speeds).narrowed(range_fraction)
+
+
+class Box(Group):
+    """A box. size: edges [m]. xyz [m], rpy [rad]: pose of its centre in the frame of the root link, as in a URDF."""
+
+    size: tuple[Positive, Positive, Positive]
+    xyz: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    rpy: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+
+
+class Surroundings(Group):
+    """The surroundings of an arm, in the frame of its root link.
+
+    Attributes:
+        floor: Height z of the floor [m]; None: there is no floor.
+        boxes: Boxes by name.
+        clearance: Smallest allowed distance between links, and from links to floor and boxes [m].
+    """
+
+    floor: Number | None = None
+    boxes: dict[str, Box] = Field(default_factory=dict)
+    clearance: Positive = 0.01
+
+
+def read_surroundings(path: Path) -> Surroundings:
+    """Return the surroundings in a YAML file. Raises SettingsError, or SpelgenErrors for several errors."""
+    document = read_document(path)
+    return validated(Surroundings, document.value(), document)

@@ -1,0 +1,115 @@
+"""Least-squares fits to windows: the initial guess of a servo fit, and the baseline of linear second-order servos.
+
+The initial guess is linear least squares on the command error. At a joint that a servo holds,
+kp (u - q) = kd qd + M qdd + gravity + friction. Divided by kp, the command error is linear in the unknown parameters,
+and its coefficient for the gravity torque of the URDF's masses is 1 / kp.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares, minimize_scalar
+from torch import Tensor
+
+from spelgen.baselines.linear_servos import LinearServos, linear_response
+from spelgen.dynamics.bristles import bristle_reach, bristles_along
+from spelgen.emission.assemble import ArmModel
+from spelgen.fitting.servo.tuning import TUNING
+from spelgen.fitting.servo.windows import ServoWindows, body_load
+
+
+def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
+    """Set kp, kd, armature, friction and offset of the model to the least-squares solution of the command error."""
+    delay = 1 / windows.rate
+    model.servo.delay.fill_(delay)
+    friction, servo = model.friction, model.servo
+    motion = windows.motion()
+    load = body_load(model, motion)
+    bristles = np.stack([bristles_along(q.numpy(), bristle_reach(model)) for q in windows.q])
+    direction = (torch.from_numpy(bristles) / friction.reach).mean(dim=-1)[:, :-1]
+    columns = torch.stack([motion.qd, motion.qdd, direction, load.bias, torch.ones_like(direction)], dim=-1)
+    error = windows.commands(delay).mean(dim=2) - windows.q[:, :-1]
+    coefficients, significance = _regression(columns[:, windows.burn_in :], error[:, windows.burn_in :])
+    damping, inertia, dry, compliance, offset = coefficients.unbind(-1)
+    with torch.no_grad():
+        is_known = servo.trained == 0
+        factor = 1 / (compliance * servo.nominal_kp).clamp(min=1e-12)
+        # gravity determines kp of the joints that it loads; the nominal kp of other joints gets the median factor
+        determined = ~is_known & (significance[:, 3] > TUNING.kp_significance)
+        determined &= factor.log().abs() < np.log(TUNING.kp_range)
+        common = factor[determined].median() if determined.any() else 1.0
+        factor = torch.where(determined, factor, common).masked_fill(is_known, 1.0)
+        kp, smallest = factor * servo.nominal_kp, TUNING.min_friction
+        servo.raw_kp.copy_(factor.log())
+        servo.raw_kd.copy_((kp * damping.clamp(min=smallest**2) / servo.nominal_kd).log())
+        armature = torch.maximum(kp * inertia - load.inertia.mean(dim=(0, 1)), smallest**3 * kp)
+        model.raw_armature.copy_((armature / model.nominal_armature).log())
+        friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=smallest).log())
+        # such logs determine only the sum of viscous friction and kd: it is fitted as kd. Friction terms are logarithms
+        # relative to a nominal value: these are negligible, and Stribeck friction is small
+        friction.raw_viscous.fill_(-6.0)
+        friction.raw_saturation.fill_(-6.0)
+        friction.raw_stribeck.fill_(-2.0)
+        model.raw_offset.copy_((kp * offset / friction.nominal).clamp(-2.0, 2.0))
+
+
+def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the least-squares coefficients of each joint, and their ratios to the standard deviations, (n, 5) each.
+
+    The K samples of a window count as one independent error.
+
+    Args:
+        columns: (W, K, n, 5), the regressors.
+        errors: (W, K, n) [rad, m].
+    """
+    matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, M, 5)
+    target = errors.flatten(0, 1).mT.unsqueeze(-1)
+    # gelsd: the pivots of torch's default driver are not deterministic
+    solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution
+    residual = target - matrix @ solution
+    unscaled = torch.linalg.pinv(matrix.mT @ matrix).diagonal(dim1=-2, dim2=-1)
+    variance = residual.square().mean(dim=1) * unscaled * errors.shape[1]
+    coefficients = solution.squeeze(-1)
+    return coefficients, coefficients / variance.clamp(min=1e-300).sqrt()
+
+
+def fit_linear_servos(windows: ServoWindows) -> LinearServos:
+    """Fit the delay of the commands to all samples of windows, and a linear servo per joint to those after burn-in."""
+    q, qd = windows.q.numpy(), windows.qd.numpy()
+    measured, dt = q[:, 1:], float(windows.dt.mean())
+
+    # finite differences change one of four unknowns at a time, three of which are not the delay
+    @lru_cache(maxsize=8)
+    def commands(delay: float) -> np.ndarray:
+        """Return the mean command of each interval, (W, K-1, n)."""
+        return windows.commands(delay).mean(dim=2).numpy()
+
+    def delayed_error(delay: float) -> float:
+        return float(np.square(commands(delay) - measured).mean())
+
+    # commands change little within the bounds, so the error has one minimum
+    late = minimize_scalar(delayed_error, bounds=(0, TUNING.max_delay), method="bounded").x
+    # logarithms of natural frequency and damping ratio, delay, offset
+    initial = (np.log(TUNING.frequency), 0.0, TUNING.initial_delay, 0.0)
+    bounds = ((-np.inf, -np.inf, 0.0, -np.inf), (np.inf, np.inf, TUNING.max_delay, np.inf))
+    fits = []
+    for joint in range(q.shape[2]):
+        column = slice(joint, joint + 1)
+
+        def residual(x: np.ndarray, column: slice = column) -> np.ndarray:
+            """Return the position errors after the burn-in, (M,)."""
+            u = commands(x[2])[..., column] + x[3]
+            predicted = linear_response(
+                q[:, 0, column], qd[:, 0, column], u, dt, np.exp(x[:1]), np.exp(x[1:2])
+            )
+            result: np.ndarray = (predicted - measured[..., column])[:, windows.burn_in :].ravel()
+            return result
+
+        fits.append(least_squares(residual, initial, bounds=bounds, x_scale="jac", max_nfev=30).x)
+    columns = np.array(fits).T
+    columns[:2] = np.exp(columns[:2])
+    frequency, damping, delay, offset = columns.tolist()
+    return LinearServos(frequency, damping, delay, offset, float(late))

@@ -1,1 +1,0 @@
-"""Fit windows of logs: the weak form of the equations, and rollouts."""
