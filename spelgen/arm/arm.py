@@ -10,13 +10,7 @@ import numpy as np
 
 from spelgen.arm.chain import ChainChoice, Leader, choose_chain, leaders
 from spelgen.arm.placement import AngleRounding, Frame, Placement, TenVector
-from spelgen.arm.rational import (
-    Matrix,
-    Vector,
-    bounded,
-    exact,
-    rotation_from_rpy,
-)
+from spelgen.arm.rational import Matrix, Vector, bounded, exact, rotation_from_rpy
 from spelgen.errors import ArmError, Diagnostic
 from spelgen.urdf.robot import JointType, Robot, UrdfJoint, UrdfLink
 

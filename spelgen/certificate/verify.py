@@ -166,14 +166,14 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
     is_rounded = any(remark.code.startswith("snapped-") for remark in arm.diagnostics)
     # per joint [rad, m]: dropped offsets, and composed rotations of 1e-11 each
     allowed = 1e-9 * len(robot.joints)
-    for found in differences:
+    for difference in differences:
         verdict: Verdict = "agrees"
-        if found.difference > allowed or (found.rounding > allowed and not is_rounded):
+        if difference.difference > allowed or (difference.rounding > allowed and not is_rounded):
             verdict = "differs"
-        result = f"at most {size_text(found.difference)} of their size apart"
+        result = f"at most {size_text(difference.difference)} of their size apart"
         if is_rounded:
-            result += f"; the reported roundings move them by {size_text(found.rounding)}"
-        yield FactCheck(f"{found.quantity} in the file", "as Pinocchio reads them", result, verdict)
+            result += f"; the reported roundings move them by {size_text(difference.rounding)}"
+        yield FactCheck(f"{difference.quantity} in the file", "as Pinocchio reads them", result, verdict)
 
 
 def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:

@@ -102,8 +102,10 @@ def without_idle_residuals(model: Model) -> Model:
     reduced = copy.deepcopy(model)
     if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:
         terms = reduced.residuals
-        terms.mass = None if _is_idle(terms.mass) else terms.mass
-        terms.potential = None if _is_idle(terms.potential) else terms.potential
+        if _is_idle(terms.mass):
+            terms.mass = None
+        if _is_idle(terms.potential):
+            terms.potential = None
         # without any term, the factor on friction is one and needs no evaluation either
         if not any(bool(weights.any()) for weights in terms.parameters()):
             reduced.residuals = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
 
 import torch
 
@@ -71,11 +71,6 @@ def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
 def motors_of(model: Any) -> Tensor:
     """Return C, (n, n): the motors rotate at C qd; the identity if each motor drives its own joint."""
     return torch.eye(model.n).to(model.friction.nominal) if model.motors is None else model.motors
-
-
-def input_of(model: object) -> Literal["torque", "position"]:
-    """Return the quantity of the inputs of a model: torques, or commands of position servos."""
-    return "position" if isinstance(model, RigidBodyDynamics) and model.servo is not None else "torque"
 
 
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:

@@ -255,8 +255,8 @@ def figures(results: Results) -> list[Figure]:
         label = f"position error, commands replayed, {replay.name}"
         mean = 1000 * replay.errors[MODEL].mean
         candidates.append(("replay", label, thousandths(results.joint_types), mean))
-    known = []
+    named_figures = []
     for name, label, unit, value in candidates:
         if value is not None:
-            known.append(Figure(name, label, unit, value))
-    return known
+            named_figures.append(Figure(name, label, unit, value))
+    return named_figures

@@ -201,7 +201,5 @@ def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
         if name not in options:
             expected = f"one of {', '.join(options)}"
             raise RunError(f"the function {name!r}", expected=expected, do=suggestion(name, options))
-    if not names:
-        return options
     # in a fixed order: the same names give the same files
-    return [name for name in options if name in names]
+    return [name for name in options if name in names or not names]

@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Literal
 
-from spelgen.dynamics.protocol import input_of
 from spelgen.emission.assemble import spec_of
 from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import FitRequest, PreparedLogs
@@ -94,7 +93,7 @@ def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -
         validation=list(prepared.validation_names),
         training_windows=prepared.window_counts[0],
         validation_windows=prepared.window_counts[1],
-        mapping=options.mapping or LogMapping(input=input_of(model)),
+        mapping=options.mapping or LogMapping(input=model.input_quantity),
         device=options.device,
         threads=options.threads,
         # of logs and links; diagnostics of the run are about the command, and do not describe the model
