@@ -228,7 +228,7 @@ def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
                 f"a specification of format {version!r}", file=file, expected=expected, do=again
             )
         spec = TypeAdapter(ModelSpec).validate_python(content)
-        # Written again it must be the same: pydantic converts numbers and ignores keys.
+        # Compared with its own JSON form: pydantic converts values and ignores unknown keys.
         if json.loads(spec.to_json()) == {"format": version, **content}:
             return spec
         # not ignored: a specification that was edited by hand would be another model than its text states

@@ -207,7 +207,7 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFac
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
         # relative to the sum of the absolute values of the terms
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
-        # its own joints may change it
+        # its own joints may change the term: only changes by other joints contradict the fact
         changes[list(term.joints)] = 0.0
         name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
         magnitudes.append((f"change of {name}", float(changes.max()), False))

@@ -1,4 +1,4 @@
-"""Motions: Fourier series that start and end at rest and keep the limits of an arm by construction; approaches.
+"""Excitation trajectories (Fourier series from rest to rest within the limits of an arm), and approaches to them.
 
 Swevers et al., Optimal robot excitation and identification, IEEE T-RA 13:730 (1997).
 """

@@ -60,7 +60,7 @@ class ContactObserver:
             self.low = inputs
         else:
             gains = np.full((len(inputs), 1), 1 - np.exp(-rate * (t - self.t)))
-            # the second momentum, at twice the bandwidth: the difference of both tells the change of acceleration
+            # twice the bandwidth: the difference of two estimates of dp/dt is proportional to its rate
             gains[4] = 1 - np.exp(-2 * rate * (t - self.t))
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
         self.t, self.inputs = t, inputs

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from spelgen.settings.log_mapping import LogMapping
 
 MOVING = SAMPLES.moving
-# Delays of positions after commands [s]: negative ones mean shifted rows, those of cheap servos are below 0.2 s.
+# Delays of positions after commands [s]: negative ones mean shifted rows; cheap servos have less than 0.2 s.
 DELAYS = np.linspace(-0.1, 0.4, 51).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # shortest piece that the polynomial of the derivative fits into

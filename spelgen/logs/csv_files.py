@@ -35,7 +35,7 @@ class CsvText(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the one table of a file; a last line that is cut off is left out, with a remark."""
+    """Return the one table of a file; a last line that is cut off is omitted, with a remark."""
     table, text, cut = _csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
     layout = table_layout(table.schema, joints, mapping, file)
@@ -80,10 +80,8 @@ def _csv_table(file: Path) -> tuple[pa.Table, CsvText, str]:
     )  # fmt: skip
     for row in wrong:
         if row.number is None or row.number < len(table) + 2 + text.comments + text.others or not len(table):
-            got, expected = (
-                f"{row.actual_columns} values ({row.text:.40})",
-                f"{row.expected_columns}, as in the header",
-            )
+            got = f"{row.actual_columns} values ({row.text:.40})"
+            expected = f"{row.expected_columns}, as in the header"
             raise LogError(got, file=file, line=row.number, expected=expected)
     if names is None:
         table = table.rename_columns([name.strip() for name in table.column_names])
@@ -98,17 +96,10 @@ def _beginning(file: Path) -> CsvText:
     """Return the beginning of a file: comments start with #, lines of units have no digits."""
     encoding, head = _decoded_head(file)
     lines = head.splitlines() or [""]
-    comments = 0
-    while lines[comments].startswith("#") and comments < len(lines) - 1:
-        comments += 1
+    # at least one line remains as the header, and one as values
+    comments = len(list(takewhile(lambda line: line.startswith("#"), lines[:-1])))
     header, rows = lines[comments], lines[comments + 1 :]
-    others = 0
-    while (
-        others < len(rows) - 1
-        and rows[others]
-        and (rows[others] == header or not re.search(r"\d", rows[others]))
-    ):
-        others += 1
+    others = len(list(takewhile(lambda row: row and (row == header or not re.search(r"\d", row)), rows[:-1])))
     return CsvText(encoding, comments, header, others, "\n".join(rows[others:]))
 
 
