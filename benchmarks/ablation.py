@@ -59,6 +59,7 @@ SIMULATED = (
 )
 
 
+ESTIMATE = torque_problem.NoiseEstimator.estimate
 OWN_BRISTLES = {kind: shared for kind, shared in torque_prior.SHARED.items() if kind != "fractions"}
 
 
@@ -84,11 +85,29 @@ def keep_prior(prior: Any, *_: Any) -> Any:
     return prior
 
 
+def keep_armatures(prior: Any, *estimate: Any) -> Any:
+    """Replace `update_widths`: the standard deviation of armatures is the initial one."""
+    updated = torque_prior.update_widths(prior, *estimate)
+    widths = updated.widths.model_copy(update={"armature": prior.widths.armature})
+    return replace(updated, widths=widths)
+
+
+def one_body_width(prior: Any, *estimate: Any) -> Any:
+    """Replace `update_widths`: the prior of the bodies is Gaussian, of one standard deviation."""
+    updated = torque_prior.update_widths(prior, *estimate)
+    return replace(updated, body_widths=torch.full_like(updated.body_widths, updated.widths.bodies))
+
+
+def no_freedom(estimator: Any, squared_residual: Any, *_: Any) -> Any:
+    """Replace `NoiseEstimator.estimate`: the noise is the root mean square residual of the fit."""
+    return ESTIMATE(estimator, squared_residual)
+
+
 def always_hysteretic(estimate: Any) -> Any:
     """Replace `choose_friction_state`: friction of every joint has bristle states."""
     estimate.problem.jacobian.model.friction.memoryless.fill_(0.0)
     problem, state = stages._least_squares_noise_fit(estimate.problem, estimate.state)
-    return torque_problem.alternate(problem, state, TUNING.iterations)
+    return torque_problem.alternate(problem, state)
 
 
 def keep_all(estimate: Any) -> Any:
@@ -130,11 +149,10 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("bounded prior widths", tuned(TUNING, max_width=NEVER)),
         Mechanism("steps at the least-squares noise", tuned(TUNING, initial_steps=0)),
         Mechanism("noise annealing", tuned(TUNING, annealing_iterations=0)),
-        Mechanism("more iterations if noise decreases", tuned(TUNING, max_extension=1)),
+        Mechanism("more iterations if noise decreases", tuned(TUNING, noise_converged=0.0)),
         Mechanism("estimated prior widths", ((torque_problem, "update_widths", keep_prior),)),
-        Mechanism(
-            "estimated prior width of armatures", ((torque_prior, "ESTIMATED_GROUPS", ("bodies", "offset")),)
-        ),
+        Mechanism("estimated prior width of armatures", ((torque_problem, "update_widths", keep_armatures),)),
+        Mechanism("prior width per link", ((torque_problem, "update_widths", one_body_width),)),
         Mechanism("friction state by evidence", ((torque_fit, "choose_friction_state", always_hysteretic),)),
         Mechanism(
             "Occam factor of bristle fractions",
@@ -143,9 +161,11 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("weak evidence yields to all joints", tuned(TUNING, strong_evidence=0.0)),
         Mechanism("friction effects by evidence", ((torque_fit, "choose_friction_effects", keep_all),)),
         Mechanism("common factor of bristle fractions", ((torque_prior, "SHARED", OWN_BRISTLES),)),
-        Mechanism("degrees of freedom of the noise", tuned(TUNING, min_error_fraction=1.0)),
+        Mechanism(
+            "degrees of freedom of the noise", ((torque_problem.NoiseEstimator, "estimate", no_freedom),)
+        ),
         Mechanism("friction limited to the torque", ((torque_fit, "limit_friction", no_limit),)),
-        Mechanism("friction compensation of drives", tuned(TUNING, min_explained=NEVER)),
+        Mechanism("friction compensation of drives", tuned(TUNING, min_significance=NEVER)),
         Mechanism("every second sample", tuned(TUNING, decimation=1)),
         Mechanism("subset of samples first", tuned(TUNING, initial_samples=2**40)),
         Mechanism("steps in inertial parameters", tuned(DAMPING, min_gain_ratio=-NEVER)),

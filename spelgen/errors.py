@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal
@@ -13,29 +13,26 @@ MAX_ERRORS = 50  # number of printed errors
 MAX_TEXT = 2000  # number of printed characters of a part of a message
 
 
+@dataclass(eq=False, repr=False)
 class SpelgenError(Exception):
     """An error printed as ``FILE:LINE: element: got X, expected Y; do Z``, without the absent parts.
 
     Without ``expected``, ``got`` is a full statement, printed without the word "got".
     """
 
-    def __init__(
-        self,
-        got: str,
-        *,
-        file: Path | str | None = None,
-        line: int | None = None,
-        element: str | None = None,
-        expected: str | None = None,
-        do: str | None = None,
-    ) -> None:
-        super().__init__(got)
-        self.got = got
-        self.file = None if file is None else str(file)
-        self.line = line
-        self.element = element
-        self.expected = expected
-        self.do = do
+    got: str
+    _: KW_ONLY
+    file: Path | str | None = None
+    line: int | None = None
+    element: str | None = None
+    expected: str | None = None
+    do: str | None = None
+
+    def __post_init__(self) -> None:
+        # `args` are the arguments of a copy, such as the one that Ray makes of an error of a worker
+        super().__init__(self.got)
+        # errors are compared by their files, which callers name as text or as a path
+        self.file = None if self.file is None else str(self.file)
 
     def __str__(self) -> str:
         statement = _in_short(self.got)
@@ -66,7 +63,7 @@ class OptionError(SettingsError):
 
     def __init__(self, option: str, belongs: str) -> None:
         super().__init__(belongs, element=option)
-        self.option = option
+        self.args = (option, belongs)
 
 
 class LogError(SpelgenError):
@@ -86,6 +83,7 @@ class SpelgenErrors(SpelgenError):
 
     def __init__(self, errors: Sequence[SpelgenError]) -> None:
         super().__init__(f"{len(errors)} errors")
+        self.args = (errors,)
         self.errors = tuple(errors)
 
     def __str__(self) -> str:
@@ -104,7 +102,7 @@ def _once(errors: Sequence[SpelgenError]) -> str:
     """Return the text of the first of several errors that differ only in their files, followed by the other files."""
     first = errors[0]
     files = dict.fromkeys(error.file for error in errors if error.file and error.file != first.file)
-    return f"{first}\n  the same: {shortened(list(files), 5)}" if files else str(first)
+    return f"{first}\n  the same: {shortened(list(map(str, files)), 5)}" if files else str(first)
 
 
 def _in_short(text: str) -> str:
@@ -135,8 +133,8 @@ def suggestion(name: str, names: Iterable[str]) -> str:
     nearest = get_close_matches(name, names, n=1)
     if nearest:
         return f"did you mean {nearest[0]!r}?"
-    more = f" and {len(names) - 10} more" if len(names) > 10 else ""
-    return f"known are {', '.join(map(repr, names[:10]))}{more}"
+    remainder = f" and {len(names) - 10} more" if len(names) > 10 else ""
+    return f"known are {', '.join(map(repr, names[:10]))}{remainder}"
 
 
 def shortened(names: Sequence[str], limit: int) -> str:

@@ -62,8 +62,8 @@ def joint_ranges(joints: tuple[int, ...]) -> str:
     """Return the numbers of joints, from 1, with ranges of three or more: ``2-6`` or ``2,4``."""
     texts = []
     # consecutive joints have the same difference to their places
-    for _, places in groupby(range(len(joints)), key=lambda place: joints[place] - place):
-        run = [str(joints[place] + 1) for place in places]
+    for _, indices in groupby(range(len(joints)), key=lambda index: joints[index] - index):
+        run = [str(joints[index] + 1) for index in indices]
         texts += [f"{run[0]}-{run[-1]}"] if len(run) > 2 else run
     return ",".join(texts)
 

@@ -43,9 +43,9 @@ class Options:
     def __post_init__(self) -> None:
         """Raise SettingsError for networks that are too large for memory."""
         # weights in the hidden layers of one network: 134 MB in double precision
-        most = 2**24
-        if not (self.width >= 1 and 1 <= self.depth <= 16 and self.width**2 * self.depth <= most):
-            expected = f"1 to 16 layers of at least 1, with at most {most:,} weights"
+        max_weights = 2**24
+        if not (self.width >= 1 and 1 <= self.depth <= 16 and self.width**2 * self.depth <= max_weights):
+            expected = f"1 to 16 layers of at least 1, with at most {max_weights:,} weights"
             raise SettingsError(f"{self.depth} hidden layers of {self.width} units", expected=expected)
 
 
@@ -228,7 +228,7 @@ def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
                 f"a specification of format {version!r}", file=file, expected=expected, do=again
             )
         spec = TypeAdapter(ModelSpec).validate_python(content)
-        # Written again it must be the same: pydantic converts numbers and ignores keys.
+        # Compared with its own JSON form: pydantic converts values and ignores unknown keys.
         if json.loads(spec.to_json()) == {"format": version, **content}:
             return spec
         # not ignored: a specification that was edited by hand would be another model than its text states

@@ -114,7 +114,7 @@ def page_of(path: str) -> Path:
 
 
 def link(path: str, target: str) -> str:
-    """Return the link from the section of one group of keys to that of another."""
+    """Return the link from the section of one group of keys to the section of another."""
     name = "" if page_of(path) == page_of(target) else page_of(target).name
     return f"{name}#{target.lower().replace('.', '')}"
 

@@ -337,6 +337,13 @@ class TestExactness:
         assert (found @ found.T == IDENTITY).all()
         assert np.abs(np.array(found, dtype=float) - rotation).max() < 1e-11
 
+    def test_without_rounding_angles_are_those_of_the_file(self, robot):
+        """Many URDFs have eleven decimals of pi/2: other readers of the file place the tip by these."""
+        made = robot(joint("a", "0", "1", rpy="0.3 1.57079632679 0", axis="0 0 1"))
+        (body,) = make_arm(made, angle_tolerance=0.0).bodies
+        expected = rotation_from_rpy((0.3, 1.57079632679, 0.0))
+        assert np.abs(np.array(exact(body), dtype=float) - expected).max() < 1e-15
+
     @given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda a: np.linalg.norm(a) > 0.1))
     @settings(max_examples=100, deadline=None)
     def test_alignment_takes_z_to_the_axis(self, axis):

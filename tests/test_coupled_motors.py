@@ -18,7 +18,7 @@ from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.emission.build import build
 from spelgen.emission.specify import generate
-from spelgen.fitting.fit import fit
+from spelgen.fitting.fit import fit, load_run
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.samples import TorqueSamples
@@ -264,14 +264,28 @@ def test_no_delay_is_estimated_with_an_unspecified_coupling(uncoupled):
     assert not told(check_logs([log], uncoupled), "torque-delay")
     identified = identify(uncoupled, log)
     assert json.loads(json.dumps(identified.to_dict()))["torque_delay"] == {"delay": 0.0, "interval": 0.0}
-    fitted = fit(build(ROBOTS / "six_dof.urdf", "closed-form"), [log])
-    assert fitted.preprocessing.torque_delay == 0.0
-    for found in (identified, fitted):
-        (message,) = (x.message for x in found.diagnostics if x.code == "no-torque-delay")
-        assert "the motor of joint 6 seems to turn with joint 5, too" in message
+    (message,) = (x.message for x in identified.diagnostics if x.code == "no-torque-delay")
+    assert "the motor of joint 6 seems to turn with joint 5, too" in message
     assert (
         identify(uncoupled, log, preprocessing=Preprocessing(torque_delay=0.002)).torque_delay.delay == 0.002
     )
+
+
+def test_a_fit_has_the_coupling_that_its_logs_show(uncoupled, tmp_path):
+    """The fit is the one of an arm whose settings state the coupling, and so are its run and its delay."""
+    log, names = recorded(uncoupled, "joints", 1.0, late=0.01), uncoupled.chain.joint_names
+    shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
+    setting = f"couplings: [{{joints: [{names[4]}, {names[5]}], matrix: [[1, 1], [0, 1]]}}]\n"
+    (tmp_path / "arm.yaml").write_text(setting, encoding="utf-8")
+    coupled = load_arm(tmp_path / "arm.urdf")
+    stated, found = (fit(build(arm, "closed-form"), [log], arm=arm) for arm in (coupled, uncoupled))
+    assert found.preprocessing.torque_delay == pytest.approx(0.01, abs=0.0005)
+    assert found.model.spec.motor_speeds == stated.model.spec.motor_speeds
+    assert found.score(log) == pytest.approx(stated.score(log), abs=1e-3)
+    (warning,) = (x for x in found.diagnostics if x.code == "coupled-motors")
+    assert f"the motor of {names[5]} turns with {names[4]}, too, 1 times as fast" in warning.message
+    found.save(tmp_path / "run")
+    assert load_run(tmp_path / "run").score(log) == pytest.approx(found.score(log))
 
 
 def test_a_coupling_that_goes_with_the_delay_is_a_delay(uncoupled, monkeypatch):

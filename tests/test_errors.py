@@ -1,10 +1,22 @@
 """The text of errors and diagnostics: file, line, element, got, expected, remedy."""
 
 import json
+import pickle
+from pathlib import Path
 
 import pytest
 
-from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors, UrdfError, collect, suggestion
+from spelgen.errors import (
+    Diagnostic,
+    LogError,
+    OptionError,
+    RunError,
+    SpelgenError,
+    SpelgenErrors,
+    UrdfError,
+    collect,
+    suggestion,
+)
 
 
 @pytest.mark.parametrize(
@@ -70,3 +82,18 @@ def test_an_error_of_several_files_is_reported_once():
         "  the same: 1.csv, 2.csv, 3.csv, 4.csv, 5.csv, and 3 more",
         "0.csv: another",
     ]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        LogError("a gap", file=Path("a.csv"), line=3, expected="none", do="cut the log"),
+        OptionError("patience", "belongs to the objective rollout"),
+        SpelgenErrors([LogError("a gap", file="a.csv"), RunError("no run")]),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_a_copy_of_an_error_is_the_same_error(error):
+    """Ray copies the errors of its workers."""
+    copied = pickle.loads(pickle.dumps(error))
+    assert (type(copied), str(copied)) == (type(error), str(error))

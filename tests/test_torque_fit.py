@@ -12,6 +12,7 @@ from emitted import closed_forms, import_source
 from lxml import etree
 from motions import smooth_motion
 from scipy.optimize import minimize_scalar
+from scipy.stats import multivariate_t
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
@@ -29,7 +30,6 @@ from spelgen.fitting.torque.joint_functions import FRICTION
 from spelgen.fitting.torque.linearization import RigidProjection
 from spelgen.fitting.torque.networks import adapt_networks
 from spelgen.fitting.torque.parameters import (
-    ESTIMATED_GROUPS,
     NEGLIGIBLE,
     RIGID_GROUPS,
     ParameterPrior,
@@ -153,28 +153,50 @@ def test_deviations_are_those_of_the_largest_marginal_likelihood():
         return float(np.linalg.slogdet(total)[1] + y @ np.linalg.solve(total, y)) / 2
 
     best = np.exp(minimize_scalar(minus_log_likelihood, bounds=(-4, 3), method="bounded").x)
-    order = torch.arange(25)
-    masks = dict(zip(ESTIMATED_GROUPS, (order < 3, (order >= 3) & (order < 23), order >= 23), strict=True))
+    order = torch.arange(33)
+    masks = {"armature": order < 3, "offset": (order >= 3) & (order < 23), "bodies": order >= 23}
     rigid = SimpleNamespace(mask=masks.get)
 
     def updated(widths, hyperprior, x, covariance):
-        prior = ParameterPrior(rigid, widths, hyperprior, torch.zeros(25).double())
+        body_widths = torch.full((1,), widths.bodies).double()
+        prior = ParameterPrior(rigid, widths, hyperprior, torch.zeros(33).double(), body_widths)
         return update_widths(prior, x, covariance).widths
 
     guess = prior = GaussianPrior(armature=0.1, bodies=0.1, offset=0.1, degrees_of_freedom=1e-9)
     for _ in range(200):
-        posterior = np.linalg.inv(rows.T @ rows / noise**2 + np.eye(20) / prior.bodies**2)
-        away, covariance = torch.full((25,), 0.1).double(), torch.zeros(25, 25).double()
+        posterior = np.linalg.inv(rows.T @ rows / noise**2 + np.eye(20) / prior.offset**2)
+        away, covariance = torch.full((33,), 0.1).double(), torch.zeros(33, 33).double()
         away[3:23] = torch.from_numpy(posterior @ rows.T @ y / noise**2)
         covariance[3:23, 3:23] = torch.from_numpy(posterior)
         prior = updated(prior, guess, away, covariance)
-    assert prior.bodies == pytest.approx(best, rel=1e-4)
+    assert prior.offset == pytest.approx(best, rel=1e-4)
     # all three armatures are off together, which the prior allows for
     assert prior.armature < 1e-4
     away[:3] = torch.tensor([0.3, -0.3, 0.0])
     assert updated(prior, guess, away, covariance).armature == pytest.approx(0.3)
     certain = prior.model_copy(update={"degrees_of_freedom": 1e12})
-    assert updated(certain, guess, away, covariance).bodies == pytest.approx(guess.bodies)
+    assert updated(certain, guess, away, covariance).offset == pytest.approx(guess.offset)
+
+
+def test_the_widths_of_bodies_are_those_of_a_t_distribution(robots):
+    """Its scale is the most probable one, and one link that is far off neither widens it nor keeps its value."""
+    rigid, widths = ParameterVector(build(robots / "six_dof.urdf", "closed-form")), GaussianPrior()
+    prior, bodies = ParameterPrior.of(rigid, widths), rigid.mask("bodies")
+    offsets = 0.2 * np.random.default_rng(0).normal(size=(int(bodies.sum()) // 10, 10))
+    offsets[2] *= 10.0
+    x = prior.mean.clone().masked_scatter(bodies, torch.from_numpy(offsets))
+    for _ in range(200):
+        prior = update_widths(prior, x, torch.zeros(len(x), len(x)).double())
+
+    def minus_log_density(log_scale):
+        square, freedom = np.exp(2 * log_scale), widths.degrees_of_freedom
+        density = multivariate_t.logpdf(offsets, shape=square * np.eye(10), df=freedom).sum()
+        return freedom / 2 * (2 * log_scale + widths.bodies**2 / square) - density
+
+    best = np.exp(minimize_scalar(minus_log_density, bounds=(-3, 2), method="bounded").x)
+    assert prior.widths.bodies == pytest.approx(best, rel=1e-4)
+    assert prior.body_widths[2] > 3 * prior.widths.bodies
+    assert prior.body_widths[[0, 1, 3]].max() < 1.2 * prior.widths.bodies < 0.5
 
 
 def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
@@ -554,9 +576,8 @@ def test_few_of_very_many_samples_come_near_first(emitted, monkeypatch):
     assert found.steps != expected.steps
     # the cost depends on the noise, and so on the correlation time, which is estimated before the final fit
     np.testing.assert_allclose(found.correlation_time, expected.correlation_time, rtol=0.1)
-    assert found.cost == pytest.approx(expected.cost, rel=0.05)
+    assert found.cost == pytest.approx(expected.cost, rel=0.03)
     np.testing.assert_allclose(found.rms_residual, expected.rms_residual, rtol=1e-3)
-    assert [stage.name for stage in found.stages][-1] == "final fit"
     few = TorqueSamples.of(samples, 2).subsampled(300)
     assert (few.count, len(next(few.blocks(1000))[0])) == (300, 300)
 
@@ -595,10 +616,6 @@ def test_a_spring_is_found_that_bodies_pass_for(emitted, robots):
     model = build(robots / "six_dof.urdf", "hybrid", width=8)
     model.residuals.potential = model.residuals.mass = None
     solution = fit_torque(model, logs)
-    names = ["initial fit", "friction state", "friction effects", "residual terms", "final fit"]
-    assert [stage.name for stage in solution.stages] == names
-    steps = [stage.steps for stage in solution.stages]
-    assert steps == sorted(steps) and (steps[-1], solution.stages[-1].cost) == (solution.steps, solution.cost)
     assert {residual.joint for residual in solution.selected_terms} == {joint}
     assert nmse(model, test) < 1e-3
     assert nmse(bodies, test) > 0.05

@@ -10,13 +10,7 @@ import numpy as np
 
 from spelgen.arm.chain import ChainChoice, Leader, choose_chain, leaders
 from spelgen.arm.placement import AngleRounding, Frame, Placement, TenVector
-from spelgen.arm.rational import (
-    Matrix,
-    Vector,
-    bounded,
-    exact,
-    rotation_from_rpy,
-)
+from spelgen.arm.rational import Matrix, Vector, bounded, exact, rotation_from_rpy
 from spelgen.errors import ArmError, Diagnostic
 from spelgen.urdf.robot import JointType, Robot, UrdfJoint, UrdfLink
 
@@ -308,7 +302,7 @@ def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], joint: UrdfJoin
     for body in (moving.body for moving in moved):
         # a body rotates about the z axis of its frame
         beside = np.array(body.rotation, dtype=float)[:, 2]
-        is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2  # [rad] rounding included
+        is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2  # [rad] parallel within rounding errors
         if body.parent == frame.body >= 0 and body.joint_type != "prismatic" and is_parallel:
             parallel.append(body.name)
     return parallel

@@ -43,6 +43,12 @@ class AngleRounding:
     tolerance: float
     diagnostics: list[Diagnostic] = field(default_factory=list)
 
+    @property
+    def rotation_error(self) -> float:
+        """Largest error of rational rotations [rad]."""
+        # 1.57079632679 is pi/2 within 5e-12: without rounding it must not become pi/2
+        return TUNING.rotation_error if self.tolerance else 1e-15
+
     def origin(
         self, xyz: Sequence[float], rpy: Sequence[float], where: str, line: int
     ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -224,7 +230,7 @@ class Placement:
         segment = self._segments[body + 1]
         candidates: list[tuple[int, int, np.ndarray]] = []
         for turned, rational in segment:
-            candidate = rational @ exact_rotation(turned.T @ composed)
+            candidate = rational @ exact_rotation(turned.T @ composed, self._rounding.rotation_error)
             lost = sum(lost_zeros(y.T @ candidate, x.T @ composed) for x, y in segment)
             candidates.append((lost, len(candidates), candidate))
             if not lost:

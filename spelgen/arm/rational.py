@@ -107,8 +107,8 @@ def alignment(axis: np.ndarray) -> np.ndarray:
     return turned
 
 
-def exact_rotation(rotation: np.ndarray) -> np.ndarray:
-    """Return a rational approximation (3, 3) of a float64 rotation (3, 3): orthogonal, error 1e-11, same zeros.
+def exact_rotation(rotation: np.ndarray, error: float = TUNING.rotation_error) -> np.ndarray:
+    """Return a rational approximation (3, 3) of a float64 rotation (3, 3): orthogonal, within ``error``, same zeros.
 
     The unit quaternion is divided by its largest component and each ratio is replaced by a close fraction; the rotation
     matrix of an unnormalised rational quaternion is rational (Euler-Rodrigues). A zero that depends on several ratios
@@ -120,12 +120,12 @@ def exact_rotation(rotation: np.ndarray) -> np.ndarray:
     # Short fractions make exact arithmetic fast.
     for bound in TUNING.denominators:
         candidate = _rotation_of([Fraction(ratio).limit_denominator(bound) for ratio in ratios])
-        if np.abs(candidate.astype(float) - rotation).max() < TUNING.rotation_error:
+        if np.abs(candidate.astype(float) - rotation).max() < error:
             break
     if not lost_zeros(candidate, rotation):
         return candidate
     row, column = np.argwhere(np.abs(rotation) < TUNING.zero_noise)[0].tolist()
-    return _rotation_with_zero(rotation, row, column)
+    return _rotation_with_zero(rotation, row, column, error)
 
 
 def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
@@ -151,19 +151,19 @@ def lost_zeros(candidate: np.ndarray, rotation: np.ndarray) -> int:
     return int(np.count_nonzero(candidate[np.abs(rotation) < TUNING.zero_noise]))
 
 
-def _rotation_with_zero(rotation: np.ndarray, row: int, column: int) -> np.ndarray:
+def _rotation_with_zero(rotation: np.ndarray, row: int, column: int, error: float) -> np.ndarray:
     """Return a rational approximation of a float64 rotation (3, 3) in which this element is zero.
 
     It is the product of a rotation about axis ``row``, a signed permutation, and a rotation about axis ``column``.
     """
-    first = _turn(row, rotation[(row + 1) % 3, column], rotation[(row + 2) % 3, column])
-    last = _turn(column, rotation[row, (column + 1) % 3], -rotation[row, (column + 2) % 3])
+    first = _turn(row, rotation[(row + 1) % 3, column], rotation[(row + 2) % 3, column], error)
+    last = _turn(column, rotation[row, (column + 1) % 3], -rotation[row, (column + 2) % 3], error)
     between = np.rint(first.T.astype(float) @ rotation @ last.T.astype(float)).astype(int)
     result: np.ndarray = first @ between @ last
     return result
 
 
-def _turn(axis: int, cosine: float, sine: float) -> np.ndarray:
+def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     """Return the rational rotation (3, 3) about a coordinate axis by the angle with this cosine and sine."""
     # Reduction to a quarter turn, so that the approximations of 45 and 135 degrees differ by exactly a right angle.
     # Common angles are inside the interval of the reduced angles, not at its ends.
@@ -175,7 +175,7 @@ def _turn(axis: int, cosine: float, sine: float) -> np.ndarray:
         for bound in TUNING.denominators:
             t = Fraction(tangent).limit_denominator(bound)
             # The error of the angle is twice the error of t, and two rotations share the bound.
-            if abs(float(t) - tangent) < TUNING.rotation_error / 4:
+            if abs(float(t) - tangent) < error / 4:
                 break
     norm = 1 + t * t
     c, s = (1 - t * t) / norm, 2 * t / norm

@@ -172,8 +172,8 @@ def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
     solver = Solver(dynamics, 1)
     coarse = solver(windows)[1]
     # only dynamics that diverge would need shorter steps, and cannot be predicted with them either
-    most = min(TUNING.most_substeps, windows.dt.mean().item() / TUNING.shortest_step)
-    while 2 * solver.substeps <= most:
+    max_substeps = min(TUNING.most_substeps, windows.dt.mean().item() / TUNING.shortest_step)
+    while 2 * solver.substeps <= max_substeps:
         finer = replace(solver, substeps=2 * solver.substeps)
         fine = finer(windows)[1]
         error = (fine - windows.qd[:, 1:]).square().mean().sqrt()

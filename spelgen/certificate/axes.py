@@ -125,9 +125,8 @@ def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarra
     angular velocity (3,). All numbers are rational.
     """
     axes, twists = [], []
-    numbers = range(
-        1, 10**6
-    )  # numerators and denominators: the more, the rarer is a relation that holds by chance
+    # numerators and denominators: with a larger bound fewer relations hold by chance
+    numbers = range(1, 10**6)
     rotation, origin = IDENTITY, ZERO
     for body in arm.bodies:
         origin = origin + rotation @ np.array(body.translation)

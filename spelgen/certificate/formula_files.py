@@ -58,9 +58,9 @@ def to_dict(formulas: Formulas) -> dict[str, object]:
         base.append({"name": symbol.name, "definition": expressions.text(definition), "value": value})
     for formula in formulas.rows:
         row, column = (None, None) if formula.entry == "V" else formula.entry
-        place = {"name": formula.name, "row": row, "col": column, "terms": formula.terms}
+        indices = {"name": formula.name, "row": row, "col": column, "terms": formula.terms}
         formula_text = None if formula.expression is None else expressions.text(formula.expression)
-        entries.append({**place, "expression": formula_text})
+        entries.append({**indices, "expression": formula_text})
     return {"entries": entries, "base_parameters": base}
 
 

@@ -52,8 +52,8 @@ class Inspection:
         structure = self.structure
         entries = []
         for entry in structure.entries:
-            place = {"row": entry.row + 1, "col": entry.column + 1}
-            entries.append({**place, "kind": entry.kind, "joints": self._names(entry.joints)})
+            indices = {"row": entry.row + 1, "col": entry.column + 1}
+            entries.append({**indices, "kind": entry.kind, "joints": self._names(entry.joints)})
         potential = "varying" if structure.potential else "zero"
         return {
             "schema": 1,

@@ -166,14 +166,14 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
     is_rounded = any(remark.code.startswith("snapped-") for remark in arm.diagnostics)
     # per joint [rad, m]: dropped offsets, and composed rotations of 1e-11 each
     allowed = 1e-9 * len(robot.joints)
-    for found in differences:
+    for difference in differences:
         verdict: Verdict = "agrees"
-        if found.difference > allowed or (found.rounding > allowed and not is_rounded):
+        if difference.difference > allowed or (difference.rounding > allowed and not is_rounded):
             verdict = "differs"
-        result = f"at most {size_text(found.difference)} of their size apart"
+        result = f"at most {size_text(difference.difference)} of their size apart"
         if is_rounded:
-            result += f"; the reported roundings move them by {size_text(found.rounding)}"
-        yield FactCheck(f"{found.quantity} in the file", "as Pinocchio reads them", result, verdict)
+            result += f"; the reported roundings move them by {size_text(difference.rounding)}"
+        yield FactCheck(f"{difference.quantity} in the file", "as Pinocchio reads them", result, verdict)
 
 
 def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
@@ -207,7 +207,7 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFac
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
         # relative to the sum of the absolute values of the terms
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
-        # its own joints may change it
+        # its own joints may change the term: only changes by other joints contradict the fact
         changes[list(term.joints)] = 0.0
         name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
         magnitudes.append((f"change of {name}", float(changes.max()), False))

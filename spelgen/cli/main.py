@@ -17,9 +17,8 @@ import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 from spelgen.cli.arm_commands import identify, inspect
-from spelgen.cli.compare_command import compare
 from spelgen.cli.console import handle_errors, say
-from spelgen.cli.evaluate_command import estimate, evaluate, report
+from spelgen.cli.evaluate_command import compare, estimate, evaluate, report
 from spelgen.cli.log_commands import excite, logs, simulate
 from spelgen.cli.model_commands import build, check, export, init
 from spelgen.cli.train_command import train

@@ -114,7 +114,7 @@ def train(
         )
     # the option that does not apply is known only after the logs chose the objective
     except OptionError as error:
-        option = "--objective" if error.option == "objective" else f"--set {error.option}"
+        option = "--objective" if error.element == "objective" else f"--set {error.element}"
         raise UsageError(f"{option}: {error.got}") from error
     _report(fit, request, folder, format, _payload(fit, source))
 

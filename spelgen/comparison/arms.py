@@ -105,8 +105,8 @@ def load_comparison(path: Path) -> Comparison:
     document = read_document(path)
     comparison = validated(Comparison, document.value(), document)
     errors = []
-    for place, got, do in _contradictions(comparison, path.parent):
-        element, line = dotted(place), document.line(place)
+    for location, got, do in _contradictions(comparison, path.parent):
+        element, line = dotted(location), document.line(location)
         errors.append(SettingsError(got, file=path, line=line, element=element, do=do))
     collect(errors)
     arms = {name: arm.in_folder(path.parent) for name, arm in comparison.arms.items()}

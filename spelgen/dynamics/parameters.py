@@ -23,10 +23,9 @@ class ParameterInfo:
 
     kind: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of friction), effects (friction that
     varies with velocity), velocities, load_dependence, fractions (of bristles), torque_splines, torque_ripple,
-    friction_splines, mass_constants, mass_residuals, stiffness, damping,
-    dead_zone, delay, or network. unit: of the quantity that the parameter represents, of revolute and of prismatic
-    joints;
-    most parameters are logarithms of it, relative to a nominal value.
+    friction_splines, mass_constants, mass_residuals, stiffness, damping, dead_zone, delay, or network. unit: of the
+    quantity that the parameter represents, of revolute and of prismatic joints; most parameters are logarithms of it,
+    relative to a nominal value.
     """
 
     kind: str
@@ -103,8 +102,10 @@ def without_idle_residuals(model: Model) -> Model:
     reduced = copy.deepcopy(model)
     if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:
         terms = reduced.residuals
-        terms.mass = None if _is_idle(terms.mass) else terms.mass
-        terms.potential = None if _is_idle(terms.potential) else terms.potential
+        if _is_idle(terms.mass):
+            terms.mass = None
+        if _is_idle(terms.potential):
+            terms.potential = None
         # without any term, the factor on friction is one and needs no evaluation either
         if not any(bool(weights.any()) for weights in terms.parameters()):
             reduced.residuals = None

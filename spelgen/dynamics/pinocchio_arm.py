@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -38,16 +39,13 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
 
     The rotor inertia on the joint side is the armature of the model. Raises ArmError if a body has no inertial.
     """
-    errors = []
-    for body in arm.bodies:
-        if body.inertia is None:
-            got, do = (
-                "a link without <inertial>",
-                "write estimates into the URDF; a model that is trained on logs needs none",
-            )
-            expected = "mass, center of mass and inertia of each moving body"
-            errors.append(ArmError(got, element=f"joint {body.name!r}", expected=expected, do=do))
-    collect(errors)
+    error = partial(
+        ArmError,
+        "a link without <inertial>",
+        expected="mass, center of mass and inertia of each moving body",
+        do="write estimates into the URDF; a model that is trained on logs needs none",
+    )
+    collect([error(element=f"joint {body.name!r}") for body in arm.bodies if body.inertia is None])
     model = kinematic_model(arm)
     # index 0 is Pinocchio's universe
     for index, body in enumerate(arm.bodies, start=1):

@@ -128,7 +128,8 @@ class PreparedModel:
     ) -> tuple[Tensor, Tensor]:
         """Return A, (..., 2 n, 2 n), and B, (..., 2 n, n): derivatives with respect to (q, qd) and tau.
 
-        Without dt of the rate (qd, qdd) for constant z; with dt [s] of the result of ``step``.
+        Without dt: derivatives of the rate (qd, qdd) at constant z. With dt [s]: derivatives of the result of
+        ``step``.
         """
         n = self.n
         z = self.memory(qd) if z is None else z

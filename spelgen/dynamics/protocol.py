@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
 
 import torch
 
@@ -73,11 +73,6 @@ def motors_of(model: Any) -> Tensor:
     return torch.eye(model.n).to(model.friction.nominal) if model.motors is None else model.motors
 
 
-def input_of(model: object) -> Literal["torque", "position"]:
-    """Return the quantity of the inputs of a model: torques, or commands of position servos."""
-    return "position" if isinstance(model, RigidBodyDynamics) and model.servo is not None else "torque"
-
-
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
     """Return z, (..., n, K), of joints that have moved at qd for a long time; K = 0 for friction without a state."""
     if not is_stateful(dynamics):
@@ -122,7 +117,7 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        # the state of friction is passed through: rollouts ask these dynamics for it
+        # the friction state is passed through: rollouts read it from these dynamics
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements

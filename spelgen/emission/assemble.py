@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -57,7 +57,7 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
     assembly = model_parts(spec)
     names: dict[str, object] = {"generator": torch.Generator().manual_seed(seed)}
     # In place of the function that the text of a module defines: the same operations in the same order.
-    names["mass_entries"] = MassEntries(entry_sums(spec))
+    names["mass_entries"] = partial(_mass_entries, entry_sums(spec))
     try:
         # the rows first: calls refer to them by name
         for name, rows in assembly.rows.items():
@@ -88,15 +88,12 @@ def spec_of(model: object) -> ModelSpec | None:
     return model.spec if isinstance(model, ArmModel) else None
 
 
-class MassEntries:
-    """M (..., n, n) from its functions of q and constants, equal to the function ``mass_entries`` of a module."""
+def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
+    """Return M, (..., n, n), linear in the terms (...,), equal to the function ``mass_entries`` of a module.
 
-    def __init__(self, rows: list[list[Sums]]) -> None:
-        self.rows = rows
-
-    def __call__(self, *terms: Tensor) -> Tensor:
-        """Return M, (..., n, n): its entries are linear in the terms, functions of q and constants of shape (...,)."""
-        return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in self.rows))
+    rows: of the lower triangle. terms: functions of q, then constants.
+    """
+    return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in rows))
 
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:

@@ -73,7 +73,7 @@ def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> Arm:
 
 def find_urdf(module: Path, name: str) -> Path:
     """Return the URDF ``name`` in the folder of a module, the current one or ``robots/``. Raises ModuleError."""
-    # the folder of the module first: a project keeps its URDF beside it
+    # the folder of the module first: a project has its URDF next to the module
     folders = [module.parent, Path(), Path("robots"), module.parent / "robots"]
     for folder in folders:
         if (folder / name).is_file():

@@ -12,7 +12,7 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
 from spelgen.baselines.registry import EvaluatedArm, command_followers, torque_predictors
 from spelgen.dynamics.parameters import used_parameter_count, without_idle_residuals
-from spelgen.dynamics.protocol import RigidDynamics, input_of
+from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError, SpelgenError, in_one_line
@@ -99,7 +99,7 @@ def evaluate(
         )
         notes.append(Diagnostic("warning", SEEN, "logs", None, message))
     # an arm under servos has no torques, so inverse dynamics and rollouts under torques are undefined for it
-    if input_of(tested.model) == "position":
+    if tested.model.input_quantity == "position":
         if baselines:
             expected = "none: the model is one of position servos"
             raise LogError("baselines that take torques", expected=expected)
@@ -148,8 +148,8 @@ def _evaluate_torques(
     model = without_idle_residuals(tested.model)
     # chosen per predictor: stiff friction needs more steps, and its error must not count as an error of the dynamics
     solver = accurate_solver(model, probe)
-    known = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
-    predictors = [Predictor(MODEL, solver, model), *torque_predictors(known)]
+    arm = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
+    predictors = [Predictor(MODEL, solver, model), *torque_predictors(arm)]
     predictors += [of_dynamics(name, dynamics, probe) for name, dynamics in baselines.items()]
     tip = _tip(tested, notes)
     horizons: list[Horizon] = []

@@ -134,7 +134,7 @@ def summary(results: Results) -> Listing | None:
         return None
     errors = {name: x.mean_nmse for name, x in results.torque.items()}
     rows: dict[str, Numbers] = {"torque that is unexplained": errors, "error of M(q)": results.mass_errors}
-    # from the least to the most information: the reader sees the gain of each step
+    # in the order of increasing information, which shows the improvement of each step
     names = [name for name in (URDF, LEAST_SQUARES, MODEL) if name in errors]
     lines = []
     for label, values in rows.items():
@@ -255,8 +255,8 @@ def figures(results: Results) -> list[Figure]:
         label = f"position error, commands replayed, {replay.name}"
         mean = 1000 * replay.errors[MODEL].mean
         candidates.append(("replay", label, thousandths(results.joint_types), mean))
-    known = []
+    named_figures = []
     for name, label, unit, value in candidates:
         if value is not None:
-            known.append(Figure(name, label, unit, value))
-    return known
+            named_figures.append(Figure(name, label, unit, value))
+    return named_figures

@@ -43,12 +43,12 @@ class TorqueErrors:
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
     """Return the torque errors on these samples; pauses count in `nmse_with_pauses` only."""
-    parts, by_trajectory = [], {}
+    errors_by_log, by_trajectory = [], {}
     for sample in samples:
         residual, rows = predicted_torques(dynamics, sample) - sample.tau, is_moving(sample.qd)
         by_trajectory[sample.name] = mean_nmse(residual[rows], sample.tau[rows])
-        parts.append((residual, sample.tau, rows))
-    residual, torque, rows = map(np.concatenate, zip(*parts, strict=True))
+        errors_by_log.append((residual, sample.tau, rows))
+    residual, torque, rows = map(np.concatenate, zip(*errors_by_log, strict=True))
     # pooled over samples: a mean over logs would give a log of one second the weight of one of an hour
     by_joint = _nmse(residual[rows], torque[rows])
     return TorqueErrors(

@@ -115,7 +115,7 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
         shapes[name] = (rows, columns) if columns > 1 else (rows,)
         parameters.append(_parameter(model, name, str(rows * columns)))
         results.append(f"{name} ({', '.join(map(str, shapes[name]))}) [{unit}]")
-    # the line of the header: what the function returns, with shapes and units
+    # the line of the header: the results of the function, with shapes and units
     about = f"{entry.about[0].upper()}{entry.about[1:]}: {', '.join(results)}."
     symbol = f"{model.name}_{entry.name}"
     signature = f"void {symbol}(\n    " + ",\n    ".join(parameters) + ")"
@@ -146,7 +146,7 @@ def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str
     each number is written once. A variable is a slot of CasADi's work vector, which is reused.
     """
     inputs = function.name_in()
-    # CasADi numbers the entries of a matrix column by column
+    # CasADi numbers the entries of a matrix in column-major order
     shapes = [function.size_out(k) for k in range(function.n_out())]
     variables: dict[str, None] = {}
     lines: list[str] = []

@@ -16,7 +16,7 @@ from scipy.interpolate import BSpline
 from torch import Tensor
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
+from spelgen.dynamics.protocol import motors_of, residual_terms
 from spelgen.dynamics.tip import last_link, tip_kinematics
 from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.errors import RunError
@@ -169,7 +169,7 @@ def array(value: Tensor) -> np.ndarray:
 
 def servos_of(model: ArmModel) -> Servos | None:
     """Return the position servos of a model; None if it has none."""
-    if input_of(model) == "torque":
+    if model.input_quantity == "torque":
         return None
     kp, kd, limit, dead_zone = map(array, model.servo.prepare())
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
@@ -248,7 +248,7 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
     cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
-        # number of leading frequencies 1, 2, ...; those of the motor are multiples of its gear ratio
+        # number of leading frequencies 1, 2, ...; frequencies of the motor are multiples of its gear ratio
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]

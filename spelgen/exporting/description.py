@@ -137,7 +137,7 @@ class EntryPoint:
 
 
 def read_entries(text: str) -> dict[str, EntryPoint]:
-    """Return entry points by name: of each, a line ``name(inputs) -> output [unit], ...``, then what it returns."""
+    """Return entry points by name: of each, a line ``name(inputs) -> output [unit], ...``, then its description."""
     entries = {}
     lines = text.strip().splitlines()
     for signature, about in zip(lines[::2], lines[1::2], strict=True):
@@ -201,7 +201,5 @@ def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
         if name not in options:
             expected = f"one of {', '.join(options)}"
             raise RunError(f"the function {name!r}", expected=expected, do=suggestion(name, options))
-    if not names:
-        return options
     # in a fixed order: the same names give the same files
-    return [name for name in options if name in names]
+    return [name for name in options if name in names or not names]

@@ -89,7 +89,7 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     # a copy in double precision: the model of the user is not changed
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
-    # rigid bodies of the model need no search; residual terms are left out and stated
+    # rigid bodies of the model need no search; residual terms are omitted, and the summary states it
     exact = isinstance(model, RigidBodyDynamics)
     bodies: ArmModel = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(

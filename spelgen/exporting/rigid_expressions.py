@@ -161,7 +161,7 @@ def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: 
 
     carrier: index of the body that carries the frame; -1: the root link. pose: (4, 4), in the frame of this body.
     """
-    # poses of the root link, then of all bodies: those that do not carry the frame vanish from the function
+    # poses of the root link, then of all bodies: poses of bodies that do not carry the frame vanish from the function
     poses = [ca.SX.eye(4)]
     for body, frame in zip(bodies, body_frames(bodies, q), strict=True):
         poses.append(poses[body.parent + 1] @ ca.vertcat(ca.horzcat(*frame), constant([[0, 0, 0, 1]])))

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.registry import FittedBaselines, arm_of_model, fit_baselines
-from spelgen.dynamics.protocol import input_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, OptionError, RunError, SettingsError, SpelgenError
 from spelgen.files import write_json
@@ -106,7 +105,7 @@ def fit(
     if run is not None and not options.resume:
         # Before the logs are filtered and cut, which may take minutes.
         run.require_free(force=options.force)
-    # locked after the request was checked: a wrong option leaves no folder
+    # locked after the request was checked: a wrong option creates no folder
     with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
         return _Fitting(request, objective, run).fitted()
@@ -214,7 +213,7 @@ def objective_of(request: FitRequest) -> Objective:
     """Return the objective of a request. Raises OptionError if it does not apply to the model."""
     name = request.config.objective
     objective = OBJECTIVES[name]
-    under = input_of(request.model)
+    under = request.model.input_quantity
     if objective.input != under:
         message = (
             f"{name} belongs to arms with 'input: {objective.input}' in their settings, this has '{under}'"
@@ -229,7 +228,7 @@ def default_objective(model: ArmModel, rates: Rates) -> str:
     "servo" for an arm under position servos; "torque" for rigid bodies if a log is sampled densely enough for
     accelerations; else "rollout".
     """
-    if input_of(model) == ServoObjective.input:
+    if model.input_quantity == ServoObjective.input:
         return ServoObjective.name
     if isinstance(model, RigidBodyDynamics) and any(map(shows_accelerations, rates())):
         return "torque"

@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Literal
 
-from spelgen.dynamics.protocol import input_of
 from spelgen.emission.assemble import spec_of
 from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import FitRequest, PreparedLogs
@@ -48,7 +47,7 @@ class Objective(ABC):
         """Do the steps of a new fit before its first checkpoint; return diagnostics."""
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Continue from the files of a run folder, by default with a fitted model.
+        """Continue from the files of a run folder. By default the fit is complete, and its best weights are loaded.
 
         Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError for files of another model.
         """
@@ -59,7 +58,7 @@ class Objective(ABC):
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """Run the fit until a stopping criterion holds, and return it; call ``save`` to write a `checkpoint`.
 
-        By default nothing is left to do after `begin`. KeyboardInterrupt may be raised at any time.
+        By default `begin` does the whole fit. KeyboardInterrupt may be raised at any time.
         """
         return "finished"
 
@@ -94,7 +93,7 @@ def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -
         validation=list(prepared.validation_names),
         training_windows=prepared.window_counts[0],
         validation_windows=prepared.window_counts[1],
-        mapping=options.mapping or LogMapping(input=input_of(model)),
+        mapping=options.mapping or LogMapping(input=model.input_quantity),
         device=options.device,
         threads=options.threads,
         # of logs and links; diagnostics of the run are about the command, and do not describe the model

@@ -10,6 +10,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,16 +31,16 @@ from spelgen.identification.intervals import Interval, base_unit, interval_listi
 from spelgen.labels import UNITS, parameter_name
 from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import DynamicsSamples
-from spelgen.runtime.friction_laws import FrictionLaws
 from spelgen.runtime.motors import MotorInputs
 
-# Finite difference, in standard deviations of the parameters.
-STEP = 1e-4
-# Speeds, relative to the typical speed, and positions at which viscous and Coulomb friction approximate friction.
-SPEEDS = np.geomspace(0.02, 1.0, 25)
-POSITIONS = 32
-# Samples of one block of predicted torques.
-BLOCK = 2048
+QUANTITIES = {
+    "armature": "{0.inertia}",
+    "viscous": "{0.torque} s/{0.position}",
+    "coulomb": "{0.torque}",
+    "offset": "{0.torque}",
+    "gain": "",
+}
+"""Units of the quantities of a drive, formatted with `UNITS` of its joint type."""
 
 
 class Uncertain(NamedTuple):
@@ -82,17 +83,16 @@ class Posterior:
             """Return the function at parameters x, (K,)."""
             return evaluate_with(self.model, self._vector.unflatten(x), function)
 
+        part = 1e-4  # central differences over a part of a standard deviation: linear, and far above rounding
         with torch.no_grad():
-            steps = STEP * self._root.mT
-            columns = [(at(self._x + step) - at(self._x - step)) / (2 * STEP) for step in steps]
+            columns = [(at(self._x + part * x) - at(self._x - part * x)) / (2 * part) for x in self._root.mT]
             return Propagated(at(self._x), torch.stack(columns, dim=-1))
 
     def mass_matrix(self, q: np.ndarray) -> Uncertain:
         """Return M (T, n, n) at q (T, n), with standard deviations."""
         position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
-        at_rest, columns = self._regressor(position, zero, zero), []
-        for unit in torch.eye(self.model.n).double():
-            columns.append(self._regressor(position, zero, unit.expand_as(zero)) - at_rest)
+        at_rest, units = self._regressor(position, zero, zero), torch.eye(self.model.n).double()
+        columns = [self._regressor(position, zero, unit.expand_as(zero)) - at_rest for unit in units]
         with torch.no_grad():
             return self._linear(self.model.mass_matrix(position), torch.stack(columns, dim=-2))
 
@@ -117,12 +117,13 @@ class Posterior:
             inverse = torch.linalg.inv(inputs + torch.diag((~inputs.any(dim=1)).double()))
         variance = (inverse.square() @ torch.from_numpy(self.torque_std).square()).expand_as(q).clone()
         samples = DynamicsSamples("", motion[0], motion[1], motion[2], np.zeros_like(motion[0]), *motion[3:])
-        for first in range(0, len(q), BLOCK):
-            block = TorqueSamples.of([samples[first : first + BLOCK]])
+        size = 2048  # of a block: the Jacobians of all samples of a log may not fit into memory
+        for first in range(0, len(q), size):
+            block = TorqueSamples.of([samples[first : first + size]])
             rows = torch.zeros(block.count, model.n, root.shape[1]).double()
             for joint, columns, jacobian, _ in TorqueJacobian(model, block).joint_rows(self._x):
                 rows[:, joint] = jacobian @ root[columns]
-            variance[first : first + BLOCK] += (inverse @ rows).square().sum(dim=-1)
+            variance[first : first + size] += (inverse @ rows).square().sum(dim=-1)
         return Uncertain(value.numpy(), variance.sqrt().numpy())
 
     @cached_property
@@ -130,20 +131,15 @@ class Posterior:
         """The identifiable combinations of inertial parameters and armatures."""
         names, combination = self._base
         values, roots = (combination @ factor for factor in self._constants)
-        result = []
-        for name, value, root in zip(names, values.tolist(), roots, strict=True):
-            result.append(Interval(name, value, float(root.norm()), base_unit(name)))
-        return tuple(result)
+        rows = zip(names, values.tolist(), roots.norm(dim=1).tolist(), strict=True)
+        return tuple(Interval(name, value, std, base_unit(name)) for name, value, std in rows)
 
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
         """Mass [kg] and first moments [kg m] of each body that the logs determine individually."""
         _, combination = self._base
-        alone = (combination.count_nonzero(dim=1) == 1).tolist()
-        pairs = zip(self.base_parameters, alone, strict=True)
-        return tuple(
-            replace(x, positive=x.name[0] == "m") for x, single in pairs if single and x.name[0] in "mh"
-        )
+        alone = compress(self.base_parameters, (combination.count_nonzero(dim=1) == 1).tolist())
+        return tuple(replace(x, positive=x.name[0] == "m") for x in alone if x.name[0] in "mh")
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -158,31 +154,24 @@ class Posterior:
 
         Viscous and Coulomb friction approximate the friction model by least squares up to the typical speed.
         """
-        model = self.model
-        trained = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
-        load, factor = self._loads()
+        model, inputs = self.model, self.model.inputs
+        trained = inputs.gain_rows.tolist() if isinstance(inputs, MotorInputs) else []
+        friction_line = _friction_line(model)
 
         def constants(model: ArmModel) -> Tensor:
             """Return the quantities of all joints, (4, n) or (5, n)."""
-            rows = [model.armature, *_friction_line(model.friction, load, factor), model.torque_offset]
+            rows = [model.armature, *friction_line(model), model.torque_offset]
             if isinstance(model.inputs, MotorInputs) and trained:
                 rows.append(model.inputs.gains().sum(dim=1))
             return torch.stack(rows)
 
-        value, std = self.uncertain(constants)
-        units = [UNITS[joint_type] for joint_type in model.joint_types]
-        rows = {
-            "armature": [unit.inertia for unit in units],
-            "viscous": [f"{unit.torque} s/{unit.position}" for unit in units],
-            "coulomb": [unit.torque for unit in units],
-            "offset": [unit.torque for unit in units],
-            "gain": [""] * model.n,
-        }
+        rows = zip(QUANTITIES.items(), *self.uncertain(constants), strict=False)
         result = {}
-        for row, (quantity, labels) in enumerate(list(rows.items())[: len(value)]):
+        for (quantity, unit), value, std in rows:
             positive, joints = quantity in ("armature", "coulomb", "gain"), range(model.n)
+            labels = [unit.format(UNITS[joint_type]) for joint_type in model.joint_types]
             result[quantity] = tuple(
-                Interval(model.joint_names[k], float(value[row, k]), float(std[row, k]), labels[k], positive)
+                Interval(model.joint_names[k], float(value[k]), float(std[k]), labels[k], positive)
                 for k in (trained if quantity == "gain" else joints)
             )
         return result
@@ -223,15 +212,6 @@ class Posterior:
             "torque_delay": None if self.delay is None else self.delay.to_dict(),
             "torque_deviation": self.torque_std.tolist(),
         }
-
-    def _loads(self) -> tuple[Tensor, Tensor]:
-        """Return gravity torques on the drives and residual factors on friction at random positions, (P, n) each."""
-        joints = self.model.spec.joints
-        places = np.random.default_rng(0).uniform(-1.0, 1.0, (POSITIONS, self.model.n))
-        q = torch.from_numpy([x.center for x in joints] + places * [x.half_range for x in joints])
-        with torch.no_grad():
-            load = self.model.gravity(q) @ torch.linalg.inv(motors_of(self.model))
-            return load, friction_factor(self.model, q)
 
     @cached_property
     def _vector(self) -> ParameterVector:
@@ -304,16 +284,26 @@ def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | Non
     return None
 
 
-def _friction_line(friction: FrictionLaws, load: Tensor, factor: Tensor) -> Tensor:
-    """Return the viscous and Coulomb friction, (2, n), that are nearest to a friction model.
+def _friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
+    """Return a function of a model: viscous and Coulomb friction, (2, n), that are nearest to its friction.
 
-    Args:
-        friction: of the drives.
-        load: gravity torques on the drives, (P, n) [Nm, N].
-        factor: of the residual terms on friction, (P, n).
+    The line is fitted by least squares to friction at speeds up to the typical speed, averaged over random positions,
+    at which gravity and residual terms have the values of the fitted model.
     """
-    speed = torch.from_numpy(SPEEDS).unsqueeze(-1) * friction.speed
-    torque = (factor * friction.prepare().torque(speed.unsqueeze(1), load)).mean(dim=1)
-    line = np.linalg.pinv(np.stack([SPEEDS, np.ones_like(SPEEDS)], axis=-1))
-    slope, intercept = torch.from_numpy(line) @ torque
-    return torch.stack([slope / friction.speed, intercept])
+    rng, joints = np.random.default_rng(0), model.spec.joints
+    places = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
+    q = torch.from_numpy([x.center for x in joints] + places)
+    with torch.no_grad():
+        load = model.gravity(q) @ torch.linalg.inv(motors_of(model))  # (P, n), on the drives
+        factor = friction_factor(model, q)
+    # logarithmic: the Stribeck effect and the intercept are at low speeds
+    speeds = np.geomspace(0.02, 1.0, 25)
+    line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
+
+    def friction_line(model: ArmModel) -> Tensor:
+        friction = model.friction
+        speed = torch.from_numpy(speeds)[:, None] * friction.speed
+        slope, intercept = line @ (factor * friction.prepare().torque(speed[:, None], load)).mean(dim=1)
+        return torch.stack([slope / friction.speed, intercept])
+
+    return friction_line

@@ -15,7 +15,7 @@ from types import TracebackType
 import torch
 from filelock import FileLock, Timeout
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from spelgen.errors import Diagnostic, RunError
 from spelgen.files import naming
@@ -107,13 +107,8 @@ class TrainingProgress:
     def __init__(self, *, show: bool) -> None:
         self._show = show
         self._console = Console(stderr=True, highlight=False, soft_wrap=True)
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(12),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-        )
-        self._bar = Progress(*columns, TextColumn("{task.fields[state]}"), console=self._console)
+        columns = ("{task.description}", BarColumn(12), MofNCompleteColumn(), TimeRemainingColumn())
+        self._bar = Progress(*columns, "{task.fields[state]}", console=self._console)
         self._task = self._bar.add_task("training", total=None, visible=False, state="")
         self._line = ""  # of the current stage, printed at its end without a terminal
 

@@ -57,7 +57,7 @@ class RunFolder:
         """
         self.require_free(force=force)
         content = {self.spec: f"{spec.to_json()}\n".encode()}
-        # before anything is removed: they may be this very run's copies
+        # read before files are removed: they may be this run's copies
         if urdf is not None and urdf.exists():
             content[self.urdf] = urdf_bytes(urdf)  # a xacro file is expanded
         if urdf is not None and (settings := urdf.with_suffix(".yaml")).is_file():
@@ -179,7 +179,7 @@ def _require_finite(weights: Content, path: Path) -> None:
 
 def write_state(path: Path, state: Content) -> None:
     """Write a state with torch.save, all or nothing."""
-    # in memory first: an interruption leaves the former file
+    # in memory first: an interruption does not change the former file
     buffer = io.BytesIO()
     torch.save(state, buffer)
     write_bytes(path, buffer.getvalue())

@@ -102,23 +102,16 @@ class Record(BaseModel):
     def require_same_run(self, resumed: Record, folder: Path) -> None:
         """Raise RunError if `resumed`, the record of a resumed fit, has other data or settings."""
         if self.data_digest != resumed.data_digest:
-            raise RunError(
-                "other logs than the run was started with",
-                file=folder,
-                do="give the same --data or start a new run",
-            )
+            do = "give the same --data or start a new run"
+            raise RunError("other logs than the run was started with", file=folder, do=do)
         original, changed_settings = self._settings(), resumed._settings()
         changed = []
         for name in original | changed_settings:
             if name not in MAY_CHANGE and original.get(name) != changed_settings.get(name):
                 changed.append(f"{name} {changed_settings.get(name)} instead of {original.get(name)}")
         if changed:
-            raise RunError(
-                ", ".join(changed),
-                file=folder,
-                expected="the settings the run was started with",
-                do="or start a new run",
-            )
+            expected, do = "the settings the run was started with", "or start a new run"
+            raise RunError(", ".join(changed), file=folder, expected=expected, do=do)
 
     def _settings(self) -> Content:
         settings = self.model_dump(include={"objective", "validation_fraction", "seed"})

@@ -96,7 +96,7 @@ def robot_of(
         raise ModuleError("another URDF than the module was built from", file=path, do=do)
     if urdf is not None:
         raise RunError("no such file", file=path, expected="the URDF the module was built from")
-    # a file beside the module was not asked for: the fit goes on without it
+    # a file next to the module was not requested: the fit continues without it
     if exists:
         code = "changed-urdf"
         message = (

@@ -44,7 +44,7 @@ class Intake:
             self.low, self.high = -self.limit, self.limit
             self.path = q.copy()
         elif refusal not in IGNORED:
-            # the friction state does not follow the rounding of an encoder
+            # changes of one encoder step are rounding, not motion
             path = np.clip(self.path, q - self.levels.encoder, q + self.levels.encoder)
             moved = path - self.path
             if self.bristles.motors is not None:

@@ -133,11 +133,10 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
 
 
 def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) -> list[np.ndarray]:
-    """Return candidates of factors (n,) on the torques, for another unit: they match the magnitude of the URDF's
-    gravity.
+    """Return candidates of factors (n,) on the torques for another unit, from the magnitude of the URDF's gravity.
 
-    One for each joint whose torques differ from the URDF's gravity by more than wrong inertials explain, and one for
-    all joints together. undeclared: joints whose unit no mapping states.
+    One for each joint whose torques are too large or too small by a factor that wrong inertials do not explain, and one
+    for all joints together. undeclared: joints whose unit no mapping states.
     """
     seen: list[float] = []
     factors = []
@@ -158,7 +157,7 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
 
 
 def _rounded(factor: float) -> float:
-    """Return 0.001 (mNm) or one significant digit if it is close to the factor, else two digits."""
+    """Return 0.001 for mNm, or one significant digit if it changes the factor by less than a tenth, else two."""
     if 1 / 1.5 < factor / 1e-3 < 1.5:
         return 1e-3  # the factor is only as exact as the masses of the URDF
     one = float(f"{factor:.1g}")

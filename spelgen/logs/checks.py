@@ -145,10 +145,7 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
     )
 
 
-CLOCK_CHECKS = [
-    Check("gap", "info", find_gaps),
-    Check("low-rate", "warning", find_low_rate),
-]
+CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
 # reported when a log is read, one message per repair
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)

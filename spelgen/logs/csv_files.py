@@ -31,7 +31,7 @@ class Beginning(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the one table of a file; a last line that is cut off is left out, with a remark."""
+    """Return the one table of a file; a last line that is cut off is omitted, with a remark."""
     table, header, cut = _csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
     return [
@@ -92,6 +92,7 @@ def _beginning(file: Path) -> Beginning:
     """Return the beginning of a file: comments start with #, lines of units have no digits."""
     encoding, head = _decoded_head(file)
     lines = head.splitlines() or [""]
+    # at least one line remains as the header, and one as values
     comments = len(list(takewhile(lambda line: line.startswith("#"), lines[:-1])))
     header, rows = lines[comments], lines[comments + 1 :]
     others = list(takewhile(lambda x: x and (x == header or not re.search(r"\d", x)), rows[:-1]))

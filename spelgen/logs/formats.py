@@ -16,6 +16,9 @@ from spelgen.logs.parquet_files import LEROBOT, PARQUET
 from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
 
+LogPaths = Path | str | Iterable[Path | str]
+"""Files and folders of logs, or addresses."""
+
 UNPACK = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".xz": "unxz", ".bz2": "bunzip2"}
 FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
 
@@ -37,9 +40,7 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[
         return log_format.read(path, joints, mapping)
 
 
-def log_files(
-    paths: Path | str | Iterable[Path | str], role: str | None = None
-) -> tuple[list[Path], list[SpelgenError]]:
+def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], list[SpelgenError]]:
     """Return the logs at these paths, each once, and the errors of all other paths.
 
     role: "train" or "test": of a folder with files train.* or test.*, only the files with this stem are used.

@@ -45,7 +45,7 @@ def mapping_line(keys: Mapping[str, object]) -> str:
 
 
 def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str]) -> dict[str, object]:
-    """Return the keys of single joints for the group `logs`; units that all joints of an arm share are its units."""
+    """Return the keys of joints for the group `logs`; a unit that is equal at all joints becomes a unit of the log."""
     first = next(iter(entries.values()))
     if first.keys() == {"units"} and all(entries.get(joint) == first for joint in joints):
         return dict(first)
@@ -114,7 +114,7 @@ class JointSignals(NamedTuple):
 
 def is_factor(value: float, unit: float) -> bool:
     """Return True if a factor equals the factor of a unit within a tolerance."""
-    # within this ratio a measured factor is that of a unit
+    # within this ratio a measured factor is the factor of a unit
     return 0.8 < value / unit < 1.25
 
 
@@ -211,13 +211,13 @@ def find_elastic(signals: JointSignals) -> str | None:
     if not (is_long and piece.tau.size and np.ptp(piece.tau[:, k])):
         return None
     frequency, inertia = _apparent_inertia(piece.qd[:, k], piece.tau[:, k], rate, length)
-    # two constants and a resonance cannot be told from noise by fewer bands
+    # fewer bands do not determine two constants and a resonance
     if len(frequency) < 5:
         return None
     ones = np.ones_like(frequency)
     rigid, _ = _relative_error([ones, frequency**-2.0], inertia)
     candidates = []
-    # a resonance somewhat above the excited frequencies shows already
+    # a resonance up to 1.5 times the excited frequencies is visible
     for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
         # multiplied by the denominator, so that one band at the resonance does not dominate
         factor = 1 - (frequency / resonance) ** 2

@@ -1,6 +1,6 @@
 """Reading and writing of log files, in SI units and with the URDF's signs; without filter and resampling."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +12,7 @@ import pyarrow.parquet
 from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.files import replacing
 from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, LogSource, log_source
-from spelgen.logs.formats import log_files, read_tables
+from spelgen.logs.formats import LogPaths, log_files, read_tables
 from spelgen.logs.segments import LogSegments
 from spelgen.logs.tables import UNITS, UNITS_KEY
 from spelgen.logs.trajectory import Trajectory, joined_column, require_joints
@@ -20,7 +20,7 @@ from spelgen.logs.tuning import TUNING
 
 
 def read_logs(
-    paths: Path | str | Iterable[Path | str],
+    paths: LogPaths,
     arm: LoggedArm,
     mapping: GivenMapping = None,
     role: str | None = None,
@@ -51,10 +51,7 @@ class BoundedLogs(NamedTuple):
 
 
 def read_bounded_logs(
-    paths: Path | str | Iterable[Path | str],
-    arm: LoggedArm,
-    mapping: GivenMapping = None,
-    role: str | None = None,
+    paths: LogPaths, arm: LoggedArm, mapping: GivenMapping = None, role: str | None = None
 ) -> BoundedLogs:
     """Return the logs as `read_logs` does, reduced to evenly spread segments if they exceed `LogTuning.kept_bytes`.
 
@@ -76,7 +73,7 @@ def read_bounded_logs(
 
 
 def _read(
-    paths: Path | str | Iterable[Path | str],
+    paths: LogPaths,
     source: LogSource,
     role: str | None,
     segments: LogSegments,

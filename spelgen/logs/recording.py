@@ -15,6 +15,9 @@ from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import foreign_rows
 from spelgen.settings.log_mapping import LogMapping
 
+Repaired = tuple[np.ndarray, tuple[str, ...]]
+"""Rows of a log (T, C), and messages on their changes."""
+
 
 def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:
     """Return a trajectory of these rows (T, C) in SI units, velocities differentiated if none were logged.
@@ -43,9 +46,7 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     )  # fmt: skip
 
 
-def _without_wraps(
-    data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> Repaired:
     """Return rows (T, C) in which signals with a period are unwrapped, and remarks."""
     remarks: list[str] = []
     if not any(mapping.word("period", *signal) for signal in signals):
@@ -71,9 +72,7 @@ def _without_wraps(
     return data, tuple(remarks)
 
 
-def _without_repeats(
-    data: np.ndarray, positions: int, mapping: LogMapping
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _without_repeats(data: np.ndarray, positions: int, mapping: LogMapping) -> Repaired:
     """Return rows (T, C), without repeats if all rows are repeated or 'dropouts: dropped' is set, and messages."""
     # too short to distinguish motion from rest; an archive may have thousands of such recordings
     if len(data) < TUNING.jump_window:
@@ -94,9 +93,7 @@ def _without_repeats(
     return data[~repeats], (f"{message}: repeats were left out, {rate:.3g} Hz remain",)
 
 
-def _without_outliers(
-    data: np.ndarray, signals: Sequence[tuple[str, str]]
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> Repaired:
     """Return rows (T, C) without lost samples and outliers, and messages that list them."""
     outliers = np.zeros(len(data), bool)
     found = []
@@ -141,7 +138,7 @@ def listed_times(t: np.ndarray) -> str:
     return f"{shown} s" + (f" and {more} more" if more > 0 else "")
 
 
-def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[np.ndarray, tuple[str, ...]]:
+def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaired:
     """Return the values (T, C) of rows of a file with increasing times, and messages about repairs.
 
     Rows are sorted if this makes the positions smoother. Of several rows with one time the first is kept, or the times

@@ -3,8 +3,6 @@
 A finding with a line advises a reading of the columns under which positions and velocities agree.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product

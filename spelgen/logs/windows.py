@@ -15,7 +15,7 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.logs.trajectory import Trajectory, set_aside
 
 LAST_PART = " (last part)"
-"""Ends the name of the part of a trajectory that validates what is fitted to the rest of it."""
+"""Suffix of the name of the part of a trajectory that validates a fit to the other part."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -111,9 +111,9 @@ def base_table(
     rows = list(zip(*columns.values(), strict=True))
     sure = tuple(row for row in rows if row[-2] in DETERMINED)
     unsure = tuple(row for row in rows if row[-2] not in DETERMINED)
-    title, more = "Base parameters: identifiable combinations", "not significantly different from zero"
-    more = f"{len(unsure)} more, {more}"
-    return ParameterTable(title, tuple(columns), sure, f"{note}.", folded=unsure, folded_title=more)
+    title = "Base parameters: identifiable combinations"
+    folded_title = f"{len(unsure)} more, not significantly different from zero"
+    return ParameterTable(title, tuple(columns), sure, f"{note}.", folded=unsure, folded_title=folded_title)
 
 
 def _number(value: float) -> str:

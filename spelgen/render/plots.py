@@ -65,22 +65,6 @@ class JointRow:
     columns: Sequence[tuple[str, np.ndarray, str]]
     height: int = 130
 
-    def chart(self, t: Values, joint: NamedJoint, k: int, time: str = "", motion: str = "") -> Chart:
-        """Return the chart of joint k.
-
-        Args:
-            t: Times, (T,) [s].
-            joint: Name and units of joint k.
-            k: Index of the joint, from 0.
-            time: Label of the time axis; "": neither label nor numbers.
-            motion: See `line_chart`.
-        """
-        lines = [Line(label, t, values[:, k], style) for label, values, style in self.columns]
-        # The plot areas of all charts of a column have the same height.
-        height = self.height + (MARGINS.bottom - MARGINS.bare if time else 0)
-        axis = joint.axis(self.quantity, self.axis) if self.quantity else self.axis
-        return line_chart(lines, f"{self.title} of {joint.name}", time, axis, motion=motion, height=height)
-
 
 def stacks(
     t: Values, rows: Sequence[JointRow], joints: Sequence[NamedJoint], motion: str = ""
@@ -95,9 +79,16 @@ def stacks(
     """
     panels = []
     for k, joint in enumerate(joints):
-        # one time axis per column: its charts are read together
-        charts = [row.chart(t, joint, k, motion=motion) for row in rows[:-1]]
-        charts.append(rows[-1].chart(t, joint, k, "t [s]", motion))
+        charts = []
+        for row in rows:
+            lines = [Line(label, t, values[:, k], style) for label, values, style in row.columns]
+            # one time axis per column; the plot areas of all its charts have the same height
+            time, height = "", row.height
+            if row is rows[-1]:
+                time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare
+            axis = joint.axis(row.quantity, row.axis) if row.quantity else row.axis
+            title = f"{row.title} of {joint.name}"
+            charts.append(line_chart(lines, title, time, axis, motion=motion, height=height))
         panels.append(Panel(joint.name, tuple(charts)))
     return panels
 

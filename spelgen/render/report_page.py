@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from jinja2 import TemplateError
 
-from spelgen.arm.configured_arm import Arm
-from spelgen.emission.specify import arm_of_spec
 from spelgen.emission.text import description
-from spelgen.errors import RunError, SpelgenError, in_one_line
+from spelgen.errors import RunError, in_one_line
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures, joined, result_tables
 from spelgen.evaluation.traces import Traces
-from spelgen.evaluation.verdict import Limits, Verdict
 from spelgen.files import write_json, write_text
-from spelgen.fitting.posterior import Posterior, posterior_of
-from spelgen.fitting.run_folder import RunFolder, fitted_model
-from spelgen.fitting.run_record import Content, Record
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import MODEL, UNITS, listed, named_joints
 from spelgen.render import run_facts
@@ -29,59 +23,13 @@ from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
 from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.plots import growth_panels
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
+from spelgen.render.run_facts import Run, open_run
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-from spelgen.spec import ModelSpec
 from spelgen.structure.structure import derive
 from spelgen.templates import render_page
 
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-
 SCHEMA = 1
 """Version of the JSON form of a report."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """The content of a run folder; None for files that it does not have.
-
-    config: the record of the fit. baselines: content of least_squares.json, {} without one. arm: None also if its URDF
-    cannot be read: the page is written without it.
-    """
-
-    folder: RunFolder
-    spec: ModelSpec
-    config: Record | None
-    results: Results | None
-    baselines: Content
-    arm: Arm | None
-
-    @property
-    def limits(self) -> Limits:
-        """Position limits of the joints [rad, m]; None for a joint without limits."""
-        if self.arm is None:
-            return [None] * len(self.spec.joints)
-        return [joint.limits for joint in self.arm.chain.coordinates]
-
-    @property
-    def verdict(self) -> Verdict | None:
-        """Assessment of the model; None before its evaluation."""
-        return None if self.results is None else self.results.assessment
-
-
-def open_run(path: Path | str) -> Run:
-    """Return the content of a run folder. Raises RunError or ModuleError."""
-    folder = RunFolder(path)
-    spec, arm, results = folder.read_spec(), None, None
-    if folder.evaluation.is_file():
-        results = Results.from_dict(folder.read_json(folder.evaluation))
-    if folder.urdf.exists():
-        # a page without the picture of the arm is better than none: the results do not depend on the URDF
-        with suppress(SpelgenError):
-            arm = arm_of_spec(spec, folder.urdf)
-    record = folder.read_record() if folder.config.is_file() else None
-    return Run(folder, spec, record, results, folder.read_baselines(), arm)
 
 
 def write_report(
@@ -108,33 +56,17 @@ def write_report(
 def report_data(folder: Path | str) -> Content:
     """Return the data of the page for programs: assessment, evaluation, baselines and parameters."""
     run = open_run(folder)
-    model = _trained(run)
-    posterior = _posterior(run, model)
+    tables = parameter_tables(run.model, run.arm, run.baselines, run.posterior)
+    bodies = body_parameters(run.model).tolist() if isinstance(run.model, RigidBodyDynamics) else None
     return {
         "schema": SCHEMA,
         "verdict": None if run.verdict is None else asdict(run.verdict),
-        "bodies": body_parameters(model).tolist() if isinstance(model, RigidBodyDynamics) else None,
-        "tables": list(map(asdict, parameter_tables(model, run.arm, run.baselines, posterior))),
-        "posterior": None if posterior is None else posterior.to_dict(),
+        "bodies": bodies,
+        "tables": list(map(asdict, tables)),
+        "posterior": None if run.posterior is None else run.posterior.to_dict(),
         "evaluation": None if run.results is None else run.folder.read_json(run.folder.evaluation),
         "least_squares": run.baselines or None,
     }
-
-
-def _trained(run: Run) -> ArmModel | None:
-    """Return the trained model; None of a run without weights."""
-    return fitted_model(run.folder).requires_grad_(False).eval() if run.folder.weights.is_file() else None
-
-
-def _posterior(run: Run, model: ArmModel | None) -> Posterior | None:
-    """Return the posterior of a trained model; None if its checkpoint has none."""
-    if model is None or run.config is None or not run.folder.checkpoint.is_file():
-        return None
-    content = run.folder.load_checkpoint().posterior
-    if content is None:
-        return None
-    # the delay is a parameter of the posterior: it shifts the torques of the fit
-    return posterior_of(model, content, run.config.preprocessing.torque_delay or 0.0, run.folder.checkpoint)
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
@@ -152,8 +84,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
-    spec, record, metrics = run.spec, run.config, run.folder.read_metrics()
-    model = _trained(run)
+    spec, record = run.spec, run.config
     # the page of a run that is not evaluated has the same sections, which state that they are empty
     traces, tables = Traces({}), []
     if run.results is not None:
@@ -165,10 +96,10 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         sections["arm"] = arm_section(run.arm.chain, urdf, evaluated_motions(traces))
         sections["cells"] = matrix(run.arm.chain, derive(run.arm.chain, spec.options.assume))
     if record is not None:
-        sections["training"] = run_facts.training_facts(record, metrics, run.baselines, model)
+        sections["training"] = run_facts.training_facts(run, record)
         sections["settings"] = run_facts.settings(record)
-    if metrics:
-        sections["losses"] = loss_chart(metrics, run_facts.best_epoch(metrics))
+    if run.metrics:
+        sections["losses"] = loss_chart(run.metrics, run_facts.best_epoch(run.metrics))
     joints = named_joints(spec.joint_names, spec.joint_types)
     return render_page(
         "report.html.jinja",
@@ -176,17 +107,17 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         spec=spec,
         about=description(spec),
         units=UNITS,
-        numbers=run_facts.head_numbers(model, record, metrics, run.results),
+        numbers=run_facts.head_numbers(run),
         verdict=run.verdict,
         outliers=None if run.results is None else run_facts.outlier_note(run.results),
         config=record,
         evaluation=run.results,
         tables=tables,
         coverage=coverage_panels(traces, run.baselines, joints, run.limits),
-        trained=model is not None,
+        trained=run.model is not None,
         under_servos=record is not None and record.mapping.input == "position",
         summary=None if record is None else servo_summary(record.servo),
-        parameters=parameter_tables(model, run.arm, run.baselines, _posterior(run, model)),
+        parameters=parameter_tables(run.model, run.arm, run.baselines, run.posterior),
         commands=run_facts.commands(run.folder, spec, run.config),
     )
 

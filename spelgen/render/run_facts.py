@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.parameters import used_parameter_count
-from spelgen.errors import shortened
+from spelgen.emission.specify import arm_of_spec
+from spelgen.errors import SpelgenError, shortened
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
-from spelgen.fitting.run_folder import RunFolder
+from spelgen.evaluation.verdict import Limits, Verdict
+from spelgen.fitting.posterior import Posterior, posterior_of
+from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.report import terms_in_use
@@ -29,29 +35,83 @@ if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
 
-def head_numbers(
-    model: ArmModel | None, record: Record | None, metrics: Sequence[Content], results: Results | None
-) -> list[tuple[str, str]]:
-    """Return the most important figures with their labels.
+@dataclass(frozen=True)
+class Run:
+    """The content of a run folder; None for files that it does not have.
 
-    Args:
-        model: The trained model; None before it is trained.
-        record: Record of the fit; None before the fit.
-        metrics: Records of the epochs; empty for a fit without epochs.
-        results: Evaluation of the model; None before it is evaluated.
+    config: the record of the fit. baselines: content of least_squares.json, {} without one. arm: None also if its URDF
+    cannot be read: the page is written without it.
     """
+
+    folder: RunFolder
+    spec: ModelSpec
+    config: Record | None
+    results: Results | None
+    baselines: Content
+    arm: Arm | None
+
+    @property
+    def limits(self) -> Limits:
+        """Position limits of the joints [rad, m]; None for a joint without limits."""
+        if self.arm is None:
+            return [None] * len(self.spec.joints)
+        return [joint.limits for joint in self.arm.chain.coordinates]
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Assessment of the model; None before its evaluation."""
+        return None if self.results is None else self.results.assessment
+
+    @cached_property
+    def metrics(self) -> list[Content]:
+        """Records of the epochs; empty for a fit without epochs."""
+        return self.folder.read_metrics()
+
+    @cached_property
+    def model(self) -> ArmModel | None:
+        """The trained model; None of a run without weights."""
+        if not self.folder.weights.is_file():
+            return None
+        return fitted_model(self.folder).requires_grad_(False).eval()
+
+    @cached_property
+    def posterior(self) -> Posterior | None:
+        """Posterior of the trained model; None if its checkpoint has none."""
+        if self.model is None or self.config is None or not self.folder.checkpoint.is_file():
+            return None
+        content = self.folder.load_checkpoint().posterior
+        # the delay is a parameter of the posterior: it shifts the torques of the fit
+        delay = self.config.preprocessing.torque_delay or 0.0
+        return None if content is None else posterior_of(self.model, content, delay, self.folder.checkpoint)
+
+
+def open_run(path: Path | str) -> Run:
+    """Return the content of a run folder. Raises RunError or ModuleError."""
+    folder = RunFolder(path)
+    spec, arm, results = folder.read_spec(), None, None
+    if folder.evaluation.is_file():
+        results = Results.from_dict(folder.read_json(folder.evaluation))
+    if folder.urdf.exists():
+        # a page without the picture of the arm is better than none: the results do not depend on the URDF
+        with suppress(SpelgenError):
+            arm = arm_of_spec(spec, folder.urdf)
+    record = folder.read_record() if folder.config.is_file() else None
+    return Run(folder, spec, record, results, folder.read_baselines(), arm)
+
+
+def head_numbers(run: Run) -> list[tuple[str, str]]:
+    """Return the most important figures with their labels."""
     numbers = []
-    if results is not None:
-        numbers = [(figure.text(), figure.label) for figure in figures(results)]
-    summary = None if record is None else servo_summary(record.servo)
+    if run.results is not None:
+        numbers = [(figure.text(), figure.label) for figure in figures(run.results)]
+    summary = None if run.config is None else servo_summary(run.config.servo)
     if summary is not None:
         numbers.append(summary.headline)
     # parameters that the fit switched off are not counted: the number states the size of the model in use
-    elif model is not None:
-        numbers.append((f"{used_parameter_count(model):,}", "trained parameters"))
-    if metrics:
-        label = f"of training, {metrics[-1]['step']:,} steps"
-        numbers.append((_duration(metrics[-1]["seconds"]), label))
+    elif run.model is not None:
+        numbers.append((f"{used_parameter_count(run.model):,}", "trained parameters"))
+    for last in run.metrics[-1:]:
+        numbers.append((_duration(last["seconds"]), f"of training, {last['step']:,} steps"))
     return numbers
 
 
@@ -75,9 +135,7 @@ def best_epoch(metrics: Sequence[Content]) -> int:
     return next((epoch["epoch"] for epoch in metrics if epoch["validation"] == best), 0)
 
 
-def training_facts(
-    record: Record, metrics: Sequence[Content], baselines: Content, model: ArmModel | None
-) -> dict[str, str]:
+def training_facts(run: Run, record: Record) -> dict[str, str]:
     """Return the logs, the preprocessing and the length of a fit as text, by label."""
     preprocessing = record.preprocessing
     facts = {
@@ -88,14 +146,14 @@ def training_facts(
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
     # least squares needs accelerations, and so fewer samples than the model
-    if "samples" in baselines:
-        count = f"{baselines['samples']:,}"
+    if "samples" in run.baselines:
+        count = f"{run.baselines['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
-    if isinstance(model, ResidualDynamics):
-        facts["residual terms"] = "; ".join(terms_in_use(model)) or "none selected"
+    if isinstance(run.model, ResidualDynamics):
+        facts["residual terms"] = "; ".join(terms_in_use(run.model)) or "none selected"
     # fits to torques have no epochs
-    if metrics:
-        last, best = metrics[-1], best_epoch(metrics)
+    if run.metrics:
+        last, best = run.metrics[-1], best_epoch(run.metrics)
         origin = f"epoch {best}" if best else "the start: no epoch was better"
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"

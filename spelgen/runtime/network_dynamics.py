@@ -204,7 +204,7 @@ class DenseFriction(NetworkFriction):
         # from the entries of a lower triangle, rows in sequence, to the matrix: (rows, rows, entries)
         spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
-        # of L, relative to the root of typical friction per typical speed
+        # initial diagonal of L, relative to the root of typical friction per typical speed
         self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
 
     def prepare(self) -> Layers:

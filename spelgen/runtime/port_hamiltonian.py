@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -51,7 +52,7 @@ class PortHamiltonian(nn.Module):
         return tuple(joint.joint_type for joint in self.joints)
 
     @property
-    def input_quantity(self) -> str:
+    def input_quantity(self) -> Literal["torque", "position"]:
         """``torque``, or ``position`` for inputs that are commands of position servos."""
         return "torque"
 

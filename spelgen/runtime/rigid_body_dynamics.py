@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -83,7 +83,7 @@ class RigidBodyDynamics(PortHamiltonian):
         self.register_buffer("loads", None if motors is None else torch.linalg.inv(motors))
 
     @property
-    def input_quantity(self) -> str:
+    def input_quantity(self) -> Literal["torque", "position"]:
         """``torque``, or ``position`` for inputs that are commands of position servos."""
         return "torque" if self.servo is None else "position"
 

@@ -66,7 +66,8 @@ class GaussianPrior(Group):
         shared_friction: Common factor of all friction of all joints.
         friction_compensation: Friction compensation of a drive, divided by typical friction per typical speed, if the
             logs show any.
-        degrees_of_freedom: Weight of the initial standard deviations, as a number of parameters.
+        degrees_of_freedom: Weight of the initial standard deviations, as a number of parameters; and degrees of freedom
+            of the distribution of each body (Student's t).
     """
 
     bodies: Positive = 0.75

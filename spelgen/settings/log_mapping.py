@@ -28,21 +28,8 @@ COUNTS = ("counts", "counts/s")
 # -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
 NORMALISED = "normalised"
 ONLY = {  # units that a joint of this type cannot have
-    "revolute": ("m", "mm", "m/s", "mm/s", "N"),
-    "prismatic": (
-        "normalised",
-        "rad",
-        "deg",
-        "turns",
-        "mrad",
-        "rad/s",
-        "deg/s",
-        "turns/s",
-        "mrad/s",
-        "rpm",
-        "Nm",
-        "mNm",
-    ),
+    "revolute": {"m", "mm", "m/s", "mm/s", "N"},
+    "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", *LENGTHS, *SPEEDS} - {"mm", "mm/s"},
 }
 
 LONGEST_DELAY = 1.0  # s
@@ -291,7 +278,7 @@ class LogMapping(Group):
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
-            # a stated period may be that of a register, which is larger than a turn
+            # a stated period may be the range of a register, which is larger than a turn
             unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
             turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
             period = logged.period.model_copy(update=turns)
@@ -366,6 +353,6 @@ class LogMapping(Group):
             in_metres = logged.counts_per_metre if kind != "revolute" else None
             if not (in_turns or in_metres):
                 return f"{'counts_per_metre' if kind == 'prismatic' else 'counts_per_turn'} beside it"
-        if unit in ONLY.get(kind or "", ()):
+        if unit in ONLY.get(kind or "", set()):
             return f"one of a {kind} joint"
         return None

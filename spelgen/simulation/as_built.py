@@ -50,7 +50,7 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
 
 
 def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
-    """Return the arm of a URDF after writing its settings, with the angles rounded as those of ``arm``."""
+    """Return the arm of a URDF after writing its settings, with the angles rounded as for ``arm``."""
     write_text(path.with_suffix(".yaml"), yaml.safe_dump(settings, sort_keys=False, allow_unicode=True))
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
 

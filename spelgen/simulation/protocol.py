@@ -68,16 +68,12 @@ def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarra
     positions = settings.simulation.positions or {}
     ranges, errors = [], []
     for joint in arm.coordinates:
-        if joint.name in positions:
-            ranges.append(positions[joint.name])
-        elif joint.continuous:
-            ranges.append((-np.pi, np.pi))
-        elif joint.lower is not None and joint.upper is not None and joint.lower < joint.upper:
-            ranges.append((joint.lower, joint.upper))
-        else:
-            # exporters write 0 to 0 for an unknown range
+        limits = (-np.pi, np.pi) if joint.continuous else joint.limits
+        # exporters write 0 to 0 for an unknown range
+        if joint.name not in positions and (limits is None or limits[0] >= limits[1]):
             message = "the joint has no range: give its lowest and highest initial position"
             errors.append(SettingsError(message, element=f"simulation.positions.{joint.name}"))
+        ranges.append(positions.get(joint.name, limits))
     collect(errors)
     lowest, highest = np.array(ranges, dtype=float).T
     return lowest, highest

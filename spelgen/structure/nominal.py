@@ -245,7 +245,7 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # of the largest eigenvalue: an inconsistent body becomes slender, and a body is one below the square of it
+    # relative to the largest eigenvalue: a smallest eigenvalue below the square of it is raised to it (slender body)
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)

@@ -17,6 +17,9 @@ from spelgen.arm.arm import Body, Chain
 Element = Any
 """An element of the ring: an object with +, - and *, with other elements and with integers."""
 
+Number = Callable[[Fraction], Element]
+"""Conversion of the exact constants of an arm to elements of the ring."""
+
 Vector = tuple[Element, ...]
 Terms = tuple[tuple[int, Element], ...]
 
@@ -56,7 +59,6 @@ class _Pose(NamedTuple):
 
 _Wrench = tuple[Vector, Vector]
 """A force, and its moment about the origin of the frame."""
-_UNROTATED = (((0, 1),), ((1, 1),), ((2, 1),))
 
 
 def triangle(n: int) -> list[tuple[int, int]]:
@@ -65,10 +67,7 @@ def triangle(n: int) -> list[tuple[int, int]]:
 
 
 def energies(
-    arm: Chain,
-    positions: Sequence[Position],
-    inertias: Sequence[Sequence[Element]],
-    number: Callable[[Fraction], Element],
+    arm: Chain, positions: Sequence[Position], inertias: Sequence[Sequence[Element]], number: Number
 ) -> Energies:
     """Return the mass matrix and the potential energy of ``arm``.
 
@@ -112,7 +111,7 @@ def energies(
 
 
 def coefficients(
-    arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Callable[[Fraction], Element]
+    arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Number
 ) -> list[Element]:
     """Return the coefficients of the inertial parameters in the entries of M, row after row, and then in V.
 
@@ -123,7 +122,7 @@ def coefficients(
     return [*result.mass.values(), result.potential]
 
 
-def _motions(arm: Chain, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[_Pose]:
+def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
     """Return the motion of the joint of each body, about or along z, at these positions of the coordinates."""
     bases = base_denominators(arm)
     motions = []
@@ -135,7 +134,7 @@ def _motions(arm: Chain, positions: Sequence[Position], number: Callable[[Fracti
                 slide = number(body.multiplier) * slide
             if body.offset:
                 slide = slide + number(Fraction(str(body.offset)))
-            motions.append(_Pose(_UNROTATED, ((2, slide),)))
+            motions.append(_Pose((((0, 1),), ((1, 1),), ((2, 1),)), ((2, slide),)))
         else:
             factor = int(body.multiplier * bases[body.coordinate])
             c, s = _multiple_angle(position.cos, position.sin, factor)
@@ -267,7 +266,7 @@ def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
     return _Inertia(inertia.mass, tuple(moment), tuple(tensor.values()))
 
 
-def _terms(row: Sequence[Fraction], number: Callable[[Fraction], Element]) -> Terms:
+def _terms(row: Sequence[Fraction], number: Number) -> Terms:
     # Products with the integers 1 and -1 cost nothing, unlike those with elements of the ring.
     return tuple((i, int(x) if abs(x) == 1 else number(x)) for i, x in enumerate(row) if x)
 

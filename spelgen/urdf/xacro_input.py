@@ -18,7 +18,7 @@ from typing import NamedTuple
 from spelgen.errors import UrdfError
 
 MAX_SECONDS = 8
-MEMORY = 2**30  # bytes of the process
+MEMORY = 2**30  # memory of the process [bytes]
 MISSING = 3  # exit code of the process where the package xacro is not installed
 _BY_HAND = "expand it where that works: xacro FILE name:=value ... > ROBOT.urdf"
 

@@ -48,8 +48,8 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
         armature = torch.maximum(kp * inertia - load.inertia.mean(dim=(0, 1)), smallest**3 * kp)
         model.raw_armature.copy_((armature / model.nominal_armature).log())
         friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=smallest).log())
-        # such logs determine only the sum of viscous friction and kd: it is fitted as kd. Friction terms are logarithms
-        # relative to a nominal value: these are negligible, and Stribeck friction is small
+        # such logs determine only the sum of viscous friction and kd: it is fitted as kd. Parameters are logarithms
+        # relative to nominal friction: -6 is negligible, -2 is small
         friction.raw_viscous.fill_(-6.0)
         friction.raw_saturation.fill_(-6.0)
         friction.raw_stribeck.fill_(-2.0)

@@ -94,11 +94,12 @@ class ServoRollouts:
 
     def _rollout(self, joints: Tensor, bodies: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
         """Return q and qd (P, W, K, n) for parameters (P, p, n), (P, r) under commands (P, W, K-1, S, n)."""
-        named = self.parameters.named(joints)
-        tensors = {name: tensor.detach() for name, tensor in named.items()}
+        tensors = {name: tensor.detach() for name, tensor in self.parameters.named(joints).items()}
         # inference mode saves a tenth of the time of these many small operations
         with torch.inference_mode():
-            drives, armature = evaluate_with(self.model, tensors, _drives)
+            drives, armature = evaluate_with(
+                self.model, tensors, lambda model: (servo_drives(model), model.armature)
+            )
             changes = torch.stack([self.parameters.inertial(x) - self.inertial for x in bodies])
             added = torch.einsum("wkni,pi->pwkn", self.load.regressor, changes)
             return self._integrate(drives, armature, added, commands)
@@ -122,7 +123,3 @@ class ServoRollouts:
             positions.append(state.q)
             velocities.append(state.qd)
         return torch.stack(positions, dim=2), torch.stack(velocities, dim=2)
-
-
-def _drives(model: ArmModel) -> tuple[ServoDrives, Tensor]:
-    return servo_drives(model), model.armature

@@ -119,14 +119,14 @@ def servo_windows(
         rows += [(segment, slice(start, start + length)) for start in starts]
     rows = rows[:: -(-len(rows) // count)]  # evenly spread: the first motions may not move all joints
     smooth_velocities = {id(segment): velocities(segment) for segment in segments if len(segment) >= length}
-    q, qd, dt, steps = [], [], [], 0
-    for log, samples in rows:
-        q.append(log.q[samples])
-        qd.append(smooth_velocities[id(log)][samples])
-        dt.append(np.diff(log.t[samples]))
-        steps = max(steps, steps_between(log))
-    tensors = torch.from_numpy(np.stack(q)), torch.from_numpy(np.stack(qd)), torch.from_numpy(np.stack(dt))
-    return ServoWindows(tuple(rows), *tensors, burn_in, steps)
+    columns = (
+        [log.q[samples] for log, samples in rows],
+        [smooth_velocities[id(log)][samples] for log, samples in rows],
+        [np.diff(log.t[samples]) for log, samples in rows],
+    )
+    q, qd, dt = (torch.from_numpy(np.stack(column)) for column in columns)
+    # enough for the log with the longest interval between samples
+    return ServoWindows(tuple(rows), q, qd, dt, burn_in, max(steps_between(log) for log, _ in rows))
 
 
 class BodyLoad(NamedTuple):

@@ -9,21 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.levenberg_marquardt import Termination
-from spelgen.fitting.torque.covariance import parameter_covariance
+from spelgen.fitting.torque.covariance import held_out_nmse, parameter_covariance
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import limit_friction
 from spelgen.fitting.torque.problem import (
     TorqueEstimate,
     TorqueProblem,
-    held_out_nmse,
     refine,
     with_correlation_time,
 )
@@ -40,26 +37,14 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 
-class FitStage(NamedTuple):
-    """Stage of a fit, with the state at its end: accepted steps since the first stage, cost, reason of termination.
-
-    Costs of two stages are comparable only if they have the same samples, noise and prior.
-    """
-
-    name: str
-    steps: int
-    cost: float
-    termination: Termination
-
-
 @dataclass(frozen=True, eq=False)
 class TorqueSolution:
     """Result of a fit.
 
     rms_residual: (n,) root mean square torque residual [Nm, N]. steps, cost: of the solver, at the end. prior: its
-    estimated standard deviations. covariance, torque_std: see `ParameterCovariance`. compensated: (n,) joints whose
-    drives compensate friction. correlation_time: (n,) of the torque errors [s]. held_out_nmse: (n,) mean squared error
-    of held-out segments, divided by the variance of the torque. selected_terms: residual terms. stages: in order.
+    estimated standard deviations. covariance: (K, K) of x. compensated: (n,) joints whose drives compensate friction.
+    correlation_time: (n,) of the torque errors [s]. held_out_nmse: (n,) mean squared error of held-out
+    segments, divided by the variance of the torque; torque_std: (n,) its root [Nm, N]. selected_terms: residual terms.
     """
 
     rms_residual: np.ndarray
@@ -72,7 +57,6 @@ class TorqueSolution:
     correlation_time: np.ndarray
     held_out_nmse: np.ndarray
     selected_terms: tuple[SelectedTerm, ...]
-    stages: tuple[FitStage, ...]
 
 
 def fit_torque(
@@ -95,57 +79,50 @@ def fit_torque(
     samples = samples.subsampled(_max_samples(model))
     subset = samples.subsampled(TUNING.initial_samples)
     if adapt is None:
+        # not of an adapted model: its friction was fitted before
         limit_friction(model, subset.columns)
     if prior is None:
         prior = TUNING.priors[adapt] if adapt else GaussianPrior()
     problem = TorqueProblem.of(TorqueJacobian(model, subset), prior, adapt)
-    estimate, selected, stages = _run_stages(problem, samples)
+    estimate, selected = _run_stages(problem, samples)
     state, jacobian = estimate.state, estimate.problem.jacobian
     jacobian.rigid.write(state.x)
-    uncertainty = parameter_covariance(estimate)
-    rms = (state.residual / samples.count).sqrt() / jacobian.logged_scale(state.x)
+    scale, nmse = jacobian.logged_scale(state.x), held_out_nmse(estimate, samples)
+    rms = (state.residual / samples.count).sqrt() / scale
     return TorqueSolution(
         rms_residual=rms.numpy(),
         steps=state.steps,
         cost=state.cost,
         prior=estimate.problem.prior.widths,
-        covariance=uncertainty.covariance,
-        torque_std=uncertainty.torque_std,
+        covariance=parameter_covariance(estimate),
+        torque_std=nmse.sqrt() * estimate.problem.noise_estimator.torque_std / scale,
         compensated=estimate.problem.compensated.numpy(),
         correlation_time=estimate.problem.correlation_time.numpy(),
-        held_out_nmse=held_out_nmse(estimate, samples).numpy(),
+        held_out_nmse=nmse.numpy(),
         selected_terms=tuple(selected),
-        stages=tuple(stages),
     )
 
 
 def _run_stages(
     problem: TorqueProblem, samples: TorqueSamples
-) -> tuple[TorqueEstimate, list[SelectedTerm], list[FitStage]]:
-    """Return the estimate after all stages, the selected residual terms, and the record of the stages."""
-    model, stages = problem.jacobian.model, []
-    selected: list[SelectedTerm] = []
-
-    def done(name: str, estimate: TorqueEstimate) -> None:
-        stages.append(FitStage(name, estimate.state.steps, estimate.state.cost, estimate.termination))
-
-    choose_state = problem.adapt is None and model.elements > 0
-    if choose_state:
+) -> tuple[TorqueEstimate, Sequence[SelectedTerm]]:
+    """Return the estimate after all stages, and the selected residual terms."""
+    if problem.adapt is not None:
+        return refine(initial_fit(problem), samples), ()
+    model = problem.jacobian.model
+    if model.elements:
+        # friction without state first: bristles would delay reversals of bodies that are far off
         model.friction.memoryless.fill_(1.0)
     estimate = initial_fit(problem)
-    done("initial fit", estimate)
-    if choose_state:
+    if model.elements:
         estimate = choose_friction_state(estimate)
-        done("friction state", estimate)
-    if problem.adapt is None:
-        estimate = with_correlation_time(choose_friction_effects(estimate), samples)
-        done("friction effects", estimate)
-        if residual_terms(model) is not None:
-            estimate, selected = fit_residual_terms(estimate, samples.subsampled(TUNING.residual_samples))
-            done("residual terms", estimate)
-    estimate = refine(estimate, samples)
-    done("final fit", estimate)
-    return estimate, selected, stages
+    # the errors of a wrong friction model last longer than those of the chosen one
+    estimate = with_correlation_time(choose_friction_effects(estimate), samples)
+    selected: Sequence[SelectedTerm] = ()
+    if residual_terms(model) is not None:
+        estimate, selected = fit_residual_terms(estimate, samples.subsampled(TUNING.residual_samples))
+    # residual terms were selected on fewer samples
+    return refine(estimate, samples), selected
 
 
 def _max_samples(model: ArmModel) -> int:

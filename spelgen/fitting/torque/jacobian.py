@@ -78,6 +78,7 @@ class TorqueJacobian:
         self._affects = self._motors != 0  # (n, n): whether a drive affects a joint's torque
         self._affected = self._affected_joints()
         self._colours = _colour(self._affects.double().mT @ self._affects.double() > 0)
+        # regressors do not depend on x: once per object, in blocks because of the copies of `_compressed_jacobian`
         self._blocks = [self._with_regressors(block) for block in samples.blocks(TUNING.block)]
 
     @cached_property
@@ -94,6 +95,7 @@ class TorqueJacobian:
         parameters = self.rigid.unflatten(x)
         with torch.no_grad():
             blocks = [self._torque_residual(parameters, block)[0] for block in self._blocks]
+        # concatenated: eliminated terms are linear maps of all samples of a joint
         residual = torch.cat(blocks) * self.logged_scale(x)
         squared_residual = residual.square().sum(dim=0)
         for joint, terms in self.terms.items():
@@ -121,6 +123,7 @@ class TorqueJacobian:
         if self.terms:
             rows = self._projected(rows)
         curvature, descent = linearization.normal_equations(rows, noise, len(x))
+        # the products are formed in theta and transformed once, (K, K) instead of (T, K)
         change = self.theta_jacobian(x)
         return change.mT @ curvature @ change, change.mT @ descent
 
@@ -189,6 +192,7 @@ class TorqueJacobian:
         """
         change = self.theta_jacobian(x)
         covariance = change @ covariance @ change.mT
+        # in theta the torque is linear, so that the projection also holds for large torques
         rows = concatenate_blocks(self.joint_rows(x), len(noise))
         gains = []
         for joint, columns, _, _ in rows:
@@ -205,6 +209,7 @@ class TorqueJacobian:
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
         for name in self.rigid.names(*LOGARITHMIC_GROUPS):
+            # log(c + c step) = log c + log1p(step): the same to first order, and straight in c
             parameters[name] = (
                 parameters[name]
                 - change[name]
@@ -220,6 +225,7 @@ class TorqueJacobian:
         model, q, qd, qdd = self.model, block.q, block.qd, block.qdd
         zero = torch.zeros_like(q)
         with torch.no_grad():
+            # the friction model has the load of gravity only, not of acceleration
             gravity_regressor = regressor_of(model.chain, q, zero, zero)
             return _RegressorBlock(
                 samples=block,
@@ -305,8 +311,5 @@ def _colour(coupled: torch.Tensor) -> list[int]:
     colours: list[int] = []
     for row in coupled.tolist():
         used = {colour for colour, shared in zip(colours, row, strict=False) if shared}
-        colour = 0
-        while colour in used:
-            colour += 1
-        colours.append(colour)
+        colours.append(min(set(range(len(row))) - used))
     return colours

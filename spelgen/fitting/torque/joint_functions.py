@@ -7,7 +7,7 @@ regression (Frisch and Waugh, Econometrica 1:387, 1933).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -75,8 +75,10 @@ class JointFunction:
     def write(self, terms: ResidualTerms, weights: torch.Tensor) -> None:
         """Set the model's parameter to weights (P,)."""
         count = self.trends.shape[1]
+        # a trend has no parameter of its own in the model, only a prior of its own in the fit
         entries = self.trends @ weights[:count] + weights[count:]
         if self.friction is not None:
+            # inverse of the model's tanh, which bounds the factor
             entries = LARGEST * (entries.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT) / LARGEST).atanh()
         with torch.no_grad():
             terms.get_parameter(self.parameter)[self.joint] = entries / self.scale
@@ -87,11 +89,13 @@ class JointFunction:
         if self.friction is None:
             return features @ weights
         friction = self.friction[rows]
+        # columns are multiplied by friction, whose sign changes: zero divided by zero is no factor
         log_factor = (features @ weights.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT)) / friction
         return friction * log_factor.nan_to_num().expm1()
 
     def target(self, torque_residual: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Return the torque (T,) of the term that explains a residual (T, n) best, weighted by 1 / noise^2, (n,)."""
+        # least squares over the joints: coupled drives put one friction into several torques
         weight = self.direction / noise.square()
         return (torque_residual @ weight) / (self.direction @ weight)
 
@@ -100,6 +104,7 @@ class JointFunction:
     ) -> BayesianRidge:
         """Return the fit to a target (T,) on the samples of these rows: samples of one visit count as one error."""
         samples = append_target(self.features[rows], target[rows])
+        # errors of one visit of a position are equal for a function of position, however long they last
         length = max(correlation_length, self.visit_length)
         return bayesian_ridge(samples.mT @ samples, len(samples), self.groups, length)
 
@@ -117,14 +122,6 @@ class ProjectedTerms(NamedTuple):
             joint, count = candidate.joint, candidate.columns.shape[1]
             candidate.write(model.residuals, weights[joint][:count])
             weights[joint] = weights[joint][count:]
-
-
-def clear_terms(model: ArmModel, joints: Iterable[int]) -> None:
-    """Set all residual terms of single joints to zero for these joints."""
-    terms = model.residuals
-    with torch.no_grad():
-        for weights in (terms.raw_torque_splines, terms.raw_friction_splines, terms.raw_torque_ripple):
-            weights[list(joints)] = 0.0
 
 
 def refit_terms(
@@ -151,6 +148,7 @@ def refit_terms(
     torques = []
     for candidate in joint_functions(model, samples, projection, selected):
         current = (candidate.features @ candidate.read(model.residuals)).unsqueeze(-1) * candidate.direction
+        # one after the other, each with the latest values of the others (backfitting)
         target = candidate.target(residual + current, noise)
         fit = candidate.fit(target, float(correlation_length[candidate.joint]))
         weights = fit.coef
@@ -163,6 +161,7 @@ def refit_terms(
                 columns = torch.cat([terms[joint].features, columns], dim=1)
                 penalty = torch.cat([terms[joint].penalty, penalty])
             terms[joint] = LinearTerms(columns, penalty)
+            # its weights are eliminated: a copy in the model would count twice
             weights = torch.zeros_like(weights)
         candidate.write(model.residuals, weights)
     return ProjectedTerms(terms, tuple(torques))
@@ -184,6 +183,7 @@ def joint_functions(
     with torch.no_grad():
         splines, ripple = terms.splines(samples.q), terms.revolute * terms.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), terms.unit.flatten()
+    # number of visits: path length in units of two splines
     visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
     one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
     line = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1)

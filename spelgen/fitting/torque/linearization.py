@@ -10,8 +10,6 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 
-from spelgen.fitting.torque.tuning import SELECTION, TUNING
-
 
 class JointRows(NamedTuple):
     """Jacobian rows of one joint's torque: residual(theta + s) = residual - jacobian @ s[columns].
@@ -43,6 +41,7 @@ class LinearTerms:
     @cached_property
     def ridge(self) -> torch.Tensor:
         """Ridge estimator (P, T): weights per torque."""
+        # small (P, P): one factorization serves all columns of the Jacobian
         gram = self.features.mT @ self.features + self.penalty.diag()
         ridge: torch.Tensor = torch.linalg.solve(gram, self.features.mT)
         return ridge
@@ -87,7 +86,8 @@ class RigidProjection(NamedTuple):
         for joint, (jacobian, gain) in enumerate(zip(self.jacobian, self.posterior_gain, strict=True)):
             rows = jacobian.unflatten(0, (-1, size))
             values, vectors = torch.linalg.eigh(torch.eye(size).double() - rows @ gain @ rows.mT)
-            scale = values.clamp(min=TUNING.min_error_fraction).rsqrt().unsqueeze(-1)
+            # at least one sample's error remains of a segment that determines many parameters
+            scale = values.clamp(min=1 / size).rsqrt().unsqueeze(-1)
             errors[..., joint] = (vectors @ (scale * (vectors.mT @ errors[..., joint : joint + 1])))[..., 0]
         return errors
 
@@ -137,6 +137,7 @@ def least_squares_residual(
     """
     curvature, descent = normal_equations(rows, noise, len(free))
     inverse = torch.zeros_like(curvature)
+    # pseudo-inverse: bodies have directions that no torque depends on, and there is no prior here
     inverse[free[:, None] & free] = _pseudo_inverse(curvature[free][:, free]).flatten()
     step = inverse @ descent
     squared_residual, gamma = torch.zeros(2, len(noise)).double()
@@ -151,9 +152,8 @@ def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
     length = curvature.diagonal().sqrt()
     scale = torch.where(length > 0, 1 / length, 0.0)
     scale = scale * scale[:, None]
-    inverse: torch.Tensor = torch.linalg.pinv(
-        curvature * scale, rtol=TUNING.min_relative_curvature, hermitian=True
-    )
+    # directions with less curvature than the rounding of products of sums are not determined by the samples
+    inverse: torch.Tensor = torch.linalg.pinv(curvature * scale, rtol=1e-10, hermitian=True)
     return inverse * scale
 
 
@@ -198,9 +198,10 @@ def bayesian_ridge(
     size, variance = member.sum(dim=0), square / count  # variance: 1 / alpha
     feature_square = (member.mT @ gram.diagonal() / count / size).clamp(min=1e-300)
     # initially each group has 10 % of the variance of the target
+    # a start at zero weights would be a fixed point
     lambda_ = 10 * feature_square * size / max(variance, 1e-300)
     n_iter, converged = 0, False
-    while n_iter < SELECTION.max_iter and not converged:
+    while n_iter < 30 and not converged:
         n_iter += 1
         tempered = variance * correlation_length
         penalty = tempered * (member @ lambda_)
@@ -210,7 +211,7 @@ def bayesian_ridge(
         lambda_ = (gamma / (member.mT @ coef.square()).clamp(min=1e-300)).clamp(max=1e14)
         residual_square = square - float(2 * coef @ moment - coef @ gram @ coef)
         previous, variance = variance, max(residual_square, 1e-12 * square) / count
-        converged = abs(variance - previous) < SELECTION.tolerance * previous
+        converged = abs(variance - previous) < 1e-3 * previous  # the noise needs three digits
     return BayesianRidge(coef, penalty, 1 / max(variance, 1e-300), lambda_, gamma, n_iter, converged)
 
 

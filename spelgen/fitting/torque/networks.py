@@ -49,12 +49,14 @@ def fit_networks(
     """
     count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
+    # joints of constant torque would have infinite weight
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def summands() -> Iterator[torch.Tensor]:
         for number, (q, qd, qdd, tau, *_) in enumerate(samples.blocks(BLOCK)):
             error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
             cost = error.mean() if count <= BLOCK else error.sum() / (count * joints)
+            # once, not per block: the loss is a mean over all samples
             if number == 0 and penalty is not None:
                 cost = cost + penalty()
             yield cost
@@ -103,12 +105,14 @@ def select_networks(
         samples: torque residual of the model with its current terms.
         correlation_length: number of samples per independent error.
     """
+    # the time of L-BFGS is proportional to the samples, which are correlated
     step = -(-len(samples.q) // SELECTION.network_samples)
     subset = ResidualSamples(*(column[::step] for column in samples))
     # the target of all residual terms together, single-joint terms included
     with torch.no_grad():
         current = residual_torque(model, *subset[:3])
     subset = subset._replace(torque_residual=subset.torque_residual + current)
+    # the potential first: it needs no accelerations, which are the noisiest column
     terms = model.residuals
     networks = {"residual_potential": list(terms.potential.parameters()) if terms.potential else []}
     networks["residual_mass"] = [terms.raw_constants, *(terms.mass.parameters() if terms.mass else ())]
@@ -151,6 +155,7 @@ def _fit_network(
         if after.sum() >= before.sum():
             break
     network.load_state_dict(initial)
+    # an accepted network is fitted again, to all samples
     if reduction is not None:
         fit(ALL, SELECTION.network_evaluations)
     model.zero_grad(set_to_none=True)

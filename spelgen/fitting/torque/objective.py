@@ -24,6 +24,7 @@ from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
+from spelgen.identification.drive_hints import Coupling
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -50,10 +51,16 @@ class TorqueObjective(Objective):
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
         preprocessing, self._delay = self.request.preprocessing, NO_DELAY
-        if preprocessing.torque_delay is None and isinstance(self.model, RigidBodyDynamics):
-            self._delay = torque_delay(self.model, self.request.logs, preprocessing)
-            preprocessing = replace(preprocessing, torque_delay=self._delay.delay)
-            self.request = replace(self.request, preprocessing=preprocessing)
+        self._coupling_notes: list[Diagnostic] = []
+        if isinstance(self.model, RigidBodyDynamics):
+            late = torque_delay(self.model, self.request.logs, preprocessing)
+            if late.coupling and late.coupling[0].logged_at == "joints" and not self.config.adapt:
+                self._coupling_notes = [couple_motors(self.model, *late.coupling)]
+                late = torque_delay(self.model, self.request.logs, preprocessing)
+            if preprocessing.torque_delay is None:
+                self._delay = late
+                preprocessing = replace(preprocessing, torque_delay=late.delay)
+                self.request = replace(self.request, preprocessing=preprocessing)
         # windows are for validation only: few suffice
         stride = -(-sum(map(len, self.request.logs)) // TUNING.max_windows)
         self.data = prepare_data(self.request, SAMPLES, stride)
@@ -62,7 +69,7 @@ class TorqueObjective(Objective):
     def begin(self) -> list[Diagnostic]:
         """Fit the model. Raises LogError if no log is sampled densely enough for accelerations."""
         model = self.model
-        notes = self._delay.notes
+        notes = [*self._coupling_notes, *self._delay.notes]
         samples = torque_samples(model, self.data)
         if samples is None:
             what = "to adapt to" if self.config.adapt else "to fit torques to"
@@ -114,6 +121,30 @@ def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Pre
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
     drives = Drives(inputs, motors_of(model).numpy())
     return find_torque_delay(logs, model.joint_types, drives, model.chain, preprocessing)
+
+
+def couple_motors(model: ArmModel, coupling: Coupling, remaining: float) -> Diagnostic:
+    """Add a coupling to the motors of a model and its specification, and return the warning about it.
+
+    Without it the friction of a coupled wrist would be attributed to the bodies (TX40: torque nMSE 1.1 instead of
+    0.02).
+
+    Args:
+        model: its motor of `coupling.joint` drives this joint only.
+        coupling: that logs of joint torques show.
+        remaining: squared torque residual of both joints with the coupling, relative to the one without it.
+    """
+    speeds = motors_of(model).clone()
+    speeds[coupling.joint, coupling.moved_by] = coupling.ratio
+    model.motors, model.loads = speeds, torch.linalg.inv(speeds)
+    model.spec = replace(model.spec, motor_speeds=tuple(map(tuple, speeds.tolist())))
+    joint, other = (model.joint_names[k] for k in coupling.pair)
+    message = (
+        f"the motor of {joint} turns with {other}, too, {coupling.ratio:g} times as fast: the squared torque residual "
+        f"of both falls to {remaining:.0%} on samples that were not fitted; the fit has this coupling, add it to the "
+        "settings (`spelgen logs` prints it)"
+    )
+    return Diagnostic("warning", "coupled-motors", "logs", None, message)
 
 
 def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:

@@ -8,7 +8,6 @@ single joint.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -169,8 +168,6 @@ def log_cholesky_parameters(factor: torch.Tensor) -> torch.Tensor:
     return parameters[:, row, column]
 
 
-ESTIMATED_GROUPS = ("armature", "bodies", "offset")
-"""Groups whose standard deviations the fit estimates."""
 SHARED = {
     "armature": "shared_armature",
     "sizes": "shared_sizes",
@@ -182,26 +179,38 @@ SHARED = {
 
 @dataclass(frozen=True, eq=False)
 class ParameterPrior:
-    """Gaussian prior of the parameters x.
+    """Prior of the parameters x: Gaussian, and Student's t for the parameters of each body.
 
-    rigid: names and groups of x. widths: standard deviations per group. hyperprior: their values before the fit. mean:
-    (K,).
+    The links of a URDF are not equally wrong. In a Gaussian prior one placeholder among careful values keeps its wrong
+    value, or widens the prior of all bodies. The t distribution is a Gaussian whose width differs between bodies.
+
+    rigid: names and groups of x. widths: standard deviations per group; the one of bodies is the scale of the t
+    distribution. hyperprior: their values before the fit. mean: (K,). body_widths: (B,) standard deviation per body.
     """
 
     rigid: ParameterVector
     widths: GaussianPrior
     hyperprior: GaussianPrior
     mean: torch.Tensor
+    body_widths: torch.Tensor
+
+    @classmethod
+    def of(cls, rigid: ParameterVector, widths: GaussianPrior) -> ParameterPrior:
+        """Return the prior whose mean is the current x of the model."""
+        body_widths = torch.full_like(rigid.initial[rigid.bodies][:, 0], widths.bodies)
+        return cls(rigid, widths, widths, rigid.flatten(rigid.initial), body_widths)
 
     @property
     def plausible(self) -> bool:
-        """Whether the width of the bodies' parameters is that of a URDF of this arm."""
-        return math.exp(self.widths.bodies) <= TUNING.wrong_urdf
+        """Whether the bodies' parameters are near the ones of the URDF, on average over the bodies."""
+        return float(self.body_widths.square().mean().sqrt().exp()) <= TUNING.wrong_urdf
 
     @cached_property
     def precision(self) -> torch.Tensor:
         """Inverse covariance, (K, K)."""
         covariance = prior_covariance(self.widths, self.rigid.initial, self.rigid.groups)
+        bodies = self.rigid.mask("bodies")
+        covariance[bodies, bodies] = self.body_widths.square().repeat_interleave(10)
         precision: torch.Tensor = torch.linalg.inv(covariance)
         return precision
 
@@ -228,22 +237,37 @@ def prior_covariance(
 
 
 def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tensor) -> ParameterPrior:
-    """Return the prior after one fixed-point step of evidence maximization for the widths of `ESTIMATED_GROUPS`.
+    """Return the prior after one fixed-point step of evidence maximization for the widths of three groups.
 
     MacKay, Bayesian Interpolation, Neural Computation 4:415 (1992): the fixed point s^2 = |x - mean|^2 / gamma, with
     the effective number of parameters gamma = k - tr(covariance) / s^2 of the group's k parameters, maximizes the
     marginal likelihood in Laplace's approximation. Here s^2 has a scaled inverse chi-squared hyperprior about its
     initial value s0^2, with c degrees of freedom: s^2 = (|x - mean|^2 + c s0^2) / (gamma + c). It is bounded.
 
+    The width of a body has this hyperprior about the common width s. Integrated over it, the prior of the body is a t
+    distribution of c degrees of freedom and scale s, and the squares of the body count s^2 / width^2 times in the fixed
+    point of s (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989).
+
     Args:
         prior: current prior.
         x: (K,) MAP estimate.
         covariance: (K, K) posterior covariance of x.
     """
-    current: dict[str, float] = dict(prior.widths)
-    initial: dict[str, float] = dict(prior.hyperprior)
-    updated, freedom, deviation = {}, prior.widths.degrees_of_freedom, x - prior.mean
-    for group in ESTIMATED_GROUPS:
+    current, initial = dict(prior.widths), dict(prior.hyperprior)
+    freedom, offset = prior.widths.degrees_of_freedom, x - prior.mean
+
+    def width(squares: torch.Tensor, gamma: torch.Tensor, group: str, center: float) -> torch.Tensor:
+        """Return the fixed point (...) for squares and effective numbers of parameters (...), near a center."""
+        square = (squares + freedom * center**2) / (gamma.clamp(min=0.0) + freedom)
+        return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
+
+    mask = prior.rigid.mask("bodies")
+    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # (B,)
+    gamma = 10 - covariance.diagonal()[mask].view(-1, 10).sum(dim=1) / prior.body_widths.square()
+    relative = (current["bodies"] / prior.body_widths).square()
+    updated = {"bodies": float(width((relative * squares).sum(), gamma.sum(), "bodies", initial["bodies"]))}
+    body_widths = width(squares, gamma, "bodies", updated["bodies"])
+    for group in ("armature", "offset"):
         mask = prior.rigid.mask(group)
         count = int(mask.sum())
         centring = torch.eye(count).double()
@@ -252,11 +276,10 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
             # between joints
             centring -= 1 / count
         spread = centring @ covariance[mask][:, mask] @ centring
-        gamma = float(centring.trace() - spread.trace() / current[group] ** 2)
-        squares = float((centring @ deviation[mask]).square().sum()) + freedom * initial[group] ** 2
-        width = (squares / (max(gamma, 0.0) + freedom)) ** 0.5
-        updated[group] = min(width, max(TUNING.max_width, initial[group]))
-    return replace(prior, widths=prior.widths.model_copy(update=updated))
+        gamma = centring.trace() - spread.trace() / current[group] ** 2
+        squares = (centring @ offset[mask]).square().sum()
+        updated[group] = float(width(squares, gamma, group, initial[group]))
+    return replace(prior, widths=prior.widths.model_copy(update=updated), body_widths=body_widths)
 
 
 def width_option(group: str) -> str:

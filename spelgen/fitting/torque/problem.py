@@ -22,7 +22,6 @@ from spelgen.fitting.levenberg_marquardt import (
     NormalEquations,
     SolverResult,
     SolverState,
-    Termination,
     levenberg_marquardt,
 )
 from spelgen.fitting.torque.jacobian import ResidualSamples, TorqueJacobian
@@ -30,7 +29,6 @@ from spelgen.fitting.torque.linearization import (
     NO_TERMS,
     LinearTerms,
     RigidProjection,
-    concatenate_blocks,
     least_squares_residual,
 )
 from spelgen.fitting.torque.parameters import ParameterPrior, update_widths
@@ -84,7 +82,8 @@ class NoiseEstimator:
             effective_parameters: number of parameters that each joint's torque determines, (n,): each reduces the
                 degrees of freedom of the residual by one independent error.
         """
-        fraction = (1.0 - effective_parameters / self.errors).clamp(min=TUNING.min_error_fraction)
+        # at least one error remains: equal shares can exceed the errors of a joint
+        fraction = (self.errors - effective_parameters).clamp(min=1.0) / self.errors
         rms = (squared_residual / self.count / fraction).sqrt()
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
@@ -117,7 +116,7 @@ class TorqueProblem:
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
         noise = NoiseEstimator.of(jacobian, correlation_time).upper_bound()
-        prior = ParameterPrior(rigid, widths, widths, rigid.flatten(rigid.initial))
+        prior = ParameterPrior.of(rigid, widths)
         compensated = rigid.initial[rigid.compensation] != 0
         return cls(jacobian, noise, prior, adapt, compensated, correlation_time)
 
@@ -145,8 +144,8 @@ class TorqueProblem:
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
-        # iterated: the solution depends on the noise, which weights the joints, and the noise on the solution
-        for _ in range(TUNING.final_iterations):
+        # twice: the noise is the weight of the joints, whose torques have common parameters
+        for _ in range(2):
             noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
         return replace(self, noise=noise)
 
@@ -162,6 +161,7 @@ class TorqueProblem:
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
         """Return Gauss-Newton Hessian (k, k) and negative gradient (k,) with respect to the k free parameters."""
+        # of all parameters first: common factors of the prior couple free and fixed ones
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
@@ -173,6 +173,7 @@ class TorqueProblem:
         step: (k,) of the free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
+        # the first one is cheaper, and as good near the optimum; far from it bodies need the second
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
@@ -200,6 +201,7 @@ class TorqueProblem:
         equal shares.
         """
         free, joints = self.free, len(state.residual)
+        # of all joints together: a parameter of a body is determined by the torques of several joints
         gamma = float(free.sum() - (covariance * self.prior.precision)[free][:, free].sum())
         noise = self.noise_estimator.estimate(state.residual, gamma / joints)
         # one body is too little data for the widths of a load
@@ -218,7 +220,6 @@ class TorqueEstimate:
     problem: TorqueProblem
     state: State
     covariance: torch.Tensor
-    termination: Termination
 
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
         """Return the same parameters on other samples, or with other residual terms or friction models."""
@@ -237,6 +238,7 @@ class TorqueEstimate:
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
+        # fewer samples per error have less noise each, so that an error keeps its weight
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
@@ -251,22 +253,21 @@ class TorqueEstimate:
         return jacobian.residual_samples(x), projection
 
 
-def alternate(problem: TorqueProblem, state: State, iterations: int) -> TorqueEstimate:
-    """Alternate Levenberg-Marquardt steps with updates of noise and prior.
+def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
+    """Alternate Levenberg-Marquardt steps with updates of noise and prior until the noise has converged.
 
     Args:
         problem: with initial noise and prior.
         state: first iterate.
-        iterations: number of outer iterations. While the noise of any joint decreases they continue, up to
-            `TUNING.max_extension` times this number.
     """
-    for number in range(TUNING.max_extension * iterations):
+    for number in range(TUNING.iterations):
         result = problem.minimize(state, TUNING.iteration_steps)
         state, covariance = result.state, problem.covariance(result.normal_equations.curvature)
         previous, problem = problem, problem.updated(state, covariance)
-        if number + 1 >= iterations and (problem.noise > TUNING.noise_converged * previous.noise).all():
+        # the first update replaces a noise of other samples or of another model
+        if number and (problem.noise > TUNING.noise_converged * previous.noise).all():
             break
-    return TorqueEstimate(problem, state, covariance, result.termination)
+    return TorqueEstimate(problem, state, covariance)
 
 
 def refine(
@@ -274,8 +275,9 @@ def refine(
 ) -> TorqueEstimate:
     """Return the estimate refitted to other samples or residual terms, with the given one as warm start."""
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
+    # the former noise is that of other samples, or without these terms
     noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
-    return alternate(replace(estimate.problem, noise=noise), estimate.state, TUNING.final_iterations)
+    return alternate(replace(estimate.problem, noise=noise), estimate.state)
 
 
 def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> TorqueEstimate:
@@ -294,29 +296,8 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
+    # the mean of two estimates, each with the weight of its independent errors
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()
     return replace(estimate, problem=replace(problem, noise=noise, correlation_time=mean))
-
-
-def held_out_nmse(estimate: TorqueEstimate, samples: TorqueSamples) -> torch.Tensor:
-    """Return the mean squared error (n,) of held-out segments, divided by the variance of the torque.
-
-    A fit to all other segments has the residual (1 - H)^-1 r on a segment, with its residual r and its block H of the
-    hat matrix of all joints, to first order in the change of the parameters.
-    """
-    segments, size = estimate.on_segments(samples), samples.segment_length(TUNING.segment)
-    jacobian, x, noise = segments.problem.jacobian, segments.state.x, segments.problem.noise
-    weighted = torch.zeros(len(noise), jacobian.samples.count, len(x)).double()
-    for joint, columns, of_joint, _ in concatenate_blocks(jacobian.joint_rows(x), len(noise)):
-        weighted[joint, :, columns] = of_joint / noise[joint]
-    weighted = weighted @ jacobian.theta_jacobian(x)
-    residual = (jacobian.residual_samples(x).torque_residual * jacobian.logged_scale(x) / noise).mT
-    error = torch.zeros_like(residual)
-    for start in range(0, residual.shape[1], size):
-        rows = slice(start, start + size)
-        block = weighted[:, rows].flatten(0, 1)
-        kept = torch.eye(len(block)).double() - block @ segments.covariance @ block.mT
-        error[:, rows] = torch.linalg.solve(kept, residual[:, rows].flatten()).view(len(noise), -1)
-    return error.square().mean(dim=1) * (noise / estimate.problem.noise_estimator.torque_std).square()

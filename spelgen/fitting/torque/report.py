@@ -8,11 +8,12 @@ from itertools import compress
 
 import numpy as np
 import torch
+from scipy.special import gammaincinv
 
 from spelgen.dynamics.parameters import idle_residuals
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
-from spelgen.errors import Diagnostic, Severity
+from spelgen.errors import Diagnostic
 from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.torque.fit import TorqueSolution
 from spelgen.fitting.torque.samples import TorqueSamples
@@ -32,66 +33,94 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
     """Yield the notes of a fit of rigid bodies to samples."""
     names = np.array(model.joint_names)
     posterior = Posterior(model, solution.covariance, solution.torque_std.numpy())
-    # the log-Cholesky parameters of a body are logarithms of its mass and radii
-    factor = float(np.exp(solution.prior.bodies))
-    message = f"prior standard deviation of URDF masses: factor {factor:.2g}"
-    if solution.prior.bodies >= TUNING.max_width:
-        message += (
-            ", its upper bound: the masses of the URDF are wrong by more, or the torques are not in Nm (N); "
-            "`spelgen logs` tests their units"
-        )
-    elif factor > TUNING.wrong_urdf:
-        message += (
-            "; check the masses and centres of mass of the URDF, `spelgen logs` names links that are far off"
-        )
-    severity: Severity = "warning" if factor > TUNING.wrong_urdf else "info"
-    yield Diagnostic(severity, "urdf-prior", "bodies", None, message)
+    yield _urdf_prior(solution)
     if solution.prior.offset >= TUNING.max_width:
-        message = (
+        yield _warning(
+            "offset-prior",
             "the torque offsets exceed three times the friction that is expected of drives of this effort; check the "
-            "effort limits of the URDF, the zeros of the torques and their unit"
+            "effort limits of the URDF, the zeros of the torques and their unit",
         )
-        yield Diagnostic("warning", "offset-prior", "logs", None, message)
-    unsupported = solution.held_out_nmse > TUNING.unsupported
-    if unsupported.any():
-        yield _few_data(samples, solution, names[unsupported])
+    nmse = _likely_nmse(samples, solution)
+    if (nmse > TUNING.unsupported).any():
+        yield _few_data(samples, nmse, names)
     if isinstance(model.inputs, MotorInputs) and len(model.inputs.gain_rows):
         yield _trained_gains(posterior)
     if solution.compensated.any():
-        yield _compensation(model, solution, names)
+        value = model.friction_compensation.tolist()
+        joints = ", ".join(
+            f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated) if value[k] > 0
+        )
+        yield _warning(
+            "friction-compensated",
+            "the measured torque decreases with velocity, as if the drive compensated friction: "
+            f"{joints} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts",
+        )
     if residual_terms(model) is not None:
-        message = _selected_terms(solution, names)
-        if solution.selected_terms and not samples.recordings.any():
-            message += "; all of them were selected in one recording: test them on another motion"
-        yield Diagnostic("info", "residuals", "model", None, message)
-    subset = samples.subsampled(TUNING.report_positions).columns
+        yield Diagnostic("info", "residuals", "model", None, _selected_terms(samples, solution, names))
+    # a few positions suffice for a mean
+    subset = samples.subsampled(50).columns
     inertia, std = posterior.uncertain(lambda other: _mean_inertia(other, subset.q))
     undetermined = std > TUNING.undetermined * inertia
     if undetermined.any():
         joints = ", ".join(names[undetermined])
         message = f"these logs do not determine the inertia at {joints}; its value is mostly the prior"
-        yield Diagnostic("warning", "inertia-undetermined", "logs", None, message)
+        yield _warning("inertia-undetermined", message)
     weak = solution.rms_residual > TUNING.weak_acceleration * inertia * subset.qdd.std(dim=0).numpy()
     if weak.any():
-        message = (
+        yield _warning(
+            "acceleration-unseen",
             f"the torque residual exceeds the inertial torque at {', '.join(names[weak])}: a simulation may be worse "
-            "than constant velocity; record faster motion"
+            "than constant velocity; record faster motion",
         )
-        yield Diagnostic("warning", "acceleration-unseen", "logs", None, message)
 
 
-def _few_data(samples: TorqueSamples, solution: TorqueSolution, joints: np.ndarray) -> Diagnostic:
-    """Return the warning that the samples do not support the parameters of these joints."""
-    nmse = float(np.nanmax(solution.held_out_nmse))
-    seconds = samples.count * samples.interval
+def _warning(code: str, message: str, element: str = "logs") -> Diagnostic:
+    return Diagnostic("warning", code, element, None, message)
+
+
+def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
+    """Return the common width of the bodies' prior, as a warning if the URDF is not of this arm."""
+    # the log-Cholesky parameters of a body are logarithms of its mass and radii
+    factor = float(np.exp(solution.prior.bodies))
+    message = f"prior standard deviation of URDF masses: factor {factor:.2g}"
+    if factor <= TUNING.wrong_urdf:
+        return Diagnostic("info", "urdf-prior", "bodies", None, message)
+    if solution.prior.bodies >= TUNING.max_width:
+        message += (
+            ", its upper bound: the masses of the URDF are wrong by more, or the torques are not in Nm (N); "
+            "`spelgen logs` tests their units"
+        )
+    else:
+        message += (
+            "; check the masses and centres of mass of the URDF, `spelgen logs` names links that are far off"
+        )
+    return _warning("urdf-prior", message, "bodies")
+
+
+def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray:
+    """Return the nMSE of held-out segments (n,), median-unbiased: most means of few squares are too small.
+
+    The sum of the squared errors of S segments is taken to be chi-squared with S degrees of freedom, whose median is
+    below S.
+    """
+    segments = samples.count * samples.interval / TUNING.segment
+    # at three seconds a factor of 1.27, at twelve of 1.06
+    median = 2 * float(gammaincinv(segments / 2, 0.5))
+    return np.asarray(solution.held_out_nmse * segments / median)
+
+
+def _few_data(samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray) -> Diagnostic:
+    """Return the warning that the samples do not support the parameters of some joints; nmse: (n,) of all joints."""
+    seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
     # the error of the parameters is inversely proportional to the duration of the motion
-    enough = math.ceil(seconds * nmse / TUNING.unsupported)
-    message = (
-        f"torques that were not fitted are predicted no better than by a constant at {', '.join(joints)} (nMSE "
-        f"{nmse:.2g}): {seconds:.2g} s of this motion do not support a fit, the values of the URDF or of a ridge "
-        f"regression may be as good; record about {enough} s in which all joints move"
+    enough = math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported)
+    return _warning(
+        "few-data",
+        "torques that were not fitted are predicted no better than by a constant at "
+        f"{joints} (nMSE {np.nanmax(nmse):.2g}): "
+        f"{seconds:.2g} s of this motion do not support a fit, the values of the URDF or of a ridge regression may be "
+        f"as good; record about {enough} s in which all joints move",
     )
-    return Diagnostic("warning", "few-data", "logs", None, message)
 
 
 def _trained_gains(posterior: Posterior) -> Diagnostic:
@@ -105,34 +134,25 @@ def _trained_gains(posterior: Posterior) -> Diagnostic:
     message += (
         f"; the gain of {', '.join(undetermined)} is not determined: friction and inertia scale with it"
     )
-    return Diagnostic("warning", "trained-gains", "motors", None, message)
+    return _warning("trained-gains", message, "motors")
 
 
-def _compensation(model: ArmModel, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:
-    value = model.friction_compensation.detach().numpy()
-    joints = ", ".join(
-        f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated & (value > 0))
-    )
-    message = (
-        "the measured torque decreases with velocity, as if the drive compensated friction: "
-        f"{joints} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts"
-    )
-    return Diagnostic("warning", "friction-compensated", "logs", None, message)
-
-
-def _selected_terms(solution: TorqueSolution, names: np.ndarray) -> str:
+def _selected_terms(samples: TorqueSamples, solution: TorqueSolution, names: np.ndarray) -> str:
     """Return a sentence with the selected terms and their error reductions."""
     if not solution.selected_terms:
         return "no residual terms selected (cross-validation)"
     parts = []
     for term in solution.selected_terms:
-        name = TERM_NAMES[term.name]
-        if term.joint is not None:
-            name += f" at {names[term.joint]}"
-        parts.append(f"{name} ({term.error_reduction:.1%})")
+        joint = "" if term.joint is None else f" at {names[term.joint]}"
+        parts.append(f"{TERM_NAMES[term.name]}{joint} ({term.error_reduction:.1%})")
+    one = (
+        ""
+        if samples.recordings.any()
+        else "; all of them were selected in one recording: test them on another motion"
+    )
     return (
         "residual terms selected by cross-validation, with the decrease of the mean squared torque residual: "
-        + ", ".join(parts)
+        f"{', '.join(parts)}{one}"
     )
 
 

@@ -57,6 +57,7 @@ class TorqueSamples:
                 [None if column is None else np.ascontiguousarray(column[::decimation]) for column in columns]
             )
             count, interval = count + len(x.q), decimation / x.rate
+            # pieces of one recording have one index: errors of its motion are common to them
             recordings.append(torch.full((len(x.q[::decimation]),), names.setdefault(x.name, len(names))))
         table = SampleBlock._make(map(_concatenated, zip(*decimated, strict=True)))
         return cls(table, count, interval, torch.cat(recordings))
@@ -74,6 +75,7 @@ class TorqueSamples:
         """Return at most `max_count` samples: evenly spaced segments of this duration [s], concatenated."""
         size = self.segment_length(seconds)
         number = max(1, min(self.count, max_count) // size)
+        # a segment may span two recordings: rare, and without effect on a mean
         starts = torch.linspace(0, self.count - size, number).long()
         rows = (starts.unsqueeze(-1) + torch.arange(size)).flatten()
         columns = SampleBlock._make(None if column is None else column[rows] for column in self.columns)
@@ -81,6 +83,7 @@ class TorqueSamples:
 
     def subsampled(self, max_count: int) -> TorqueSamples:
         """Return at most `max_count` samples, evenly spaced; this object itself if it has no more."""
+        # evenly spaced, not random: deterministic, and covers every motion
         step = -(-self.count // max_count)
         if step <= 1:
             return self

@@ -131,6 +131,7 @@ def _best(
     torque_residual: (T, n). noise: (n,). recordings: (T,). limits: `max_torques`; None: no bounds.
     """
     significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
+    # halves are the farthest extrapolation in time that one recording allows
     first, last = split_halves(len(torque_residual), correlation_length)
     best = best_within = None
     for candidate in candidates:
@@ -143,6 +144,7 @@ def _best(
         if reduction is None and reduction_within is None:
             continue
         weights = candidate.fit(target, correlation_length, first).coef
+        # implausible torques of one motion are errors that this motion repeats
         if limits and candidate.torque(weights).std() > limits[candidate.parameter][candidate.joint]:
             continue
         before, after = target[last].square(), (target - candidate.torque(weights))[last].square()
@@ -173,6 +175,7 @@ def _blocks(count: int) -> list[slice]:
 
 def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Yield masks (T,) of the held-out and of the fitted samples: of recordings (T,), or of blocks of one recording."""
+    # recordings differ more than blocks do: errors of a day, a load, a motion
     number = int(recordings.max()) + 1
     if number == 1:
         rows = torch.arange(len(recordings))
@@ -217,6 +220,7 @@ def significant_reduction(
     the denominator, so that blocks without torque count as zero.
     """
     negligible = 2 * SELECTION.min_reduction * before.mean()
+    # symmetric: halving and doubling an error have the same size
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,7 +9,7 @@ import torch
 
 from spelgen.fitting.levenberg_marquardt import initial_state
 from spelgen.fitting.torque.jacobian import TorqueJacobian
-from spelgen.fitting.torque.joint_functions import TermKey, clear_terms, refit_terms
+from spelgen.fitting.torque.joint_functions import TermKey, refit_terms
 from spelgen.fitting.torque.networks import select_networks
 from spelgen.fitting.torque.parameters import NEGLIGIBLE
 from spelgen.fitting.torque.problem import (
@@ -21,13 +20,7 @@ from spelgen.fitting.torque.problem import (
     refine,
 )
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.selection import (
-    SelectedTerm,
-    can_split,
-    select_functions,
-    split_halves,
-    within_range,
-)
+from spelgen.fitting.torque.selection import SelectedTerm, can_split, select_functions
 from spelgen.fitting.torque.tuning import TUNING
 
 EFFECT_GROUPS = ("effects", "load_dependence")
@@ -44,13 +37,13 @@ def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
     while problem.adapt is None and (further := find_compensation(problem, state.x)).any():
         problem = replace(problem, compensated=problem.compensated | further)
         problem, state = _annealed_fit(problem, state.steps)
-    estimate = alternate(problem, state, TUNING.iterations)
+    estimate = alternate(problem, state)
     if problem.adapt is not None or estimate.problem.prior.plausible or problem.compensated.all():
         return estimate
     # masses that are wrong by such a factor are less plausible than drives that compensate friction, whose torque the
     # masses absorb
     problem = replace(problem, compensated=torch.ones_like(problem.compensated))
-    compensated = alternate(*_annealed_fit(problem, estimate.state.steps), TUNING.iterations)
+    compensated = alternate(*_annealed_fit(problem, estimate.state.steps))
     return compensated if compensated.problem.prior.plausible else estimate
 
 
@@ -102,7 +95,7 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
         return decreasing
     amplitude = (slope * products / estimator.count).sqrt()
     visible = amplitude > TUNING.min_compensation * estimator.torque_std
-    return decreasing & (deviations > TUNING.min_significance) & (explained > TUNING.min_explained) & visible
+    return decreasing & (deviations > TUNING.min_significance) & visible
 
 
 def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
@@ -113,16 +106,18 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     """
     friction = estimate.problem.jacobian.model.friction
     friction.memoryless.fill_(0.0)
+    # the noise of rate-only friction is too large for bristles, which explain more
     problem, state = _least_squares_noise_fit(estimate.problem, estimate.state)
-    hysteretic = alternate(problem, state, TUNING.iterations)
+    hysteretic = alternate(problem, state)
     evidence = log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic)
     rate_only = _rejected(evidence)
     friction.memoryless.copy_(rate_only)
     if rate_only.all():
         return estimate
     if rate_only.any():
+        # the friction state changed in the model: the residual is recomputed
         mixed = hysteretic.with_jacobian(hysteretic.problem.jacobian)
-        return alternate(mixed.problem, mixed.state, TUNING.iterations)
+        return alternate(mixed.problem, mixed.state)
     return hysteretic
 
 
@@ -136,7 +131,8 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     index = rigid.unflatten(torch.arange(len(estimate.state.x)))
     effects = torch.stack([index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1)  # (n, effects)
     plain = _without(estimate, effects.flatten())
-    rejected = _rejected(log_likelihood_ratio(estimate, plain) - TUNING.effects_evidence)
+    # Akaike's criterion, for one parameter (IEEE Trans. Autom. Control 19:716, 1974)
+    rejected = _rejected(log_likelihood_ratio(estimate, plain) - 2)
     if rejected.all():
         return plain
     return _without(estimate, effects[rejected].flatten()) if rejected.any() else estimate
@@ -145,15 +141,17 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
 def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
     """Return the estimate with negligible coefficients, in x and in the prior mean, at these indices (k,)."""
     problem, x, mean = estimate.problem, estimate.state.x.clone(), estimate.problem.prior.mean.clone()
+    # in the prior mean, too: otherwise the prior would restore them
     mean[indices] = x[indices] = NEGLIGIBLE
     problem = replace(problem, prior=replace(problem.prior, mean=mean))
     state = replace(estimate.state, x=x, residual=problem.residual(x))
-    return alternate(problem, state, TUNING.iterations)
+    return alternate(problem, state)
 
 
 def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> torch.Tensor:
     """Return twice the log likelihood ratio of two estimates per joint (n,), with the noise maximized out."""
     samples = estimate.problem.jacobian.samples
+    # the noise maximized out: log of the ratio of squares, per independent error
     errors = samples.count * min(1.0, samples.interval / TUNING.reversal_correlation_time)
     return errors * (other.state.residual / estimate.state.residual).log()
 
@@ -198,17 +196,15 @@ def fit_residual_terms(
     correlation_length = estimate.problem.correlation_length
     if not can_split(samples.count, float(correlation_length.max())):
         return estimate, []
-    rigid_only = estimate
     selected: list[SelectedTerm] = []
     estimate = estimate.with_current_covariance()
     data = correlation_length, samples.recordings, estimate.problem.jacobian.torque_std
     while further := select_functions(model, *estimate.linearize(), _keys(selected), *data):
         selected += further
         estimate = _refit(estimate, samples, selected).with_current_covariance()
-    if selected:
-        estimate, selected = _without_losing_joints(rigid_only, estimate, selected)
     residual_samples = estimate.problem.jacobian.residual_samples(estimate.state.x)
     selected += select_networks(model, residual_samples, float(correlation_length.max()))
+    # friction factors and networks are not eliminated, so that alternations are needed
     for _ in range(TUNING.alternations if selected else 0):
         estimate = _refit(estimate.with_current_covariance(), samples, selected)
     return estimate, selected
@@ -225,59 +221,6 @@ def _refit(
     jacobian.rigid.write(x)
     projected.write(model, jacobian.residual_samples(x).torque_residual)
     return estimate.with_jacobian(TorqueJacobian(model, samples))
-
-
-def _without_losing_joints(
-    rigid_only: TorqueEstimate, estimate: TorqueEstimate, selected: Sequence[SelectedTerm]
-) -> tuple[TorqueEstimate, list[SelectedTerm]]:
-    """Return estimate and terms without the terms of joints at which they do not lower the held-out error.
-
-    rigid_only: estimate without terms.
-    """
-    jacobian = estimate.problem.jacobian
-    model, samples = jacobian.model, jacobian.samples
-    losing = _losing_joints(rigid_only, estimate, selected)
-    kept = [term for term in selected if term.joint not in losing]
-    clear_terms(model, losing)
-    if not kept:
-        estimate = rigid_only
-    # the fits to half of the samples changed the model, whose armature bounds the networks of M
-    jacobian.rigid.write(estimate.state.x)
-    return estimate.with_jacobian(TorqueJacobian(model, samples)), kept
-
-
-def _losing_joints(
-    rigid_only: TorqueEstimate, estimate: TorqueEstimate, selected: Sequence[SelectedTerm]
-) -> list[int]:
-    """Return the joints at which the terms do not lower the error on the last half, after fits to the first half."""
-    jacobian, correlation_length = estimate.problem.jacobian, estimate.problem.correlation_length
-    model, samples = jacobian.model, jacobian.samples
-    first, last = (
-        samples.select(rows) for rows in split_halves(samples.count, float(correlation_length.max()))
-    )
-    terms = copy.deepcopy(model.residuals.state_dict())
-
-    def fit_first(
-        estimate: TorqueEstimate, selected: Sequence[SelectedTerm]
-    ) -> tuple[TorqueEstimate, torch.Tensor]:
-        """Return the fit to the first half, and its squared torque residual (T, n) on the last half."""
-        estimate = estimate.with_jacobian(TorqueJacobian(model, first)).with_current_covariance()
-        estimate = _refit(estimate, first, selected)
-        held_out = TorqueJacobian(model, last).residual_samples(estimate.state.x)
-        return estimate, held_out.torque_residual.square()
-
-    with_terms, squares_with_terms = fit_first(estimate, selected)
-    clear_terms(model, range(model.n))
-    # both fits have the prior of the fit with terms: only the terms differ
-    prior = with_terms.problem.prior
-    rigid_only = replace(rigid_only, problem=replace(rigid_only.problem, prior=prior))
-    _, squares = fit_first(rigid_only, [])
-    decrease = squares - squares_with_terms
-    model.residuals.load_state_dict(terms)
-    # a term is defined at the positions of the first half only
-    within = within_range(last.columns.q, first.columns.q)
-    losing = (decrease.sum(dim=0) <= 0) & ((decrease * within).sum(dim=0) <= 0)
-    return losing.nonzero()[:, 0].tolist()
 
 
 def _keys(terms: Sequence[SelectedTerm]) -> set[TermKey]:

@@ -37,14 +37,11 @@ class TorqueTuning:
     # [1] Largest estimated prior width: masses and armatures are known to a factor of 20, torque offsets to three times
     # the typical friction. Logs that need a wider prior are not of the URDF's arm, or not in Nm.
     max_width: float = 3.0
-    # [1] Outer iterations of noise and prior after the initial fit.
-    iterations: int = 5
+    # [1] Largest number of outer iterations, which alternate steps with estimates of noise and prior.
+    iterations: int = 20
     # [1] Twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773,
     # 1995).
     strong_evidence: float = 6.0
-    # [1] Twice the log likelihood ratio that adds the Stribeck effect, saturation or load dependence to a joint: 2 per
-    # parameter (Akaike, IEEE Trans. Autom. Control 19:716, 1974).
-    effects_evidence: float = 2.0
     # [1] Largest number of steps before noise and prior are estimated.
     initial_steps: int = 60
     # [1] Largest number of iterations in which the noise is lowered to the least-squares level.
@@ -52,10 +49,6 @@ class TorqueTuning:
     # [1] Noise of these iterations, as a fraction of the torque residual (a low_cost_robot with placeholder
     # inertials: error of M(q) 0.44 -> 0.005).
     annealing_fraction: float = 0.03
-    # [1] Outer iterations of a final fit, and of unconstrained least squares.
-    final_iterations: int = 2
-    # [1] Factor on the number of outer iterations while the noise of a joint decreases.
-    max_extension: int = 4
     # [1] Noise divided by the noise of the previous iteration, above which the noise has converged.
     noise_converged: float = 0.98
     # [1] Largest number of steps in an outer iteration.
@@ -72,15 +65,8 @@ class TorqueTuning:
     validation_windows: int = 2**8
     # [1] Samples for the selection of residual terms.
     residual_samples: int = 2**14
-    # [1] Directions with less than this fraction of the largest curvature are not determined by the samples.
-    min_relative_curvature: float = 1e-10
     # [1] Smallest noise, as a fraction of a torque's standard deviation: noise-free samples are fitted to four digits.
     min_noise: float = 1e-4
-    # [1] Smallest fraction of independent errors that remains, however many parameters are determined.
-    min_error_fraction: float = 0.1
-    # [1] Fraction of the squared residual that friction compensation by a drive (torque that increases with velocity)
-    # must explain.
-    min_explained: float = 0.1
     # [1] Standard deviations by which the coefficient of friction compensation must differ from zero.
     min_significance: float = 4.0
     # [1] Smallest standard deviation of friction compensation, as a fraction of the torque's: delays of
@@ -103,8 +89,6 @@ class TorqueTuning:
     wrong_urdf: float = 5.0
     # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
     weak_acceleration: float = 2.0
-    # [1] Positions at which inertias are evaluated.
-    report_positions: int = 50
     # [1] Prior standard deviations of an adapted fit, about the parameters of its source, by adapted part. load: mass
     # known to a factor of twenty (with 10 in place of 3 half a second of motion has an error of 27 times the variance
     # of the torque, UR10e). friction: warmth changes the friction of all joints by tens of per cent, of a single joint
@@ -141,10 +125,6 @@ class ResidualTuning:
     # [1] A later term is preferred to the best one so far only if its residual is below this fraction of the residual
     # of the best one.
     preference_ratio: float = 0.9
-    # [1] Largest number of fixed-point iterations of the marginal likelihood.
-    max_iter: int = 30
-    # [1] Relative change of the noise at which these iterations end.
-    tolerance: float = 1e-3
     # [1] Samples to which networks are fitted.
     network_samples: int = 2**12
     # [1] Evaluations of the loss after which a network without error reduction is discarded.
