@@ -196,12 +196,12 @@ def test_columns_of_positions_and_velocities(arm, wrong):
 def test_values_that_stay_while_the_joint_moves(arm, quantity):
     log = recorded(arm, 14)
     values = getattr(log, quantity).copy()
-    values[700:1000, 1] = values[700, 1]
+    values[800:1100, 1] = values[800, 1]
     path = logged(arm, replace(log, **{quantity: values}))
     message = message_of(arm, path)
-    assert f"{quantity} that stays at" in message and "in 299 samples from t = 7.01 s" in message
+    assert f"{quantity} that stays at" in message and "in 299 samples from t = 8.01 s" in message
     (read,) = read_logs([path], obeyed(arm, message))
-    assert len(read) == len(log) - 299 and not np.isin(read.t, log.t[701:1000]).any()
+    assert len(read) == len(log) - 299 and not np.isin(read.t, log.t[801:1100]).any()
 
 
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)

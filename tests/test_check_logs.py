@@ -14,7 +14,7 @@ from spelgen.arm.actuation import Drives
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor_dynamics import body_chain, regressor, urdf_parameters
-from spelgen.errors import LogError, SpelgenError, SpelgenErrors
+from spelgen.errors import LogError, SpelgenError
 from spelgen.identification import drive_hints
 from spelgen.identification.drive_hints import DriveLog, drive_problem, find_coupling
 from spelgen.log_checks import check_torque_logs, robot_checks
@@ -139,11 +139,11 @@ def test_torques_of_another_sense_or_unit_are_errors_before_anything_is_fitted(l
 def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
     """Where gravity says nothing: of a joint with an effort limit and torques of noise."""
     random = np.random.default_rng(0)
-    coordinates = tuple(replace(each, effort=10.0) for each in arm.coordinates)
+    coordinates = tuple(each._replace(effort=10.0) for each in arm.coordinates)
     weak = replace(loaded, chain=replace(arm, coordinates=coordinates))
     wrong = replace(log, tau=500 * random.standard_normal(log.tau.shape))
     with pytest.raises(
-        SpelgenErrors, match=r"times what the drive can give, expected Nm or N at the joint; write 'un"
+        LogError, match=r"times what the drive can give, expected Nm or N at the joint; write 'un"
     ):
         require_sound_logs([wrong], weak)
 
@@ -160,7 +160,7 @@ def test_limits_overrun_are_said(loaded, arm, log):
 @pytest.mark.parametrize(("over", "codes"), [(1.005, set()), (1.05, {"beyond-velocity-limit"})])
 def test_noise_at_the_velocity_limit_is_no_finding(loaded, arm, log, over, codes):
     first, *others = arm.coordinates
-    first = replace(first, velocity=np.abs(log.qd[:, 0]).max() / over)
+    first = first._replace(velocity=np.abs(log.qd[:, 0]).max() / over)
     slower = replace(loaded, chain=replace(arm, coordinates=(first, *others)))
     assert {x.code for x in check_logs([log], slower).findings if "velocity" in x.code} == codes
 

@@ -87,7 +87,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
 def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.ndarray:
     """Return a mask (T,) of samples that repeat an old value for long, in a signal that otherwise changes.
 
-    The step to the value after them is large: quantised signals, and drives with a dead zone, go on with a typical one.
+    A quantised signal, as of a drive with a dead zone, may keep a value: the step to the next one must then be large.
     changes: (T,), a signal that cannot change by more than `least` while the values are constant.
     """
     stale = np.zeros(len(values), bool)
@@ -95,7 +95,8 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
     lengths = np.diff(np.append(starts, len(values)))
     steps = np.append(np.abs(np.diff(values[starts])), np.inf)
     is_long = lengths > 20.0 * max(1.0, float(np.median(lengths)))
-    is_long &= (steps > 4.0 * _usual(steps[:-1])) & (len(starts) > 1)
+    is_quantised = len(np.unique(values)) < len(starts) / 2
+    is_long &= (steps > 4.0 * _usual(steps[:-1]) * is_quantised) & (len(starts) > 1)
     for start, length in zip(starts[is_long], lengths[is_long], strict=True):
         rows = slice(start + 1, start + length)
         if np.ptp(changes[rows]) > min_change:
