@@ -12,19 +12,21 @@ ROOT = Path(__file__).parents[1]
 
 # The files that take longest. Workers of pytest-xdist take whole files in this order, so the longest start first.
 LONGEST_FILES = (
-    "test_export_onnx",
     "test_docs",
+    "test_export_onnx",
     "test_torque_fit",
     "test_workflow",
     "test_servo",
     "test_training",
     "test_types",
+    "test_comparison",
     "test_coupled_motors",
     "test_contracts",
     "test_evaluation",
+    "test_export_torch",
+    "test_advice",
     "test_run_folder",
-    "test_selection",
-    "test_meshes",
+    "test_export_c",
 )
 
 

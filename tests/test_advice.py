@@ -139,12 +139,16 @@ UNITS = {
 }
 
 
-@pytest.mark.parametrize("units", UNITS)
-@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize(
+    ("arm", "units", "single"),
+    [
+        *(("rpr", units, False) for units in UNITS), ("ur10e", "revolutions", False),
+        ("ur10e", "degrees and rpm", False), ("ur10e", "degrees", True), ("ur10e", "rpm", True),
+    ],
+    indirect=["arm"],
+)  # fmt: skip
 def test_units_of_positions_and_velocities(arm, units, single):
     """Of all revolute joints, or of one; only the torques show positions and velocities in revolutions."""
-    if single and units == "revolutions":
-        pytest.skip("not tested by least squares: one joint is in another unit than all others")
     log, turning = recorded(arm, 12), [x.joint_type == "revolute" for x in arm.chain.coordinates]
     changed = np.flatnonzero(turning)[-2:-1] if single else np.array(turning)
     q, qd = (1 / SCALES.get(unit, 1.0) for unit in UNITS[units])
@@ -171,7 +175,11 @@ COLUMNS = {
 }
 
 
-@pytest.mark.parametrize("wrong", COLUMNS)
+@pytest.mark.parametrize(
+    ("arm", "wrong"),
+    [*(("rpr", wrong) for wrong in COLUMNS), ("ur10e", "exchanged quantities")],
+    indirect=["arm"],
+)
 def test_columns_of_positions_and_velocities(arm, wrong):
     log = recorded(arm, 13)
     path = logged(arm, replace(log, **COLUMNS[wrong](log)))
@@ -182,7 +190,9 @@ def test_columns_of_positions_and_velocities(arm, wrong):
     assert "write" not in message_of(mended, path)
 
 
-@pytest.mark.parametrize("quantity", ["q", "qd", "tau"])
+@pytest.mark.parametrize(
+    ("arm", "quantity"), [("rpr", "q"), ("rpr", "qd"), ("rpr", "tau"), ("ur10e", "tau")], indirect=["arm"]
+)
 def test_values_that_stay_while_the_joint_moves(arm, quantity):
     log = recorded(arm, 14)
     values = getattr(log, quantity).copy()
@@ -194,6 +204,7 @@ def test_values_that_stay_while_the_joint_moves(arm, quantity):
     assert len(read) == len(log) - 299 and not np.isin(read.t, log.t[701:1000]).any()
 
 
+@pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 def test_velocities_that_are_refreshed_rarely(arm):
     log = recorded(arm, 15)
     path = logged(arm, replace(log, qd=log.qd[np.arange(len(log)) // 10 * 10]))

@@ -298,16 +298,28 @@ NO_LIMITS = {
 }
 
 
+def unlimited_arm(robots, folder, name, form):
+    """Load a robot whose joints have this form of limits."""
+    text = re.sub(r"<limit [^>]*/>", f"<limit {NO_LIMITS[form]}/>", (robots / f"{name}.urdf").read_text())
+    (folder / "x.urdf").write_text(text)
+    return load_arm(folder / "x.urdf")
+
+
 @pytest.mark.parametrize("form", NO_LIMITS)
 @pytest.mark.parametrize("name", ["two_link", "scara", "six_dof"])
 def test_all_forms_of_no_limit_mean_unlimited_and_are_stated_once(robots, tmp_path, name, form):
-    text = re.sub(r"<limit [^>]*/>", f"<limit {NO_LIMITS[form]}/>", (robots / f"{name}.urdf").read_text())
-    (tmp_path / "x.urdf").write_text(text)
-    arm = load_arm(tmp_path / "x.urdf")
+    arm = unlimited_arm(robots, tmp_path, name, form)
     for joint in arm.chain.coordinates:
         assert (joint.limits, joint.effort, joint.velocity) == (None, None, None)
     (note,) = [x for x in arm.robot.diagnostics if x.code == "unlimited"]
     assert "velocity of all joints; effort of all joints" in note.message
+
+
+@pytest.mark.parametrize(
+    ("name", "form"), [*(("two_link", form) for form in NO_LIMITS), ("scara", "largest"), ("six_dof", "0")]
+)
+def test_motions_and_logs_of_unlimited_joints_have_no_limits(robots, tmp_path, name, form):
+    arm = unlimited_arm(robots, tmp_path, name, form)
     ranges = {joint.name: [-0.4, 0.5] for joint in arm.chain.coordinates}
     with pytest.raises(
         SpelgenError, match="got no position limits, expected a range to move in; write 'simulation"

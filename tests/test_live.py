@@ -123,7 +123,7 @@ def test_the_jacobian_is_the_velocity_of_the_tip(arm):
     tip = tip_frame(robot)
     assert tip.carrier == len(robot.chain.bodies) - 1
     q, qd = numbers(log.q[::400], log.qd[::400])
-    jacobian = load_terms(model, q, qd, torch.from_numpy(tip.pose[:3, 3].copy()))[2]
+    jacobian = load_terms(model.chain, q, qd, torch.from_numpy(tip.pose[:3, 3].copy()))[2]
     expected = tip_kinematics(robot).jacobian(q)[:, :3]
     assert (jacobian - expected).abs().max() < 1e-5
 
@@ -185,7 +185,7 @@ def test_a_changed_load_is_found_and_a_contact_is_none(arm, levels, run):
 def test_contacts_are_found_at_their_joint_with_their_force(arm, levels, run):
     """A force of 40 N at the tip for half a second."""
     model, log, _ = arm
-    jacobian = load_terms(model, *numbers(log.q, log.qd, levels.point))[2].numpy()
+    jacobian = load_terms(model.chain, *numbers(log.q, log.qd, levels.point))[2].numpy()
     force = np.array([0.0, 30.0, -27.0])
     torque = np.einsum("tij,i->tj", jacobian, force)
     begin, end = 7.0, 7.5
@@ -198,6 +198,29 @@ def test_contacts_are_found_at_their_joint_with_their_force(arm, levels, run):
     at = np.searchsorted(log.t, end) - 2
     np.testing.assert_allclose(states[at].contact.external_torque, torque[at], atol=0.02 * EFFORT.max())
     assert np.linalg.norm(states[at].contact.force - force) < 0.25 * np.linalg.norm(force)
+
+
+def test_a_contact_is_reported_until_it_ends(arm, levels, run):
+    """The disturbance adapts to the contact, and is not removed from it."""
+    _model, log, _ = arm
+    acts, torque = (log.t >= 7.0) & (log.t < 9.0), 0.1 * EFFORT[1]
+    _, states = estimates(run, levels, log, log.tau - np.outer(acts, torque * (np.arange(6) == 1)))
+    touched = np.array([state.contact.touched for state in states])
+    assert touched[(log.t > 7.1) & acts, 1].all()
+    assert not touched[(log.t < 7.0) | (log.t > 9.3)].any()
+    found = np.array([state.contact.external_torque[1] for state in states])
+    np.testing.assert_allclose(found[(log.t > 7.3) & acts], torque, atol=0.2 * torque)
+
+
+def test_a_log_that_begins_in_motion_begins_without_a_contact(arm, levels, run):
+    model, log, qdd = arm
+    start = 300 + int(np.abs(qdd[300:1200]).sum(axis=1).argmax())
+    part = log[start : start + 200]
+    inertial = model.inverse_dynamics(*numbers(part.q[0], 0 * part.qd[0], qdd[start]))
+    still = model.inverse_dynamics(*numbers(part.q[0], 0 * part.qd[0], 0 * qdd[start]))
+    _, states = estimates(run, levels, part, part.tau)
+    assert ((inertial - still).abs().numpy() > states[50].contact.threshold).any()
+    assert not any(state.contact.touched.any() for state in states)
 
 
 def test_friction_drift_is_found(arm, levels, run):
@@ -289,7 +312,7 @@ def test_the_payload_is_the_map_estimate(offset):
     covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + np.diag(TUNING.load_prior**-2.0))
     mean = PAYLOAD.copy()
     mean[[4, 7, 9]] -= offset
-    payload = find_payload(mean, covariance, 1.0)
+    payload = find_payload(mean, covariance, 1.0, 2.0)
     assert payload.status == "payload"
     precision = np.linalg.inv(covariance)
     linear, precision = precision @ mean, precision - np.diag(TUNING.load_prior**-2.0)
@@ -321,7 +344,7 @@ def test_the_payload_is_the_map_estimate(offset):
 def test_an_indefinite_covariance_is_no_payload_and_no_error():
     covariance = np.diag(TUNING.load_prior**2.0)
     covariance[0, 0] = -1e-9
-    assert find_payload(PAYLOAD, covariance, 1.5).status == "not yet"
+    assert find_payload(PAYLOAD, covariance, 1.5, 2.0).status == "not yet"
 
 
 def test_noise_levels_are_those_of_the_residuals():

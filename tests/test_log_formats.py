@@ -566,6 +566,46 @@ def test_csv_as_spreadsheets_write_it(tmp_path, separator, decimal, encoding):
     check(read_logs(tmp_path / "x.csv", joints)[0], "x")
 
 
+UNIT_LINE = "s,rad,rad,rad/s,rad/s,Nm,Nm"
+FORMS = {
+    "comments": lambda lines: ["# arm 3", "# 26 November", *lines],
+    "a line of units": lambda lines: [lines[0], UNIT_LINE, *lines[1:]],
+    "the header twice": lambda lines: [lines[0], *lines],
+    "comments and units": lambda lines: ["# arm 3", lines[0], UNIT_LINE, *lines[1:]],
+    "decimal commas in quotes": lambda lines: [
+        lines[0],
+        *(",".join(f'"{x}"'.replace(".", ",") for x in line.split(",")) for line in lines[1:]),
+    ],
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_lines_of_a_csv_that_are_no_rows(tmp_path, form):
+    (tmp_path / "x.csv").write_text("\n".join(FORMS[form](text_log().splitlines())) + "\n")
+    check(read_logs(tmp_path / "x.csv", JOINTS)[0], "x")
+
+
+@pytest.mark.parametrize("form", ["comments and units", "the header twice"])
+def test_a_wrong_cell_after_lines_of_units_is_reported_with_its_line(tmp_path, form):
+    lines = FORMS[form](text_log().replace("-0.23", "o.23").splitlines())
+    (tmp_path / "x.csv").write_text("\n".join(lines))
+    number = 1 + next(k for k, line in enumerate(lines) if "o.23" in line)
+    with pytest.raises(LogError, match=rf"x\.csv:{number}: row 3, column q_elbow: got 'o\.23'"):
+        read_logs(tmp_path / "x.csv", JOINTS)
+
+
+def test_the_cut_last_line_of_a_csv_is_left_out(tmp_path):
+    """A recorder without power; a line that is cut in the middle of a file is an error with its number."""
+    lines = text_log().splitlines()
+    (tmp_path / "x.csv").write_text("\n".join([*lines, lines[-1][:9]]))
+    (found,) = read_logs(tmp_path / "x.csv", JOINTS)
+    check(found, "x")
+    assert found.remarks == (f"the last line is cut off and was left out: {lines[-1][:9]}",)
+    (tmp_path / "x.csv").write_text("\n".join([*lines[:3], lines[3][:9], *lines[4:]]))
+    with pytest.raises(LogError, match=r"x\.csv:4: got \d values \(.*\), expected 7, as in the header"):
+        read_logs(tmp_path / "x.csv", JOINTS)
+
+
 def test_a_cell_that_is_no_number_is_reported_with_its_row(tmp_path):
     (tmp_path / "x.csv").write_text(text_log().replace("-0.23", "o.23"))
     with pytest.raises(LogError) as caught:

@@ -269,7 +269,7 @@ def test_degrees_are_refused(case):
     with pytest.raises(LogError) as caught:
         check([trajectory], JOINTS, ("revolute", "revolute"))
     assert str(caught.value) == (
-        f"trajectory x, joint 'a', 'b': got {message}, expected radians and rad/s; "
+        f"trajectory x, joint 'a', 'b': got {message}, expected rad and rad/s, m and m/s; "
         f"write 'units: {units}' under 'logs' in the robot's YAML; --accept degrees if it is right"
     )
 

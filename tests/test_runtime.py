@@ -29,7 +29,7 @@ from spelgen.runtime.rows import Constant, Joint, Link, vector
 
 NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
 FIRST_STAGE = (  # friction's laws then: |gravity torque|, tanh and exp
-    ("MIN_LOAD = 0.01", "MIN_LOAD = 0.0"),
+    ("load = 0.01 * torch.where", "load = 0.0 * torch.where"),
     ("torch.rsqrt(velocity * velocity + width**2)", "(velocity / width).tanh() / velocity"),
     ("slow.square().square().square()", "(-((qd / self.stribeck_velocity) ** 2)).exp()"),
 )

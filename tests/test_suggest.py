@@ -73,6 +73,28 @@ def test_names_of_joints_count_before_numbers(scara, tmp_path):
     require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
 
 
+def test_columns_of_another_arm_are_listed(scara, tmp_path):
+    names = [x.name for x in scara.chain.coordinates]
+    sides = [
+        f"{side}_{x}_{name}" for side in ("left", "right") for x in ("pos", "vel", "tau") for name in names
+    ]
+    rows = np.column_stack([T, 0 * Q, 0 * QD, 0 * TAU, Q, QD, TAU])
+    found, text = suggested(written(tmp_path / "log.csv", ["t", *sides], rows), scara)
+    require_same(found)
+    assert f"# not used: left_pos_{names[0]}, left_pos_{names[1]}" in text
+
+
+@pytest.mark.parametrize(("unit", "name"), [("%", "percent"), ("‰", "permille"), ("A", "A")])
+def test_parts_of_a_torque_get_a_gain_to_write(scara, tmp_path, unit, name):
+    head = [
+        "t",
+        *(f"{x}_{k}{end}" for x, end in (("q", ""), ("qd", ""), ("tau", f" [{unit}]")) for k in range(4)),
+    ]
+    found, text = suggested(written(tmp_path / "log.csv", head, np.column_stack([T, Q, QD, TAU])), scara)
+    require_same(found)
+    assert f'"tau": "{name}"' in text and text.count(f"gain: 1.0 # Nm per {name}") == 4
+
+
 def test_matrices_of_an_archive(scara, tmp_path):
     np.savez(tmp_path / "log.npz", time=T, positions=Q, velocities=QD, torques=TAU, image=np.zeros((3, 3)))
     require_same(suggested(tmp_path / "log.npz", scara)[0])

@@ -54,6 +54,7 @@ def motion_bounds(
         default = (-pi, pi) if coordinate.continuous else (nan, nan)
         limits[k] = sorted((ranges or {}).get(coordinate.name) or coordinate.limits or default)
         speeds[k] = coordinate.velocity or SPEEDS[coordinate.joint_type]
+    # a mimic joint moves by a multiple of its coordinate, whose range shrinks to keep the limits of both
     for body in arm.bodies:
         k, factor = body.coordinate, float(body.multiplier)
         mimic = (joints or {}).get(body.name)

@@ -113,6 +113,7 @@ class Collisions:
         """
         lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
         path = np.concatenate([[0.0], np.cumsum(lengths)])
+        # equal steps of the path, not of time: a slow part needs no more positions than a fast one
         points = np.linspace(0.0, path[-1], ceil(path[-1] / (1.5 * self.clearance)) + 1)
         for point in points:
             q = np.array([np.interp(point, path, column) for column in motion.q.T])
@@ -205,7 +206,9 @@ class Collisions:
         The distance from a joint to any point that it carries is at most the length of the chain from there on.
         """
         extents, weights = self._extents.copy(), np.zeros(len(chain.coordinates))
+        # of prismatic joints, whose links move apart
         travel = np.maximum(np.abs(bounds.low), np.abs(bounds.high))
+        # from the tip to the root, so that an extent includes all bodies that a body carries
         for index, body in reversed(list(enumerate(chain.bodies))):
             k, ratio = body.coordinate, abs(float(body.multiplier))
             length = float(np.linalg.norm(np.array(body.translation, dtype=float)))

@@ -70,7 +70,8 @@ def excite(
     ranges = arm.robot.joint, arm.settings.simulation.positions
     limits = motion_bounds(arm.chain, 1.0, 1.0, *ranges)
     bounds = motion_bounds(arm.chain, reach, speed, *ranges)
-    strongest = bounds.speed  # divided by one second
+    # without limits, the approach reaches its speed in one second
+    strongest = bounds.speed
     if acceleration is not None:
         strongest = _joint_values("acceleration", acceleration, arm.chain, positive=True)
         bounds = replace(bounds, acceleration=strongest)
@@ -83,6 +84,7 @@ def excite(
         fraction = TUNING.range_factor**attempt
         trajectory = ExcitationTrajectory(duration, harmonics, bounds.narrowed(fraction))
         criterion = Criterion(arm.chain, trajectory, collisions)
+        # another seed as well as a smaller range: the same first motion would lead to the same contact
         starts = np.random.default_rng(seed + attempt).standard_normal((TUNING.starts, trajectory.size))
         best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
         motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
@@ -168,6 +170,7 @@ def _start(
     """Return the position from which the approach starts, (n,). Raises SettingsError, ArmError for a contact."""
     if start is None:
         middle = (limits.low + limits.high) / 2
+        # controllers of most arms start at zero
         position = np.where((limits.low <= 0) & (limits.high >= 0), 0.0, middle)
         if collisions is not None and collisions.contact_at(position):
             position = middle
@@ -207,6 +210,7 @@ def _improved(
         progress(min(done, trials), trials)
         return value, gradient
 
+    # no tolerance of the cost: the trials are the budget, and a flat step may be followed by a steep one
     options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.history, "ftol": 0.0}
     minimize(evaluate, initial, jac=True, method="L-BFGS-B", options=options)
     return best

@@ -111,8 +111,10 @@ class ExcitationTrajectory:
         if self.bounds.acceleration is not None:
             strongest = accelerations.abs().amax(dim=0) / GRID_RATIO
             largest = torch.minimum(largest, torch.from_numpy(self.bounds.acceleration) / strongest)
+        # at most the largest amplitude, for any parameter
         amplitude = largest * (-self.amplitude_reduction(parameters)).exp()
         free = room - 2 * amplitude * half  # range of the offset
+        # tanh: any parameter gives an offset within the free range
         offset = low - amplitude * (middle - half) + free * (1 + offsets.tanh()) / 2
         q, qd, qdd = amplitude * self._signals(coefficients, t)
         return torch.stack([offset + q, qd, qdd])

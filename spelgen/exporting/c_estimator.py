@@ -17,7 +17,7 @@ from spelgen.exporting.description import TrainedModel, read_entries
 from spelgen.exporting.model_expressions import drive_friction, joint_mass, named_function
 from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics
-from spelgen.live.noise import TAIL, BlockNoise, NoiseLevels
+from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.tuning import TUNING
 from spelgen.templates import render
 
@@ -87,7 +87,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     for name, level in levels:
         if isinstance(level, BlockNoise):
             tables |= {f"{name}_{key}": row for key, row in level}
-        elif name not in ("minutes", "point"):
+        elif name not in ("minutes", "point", "load_freedom"):
             tables[name] = np.ravel(level)
     values = {
         "name": model.name,
@@ -95,8 +95,9 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "n": model.n,
         "tuning": TUNING,
         "supported": f"{levels.supported_alarms:.2g} per minute",
-        "windows": repr(60 / TUNING.window * TAIL * model.n),
+        "windows": repr(levels.tail_peaks),
         "evidence": repr(TUNING.evidence),
+        "quantile": repr(levels.load_quantile),
         "iterations": TUNING.iterations,
         "weights": TUNING.weights,
         "tables": {name: _numbers(row) for name, row in tables.items()},

@@ -166,7 +166,7 @@ class GeometryProblem:
         return np.asarray(np.sqrt(np.einsum("snk,kl,snl->sn", rows, fit.covariance, rows, optimize=True)))
 
     def drive_parameters(self, fit: HypothesisFit) -> np.ndarray:
-        """Return the parameters of the drives in a fit, (effects, n); effects: see `drive_rows`."""
+        """Return the parameters of the drives in a fit, (effects, n), in the order of `drive_rows`."""
         return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
     def torque(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:

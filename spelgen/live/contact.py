@@ -24,65 +24,84 @@ class ContactState(NamedTuple):
 class ContactObserver:
     """First-order low-pass filter of the momentum balance, updated with each sample.
 
-    Each low-passed term is a state, (15, n): torque, friction, its uncertainty, the momenta of the arm at two
-    bandwidths, and the regressor of the payload.
+    low: each low-passed term is a state, (15, n): torque, friction, its uncertainty, the momenta of the arm at two
+    bandwidths, and the regressor of the payload. baseline: disturbance that is no external torque, (n,) [Nm, N].
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
-        self.levels, self.factor = levels, levels.thresholds(alarms_per_minute)
+        self.levels, self.alarms_per_minute = levels, alarms_per_minute
         self.restart()
 
     def restart(self) -> None:
         """Discard the filter states; the next sample initialises them."""
         self.t: float | None = None
-        self.inputs = self.low = np.zeros((15, len(self.factor)))
+        self.inputs = self.low = np.zeros((15, len(self.levels.speed)))
+        self.touched = np.zeros(len(self.levels.speed), dtype=bool)
 
     def step(
-        self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
+        self, t: float, qd: np.ndarray, at: Balance, payload: Payload, drift: np.ndarray
     ) -> ContactState:
-        """Return the external torques after a sample. at: its terms; scale: friction scale minus one, (n,)."""
-        signal, variance = self.residual(t, qd, at, payload, scale)
-        threshold = self.factor * np.sqrt(variance)
-        touched = np.abs(signal) > threshold
-        force = tip_force(at.jacobian, -signal, variance) if touched.any() else np.zeros(3)
-        return ContactState(-signal, threshold, touched, force)
+        """Return the external torques after a sample.
+
+        at: its terms. drift: friction scale minus one, and disturbance, (n, 2).
+        """
+        signal, variance = self.residual(t, at, payload, drift)
+        noise = np.sqrt(variance + np.square(self.levels.observer))
+        threshold = self.levels.thresholds(self.alarms_per_minute) * noise + self.levels.resting_torque(qd)
+        self.touched = np.abs(signal) > threshold
+        force = tip_force(at.jacobian, -signal, threshold) if self.touched.any() else np.zeros(3)
+        return ContactState(-signal, threshold, self.touched, force)
 
     def residual(
-        self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
+        self, t: float, at: Balance, payload: Payload, drift: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low-pass filtered torque residual of model, payload and drift, and its variance, (n,) each."""
+        """Return the low-pass filtered torque residual of model, payload and drift, and its variance, (n,) each.
+
+        The variance is due to changing accelerations, an unknown friction state and the payload; without the noise.
+        """
         rate = TUNING.bandwidth
+        scale, disturbance = drift.T
         load = at.load_torque + rate * at.load_momentum
         free = at.torque - at.friction + rate * at.momentum
         inputs = np.stack([free, at.friction, at.uncertainty, at.momentum, at.momentum, *load.T])
+        # a contact may be as slow as a disturbance, and is none only as far as the training logs have disturbances
+        largest = TUNING.outlier * self.levels.drift.disturbance
+        disturbance = np.clip(disturbance, -largest, largest)
         if self.t is None:
-            # the steady state for constant inputs
-            self.low = inputs
+            # the steady state for constant inputs would be an external torque if the arm accelerates
+            self.low = inputs.copy()
+            self.low[0], self.low[1], self.low[5:] = rate * at.momentum, 0.0, rate * at.load_momentum.T
+            self.baseline = disturbance
         else:
-            gains = np.full((len(inputs), 1), 1 - np.exp(-rate * (t - self.t)))
+            step = t - self.t
+            gains = np.full((len(inputs), 1), 1 - np.exp(-rate * step))
             # twice the bandwidth: the difference of two estimates of dp/dt is proportional to its rate
-            gains[4] = 1 - np.exp(-2 * rate * (t - self.t))
+            gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
+            # the disturbance of a joint in contact contains the contact
+            gain = np.where(self.touched, 0.0, 1 - np.exp(-step / TUNING.baseline))
+            self.baseline = self.baseline + gain * (disturbance - self.baseline)
         self.t, self.inputs = t, inputs
         torque, friction, uncertainty, slow, fast = self.low[:5]
         # regressor Phi of the payload, (n, 10), as in `Block`
         regressor = rate * at.load_momentum - self.low[5:].T
-        signal = torque - rate * at.momentum - regressor @ payload.parameters - friction * scale
+        signal = (
+            torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline
+        )
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
-        resting = TUNING.resting_friction * self.levels.coulomb * np.exp(-np.abs(qd) / self.levels.rest_speed)
-        variance = self.levels.observer**2 + resting**2 + jerk**2 + TUNING.uncertainty * uncertainty**2
+        variance = jerk**2 + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)
         return signal, variance
 
 
-def tip_force(jacobian: np.ndarray, torque: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def tip_force(jacobian: np.ndarray, torque: np.ndarray, threshold: np.ndarray) -> np.ndarray:
     """Return the weighted least-squares estimate of a force at the tip, (3,) [N], in root axes, from external torques.
 
     Args:
         jacobian: of the tip, (3, n).
-        torque, variance: external torques [Nm, N] and their variances, (n,).
+        torque, threshold: external torques and their thresholds, (n,) [Nm, N].
     """
-    weighted = jacobian / variance
+    weighted = jacobian / threshold**2
     matrix = weighted @ jacobian.T
     # a force that no joint torque depends on is zero
     matrix += 1e-3 * np.trace(matrix) / 3 * np.eye(3)

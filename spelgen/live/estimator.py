@@ -113,7 +113,7 @@ class Estimator:
             self.half = None
             if refusal == "gap":
                 self.observer.restart()
-        self.contact = self.observer.step(t, qd, at, self.payload, self.drift.x[:, 0])
+        self.contact = self.observer.step(t, qd, at, self.payload, self.drift.x)
         block = None if refusal == "saturated" else self.blocks.add(t, qd, at)
         if block is not None:
             self.drift.update(block, block.y - block.load @ self.payload.parameters)
@@ -130,7 +130,9 @@ class Estimator:
         """Estimate the payload and use it from the next step on; ``step`` calls this after each second of motion."""
         main, before = self.estimate.filters[0], self.payload
         self.reported = self.estimate.moved
-        self.payload = find_payload(main.x[:10], main.P[:10, :10], self.levels.load_variance)
+        self.payload = find_payload(
+            main.x[:10], main.P[:10, :10], self.levels.load_variance, self.levels.load_quantile
+        )
         if (before.status == "payload") != (self.payload.status == "payload"):
             # the drift filter has attributed torques of the load to friction: it starts from the payload filter
             joints = slice(10, 10 + self.model.n)

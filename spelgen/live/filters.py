@@ -90,7 +90,7 @@ class LoadFilter:
 
     def __init__(self, noise: BlockNoise, effort: np.ndarray) -> None:
         self.n, self.noise = len(effort), noise
-        self.disturbance = TUNING.variance * np.square(noise.disturbance)
+        self.disturbance = np.square(noise.disturbance)
         self.x = np.zeros(10 + 3 * self.n)
         offset, friction = np.square(TUNING.offset * effort), np.full(self.n, TUNING.friction**2)
         self.P = np.diag(np.concatenate([TUNING.load_prior**2, friction, offset, self.disturbance]))
@@ -117,8 +117,7 @@ class LoadFilter:
         columns = [*range(10), *range(10 + joint, 10 + 3 * self.n, self.n)]
         row = np.array([*block.load[joint], block.friction[joint], 1.0, 1.0])
         covariance = self.P[:, columns] @ row
-        noise = TUNING.variance * self.noise.white[joint] ** 2
-        noise += TUNING.uncertainty * block.uncertainty[joint] ** 2
+        noise = self.noise.white[joint] ** 2 + TUNING.uncertainty * block.uncertainty[joint] ** 2
         expected = float(row @ covariance[columns]) + noise
         residual = float(block.y[joint] - self.x[columns] @ row)
         # Huber: the noise of an outlier is larger
@@ -162,11 +161,8 @@ class JointFilters:
     @classmethod
     def of_drift(cls, noise: BlockNoise) -> JointFilters:
         """Return the filters of a and d that the estimator runs."""
-        factor = np.sqrt(TUNING.variance)
-        deviations = np.stack(
-            [np.full_like(noise.white, TUNING.friction), factor * noise.disturbance], axis=-1
-        )
-        return cls(deviations, factor * noise.white, noise.time_constant, drifts=True)
+        deviations = np.stack([np.full_like(noise.white, TUNING.friction), noise.disturbance], axis=-1)
+        return cls(deviations, noise.white, noise.time_constant, drifts=True)
 
     def update(self, block: Block, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Predict the state over a block, and update it with the torque of the block without the payload, (n,) [Nm, N].

@@ -30,7 +30,7 @@ from spelgen.live.contact import ContactObserver
 from spelgen.live.filters import Block, Blocks, JointFilters, LoadFilter
 from spelgen.live.intake import Intake, balance_along
 from spelgen.live.momentum import Balance
-from spelgen.live.noise import TAIL, BlockNoise, NoiseLevels
+from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.payload import NO_REPORT
 from spelgen.live.tuning import TUNING
 from spelgen.logs.dynamics_samples import dynamics_samples
@@ -160,17 +160,9 @@ def find_levels(
         point: the tip in the frame of the last body, (3,) [m].
     """
     logs = [log for _, fold in folds for log in fold]
-    unknown = np.ones(len(effort))
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    noise = BlockNoise(white=unknown, disturbance=unknown, time_constant=unknown)
-    levels = NoiseLevels(
-        drift=noise,
-        load=noise,
-        observer=0 * unknown,
-        peak_start=unknown,
-        peak_scale=unknown,
-        load_variance=TUNING.variance,
-        coulomb=np.mean([model.coulomb.numpy() for model, _ in folds], axis=0),
+    # without the noise, which is found with these
+    levels = NoiseLevels.model_construct(
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
         # no limit is below the largest logged torque
@@ -182,29 +174,36 @@ def find_levels(
     segments = [[x.block for x in samples if x.block is not None] for samples in tested]
     pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
-    levels = levels.model_copy(update={"load_variance": load_variance(pairs, levels)})
+    factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
+    levels = levels.model_copy(update={"load_variance": factor, "load_freedom": freedom})
     return _with_observer(levels, tested)
 
 
-def load_variance(segments: Sequence[Sequence[Block]], levels: NoiseLevels) -> float:
-    """Return the factor on the covariance of estimated payloads, from logs without payload: each estimate is an error.
+def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
+    """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
 
-    Windows of blocks are independent trials. The factor is the mean squared normalised estimate of mass and first
-    moments, (4,), the larger one of two lengths of windows: errors of the model average out slowly.
+    The logs are without payload: each estimate is an error. Windows of blocks in a row are independent trials. The
+    squared normalised estimates of the mass, and of mass and first moments, are averaged together with the prior. The
+    largest average counts: errors of the model average out slowly, so that longer windows may be worse.
     """
-    factors = [TUNING.variance]
+    factors = []
     for window in TUNING.trial_blocks:
-        squares: list[float] = []
-        for blocks in segments:
-            for start in range(0, len(blocks) - window + 1, window):
-                load = LoadFilter(levels.load, levels.effort)
-                for block in blocks[start : start + window]:
-                    load.predict(block.duration)
-                    for joint in range(load.n):
-                        load.update(block, joint)
-                squares.append(float(load.x[:4] @ np.linalg.solve(load.P[:4, :4], load.x[:4])) / 4)
-        if squares:
-            factors.append(float(np.mean(squares)))
+        squares = np.zeros(2)
+        trials = len(blocks) // window
+        for start in range(0, trials * window, window):
+            load = LoadFilter(levels.load, levels.effort)
+            for block in blocks[start : start + window]:
+                load.predict(block.duration)
+                for joint in range(load.n):
+                    load.update(block, joint)
+            theta, covariance = load.x[:4], load.P[:4, :4]
+            squares += (
+                theta[0] ** 2 / covariance[0, 0],
+                theta @ np.linalg.solve(covariance, theta) / len(theta),
+            )
+        freedom = trials + TUNING.prior_trials
+        prior = TUNING.prior_trials * TUNING.prior_variance
+        factors.append((float(squares.max() + prior) / freedom, freedom))
     return max(factors)
 
 
@@ -253,7 +252,8 @@ def _likelihood(
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
     """Return the levels completed by the noise of the momentum observer and the exponential tail of its peaks."""
-    signals: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+    columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    times = np.array([sample.t for samples in tested for sample in samples])
     for samples in tested:
         observer, drift = (
             ContactObserver(levels, TUNING.alarms_per_minute),
@@ -262,19 +262,39 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
         for t, qd, at, is_resumed, block in samples:
             if is_resumed:
                 observer.restart()
-            signal, variance = observer.residual(t, qd, at, NO_REPORT, drift.x[:, 0])
-            signals.append((np.array(t), signal, variance, np.abs(qd) > levels.rest_speed))
+            columns.append((*observer.residual(t, at, NO_REPORT, drift.x), qd))
             if block is not None:
                 drift.update(block, block.y)
-    times, signal, variance, moving = (np.array(column) for column in zip(*signals, strict=True))
-    # of a moving joint: 0.455 is the median of the squared standard normal distribution
-    squares = np.nanmedian(np.where(moving, np.square(signal), np.nan), axis=0) / 0.455
-    observer_level = np.maximum(np.sqrt(squares), TUNING.min_observer_noise * levels.effort)
-    ratio = np.abs(signal) / np.sqrt(variance + observer_level**2)
+    signal, variance, qd = (np.array(column) for column in zip(*columns, strict=True))
+    levels = levels.model_copy(update=_observer_noise(signal, qd, levels))
+    beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
+    ratio = beyond / np.sqrt(variance + np.square(levels.observer))
     # peaks of neighbouring samples are one event: the largest of each window counts
     starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
     peaks = np.maximum.reduceat(ratio, starts, axis=0)
-    start = np.quantile(peaks, 1 - TAIL, axis=0)
+    start = np.quantile(peaks, 1 - TUNING.tail, axis=0)
     tail = np.where(peaks > start, peaks - start, np.nan)
-    update = {"observer": observer_level, "peak_start": start, "peak_scale": np.nanmean(tail, axis=0)}
-    return levels.model_copy(update=update)
+    return levels.model_copy(update={"peak_start": start, "peak_scale": np.nanmean(tail, axis=0)})
+
+
+def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:
+    """Return the noise of the observer in motion and at rest, of maximum likelihood over a grid; arrays are (T, n)."""
+    best: dict[str, np.ndarray] = {}
+    lowest = np.full(len(levels.speed), np.inf)
+    for speed, ratio in itertools.product(TUNING.resting_speeds, TUNING.resting_ratios):
+        shape = 1 + np.square(ratio * np.exp(-np.abs(qd) / (speed * levels.speed)))
+        # 0.455 is the median of the squared standard normal distribution; peaks have their own distribution
+        level = np.sqrt(np.median(signal**2 / shape, axis=0) / 0.455)
+        level = np.maximum(level, TUNING.min_observer_noise * levels.effort)
+        normalised = np.abs(signal) / (level * np.sqrt(shape))
+        # Huber's cost: quadratic up to the outliers, then linear
+        inner = np.minimum(normalised, TUNING.outlier)
+        cost = np.mean(np.log(level**2 * shape) + inner * (2 * normalised - inner), axis=0)
+        found = {
+            "observer": level,
+            "resting": TUNING.outlier * ratio * level,
+            "resting_speed": speed * levels.speed,
+        }
+        best = {key: np.where(cost < lowest, x, best.get(key, x)) for key, x in found.items()}
+        lowest = np.minimum(cost, lowest)
+    return best

@@ -16,7 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.protocol import is_stateful
+from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 _BLOCK = 2048  # samples that are computed at a time
@@ -39,60 +41,32 @@ class Balance(NamedTuple):
     jacobian: np.ndarray
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    product: Tensor = torch.linalg.cross(a, b.expand_as(a), dim=-1)
-    return product
-
-
-def load_terms(model: RigidBodyDynamics, q: Tensor, qd: Tensor, point: Tensor) -> tuple[Tensor, ...]:
+def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return P and N, (T, n, 10), and the Jacobian of a point of the last body, (T, 3, n), in root axes.
 
     Args:
-        model: in double precision.
+        chain: kinematics of the bodies.
         q, qd: (T, n).
         point: in the frame of the last body, (3,) [m].
     """
-    chain = model.chain
     # with the columns of the frames in place of points
-    at = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
-    _, twists, turning = chain.motion(at, qd)
-    frame = at.place[..., -1, :]  # (T, 3, 4)
-    rotation, origin = frame[..., :3], frame[..., 3].unsqueeze(-2)
-
-    def at_body(twist: Tensor) -> tuple[Tensor, Tensor]:
-        """Return twists (T, 6, bodies), angular and linear, at the origin of the last body and in its axes."""
-        angular, linear = twist.mT.chunk(2, dim=-1)
-        return angular @ rotation, (linear + _cross(angular, origin)) @ rotation
-
-    # twists of the last body per rate of each body's displacement, and their time derivatives
-    axes, turned, twist = at_body(at.axes), at_body(turning), at_body(twists[..., -1:])
-    angular, linear = axes
-    gravity = (-chain.base.reshape(1, 3) @ rotation).expand_as(angular)
-    weight = [
-        (linear * gravity).sum(-1, True),
-        _cross(gravity, angular),
-        torch.zeros_like(angular).repeat(1, 1, 2),
-    ]
-    # displacements per joint position, zero for bodies that do not carry the last one, (bodies, n)
+    pose = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
+    velocities, _, turning = chain.motion(pose, qd)
+    frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(-2, -3)  # (T, 1, 4, 4)
+    velocity = velocities[..., -1, :]  # of the frame, (T, 3, 4)
+    axes, turned = (torch.unflatten(x.mT @ chain.motions, -1, (3, 4)) for x in (pose.axes, turning))
+    # derivatives of the frame with respect to q and their rates, (T, n, 3, 4); the last body is carried by few bodies
     ratios = chain.carriers[:, -1:] * chain.ratios
-    momentum = ratios.mT @ _projected(axes, twist)
-    force = ratios.mT @ (_projected(turned, twist) + torch.cat(weight, -1))
-    jacobian: Tensor = rotation @ ((linear + _cross(angular, point)).mT @ ratios)
-    return momentum, force, jacobian
-
-
-def _projected(axes: tuple[Tensor, Tensor], twist: tuple[Tensor, Tensor]) -> Tensor:
-    """Return a . angular momentum + l . linear momentum per inertial parameter of a body with this twist, (T, bodies,
-    10).
-
-    Linear momentum is m v + w x mc, angular momentum I w + mc x v. axes: (a, l), (T, bodies, 3).
-    """
-    (a, l), (w, v) = axes, (x.expand_as(axes[0]) for x in twist)  # noqa: E741
-    products = a.unsqueeze(-1) * w.unsqueeze(-2)
-    rows, columns = torch.triu_indices(3, 3)
-    # an entry off the diagonal occurs twice in I
-    inertia = (products + products.mT)[..., rows, columns] * torch.where(rows == columns, 0.5, 1.0)
-    return torch.cat([(l * v).sum(-1, True), _cross(l, w) + _cross(v, a), inertia], dim=-1)
+    changes = axes @ frame, turned @ frame + axes[..., :3] @ velocity.unsqueeze(-3)
+    jacobian, rate = (torch.einsum("bn,tbxa->tnxa", ratios, change) for change in changes)
+    weight = torch.zeros_like(velocity)
+    weight[..., 3] = -chain.base.flatten()
+    directions, vectors = torch.stack([jacobian, rate, jacobian]), torch.stack([velocity, velocity, weight])
+    # tr(direction J vector^T) is linear in the pseudo-inertia J of the payload
+    products = torch.einsum("ktnxa,ktxb->ktnab", directions, vectors)
+    units = pseudo_inertia(torch.eye(10).to(q))
+    momentum, centrifugal, weighed = torch.tensordot(products, units, dims=([-2, -1], [1, 2]))
+    return momentum, centrifugal + weighed, (jacobian @ torch.cat([point, point.new_ones(1)])).mT
 
 
 def balance(
@@ -124,4 +98,4 @@ def _terms(
     else:
         low = high = model.friction_torque(at, qd)
     terms = model.momentum(at, qd), torque, (high + low) / 2, (high - low).abs() / 2
-    return [*terms, *load_terms(model, q, qd, point)]
+    return [*terms, *load_terms(model.chain, q, qd, point)]

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
+from scipy.special import stdtrit
 
 from spelgen.live.tuning import TUNING
 
@@ -41,12 +42,12 @@ class BlockNoise(BaseModel):
 class NoiseLevels(BaseModel):
     """Noise levels and limits of an arm that the estimator uses in addition to its model; vectors are (n,).
 
-    drift, load: noise of the blocks of the drift and payload filters. observer: standard deviation of the momentum
-    observer of a moving
-    joint [Nm, N]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer, beyond the
-    largest fifth. load_variance: factor on the covariance of payloads. coulomb: friction at low speed [Nm, N]. speed:
-    largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m]. effort: torque limit [Nm, N].
-    minutes: duration of the training logs. point: tip in the frame of the last body, (3,) [m].
+    drift, load: noise of blocks of both filters. observer: standard deviation of the momentum observer of a moving
+    joint. resting: three more standard deviations of a joint at rest [Nm, N], which fall with exp(-|qd| /
+    resting_speed) [rad/s, m/s]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer,
+    beyond the largest fifth. load_variance: factor on the covariance of payloads, an estimate with load_freedom
+    degrees of freedom. speed: largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m]. effort:
+    torque limit [Nm, N]. minutes: duration of the training logs. point: tip in the frame of the last body, (3,) [m].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -54,10 +55,12 @@ class NoiseLevels(BaseModel):
     drift: BlockNoise
     load: BlockNoise
     observer: Vector
+    resting: Vector
+    resting_speed: Vector
     peak_start: Vector
     peak_scale: Vector
     load_variance: float
-    coulomb: Vector
+    load_freedom: float
     speed: Vector
     encoder: Vector
     effort: Vector
@@ -70,16 +73,34 @@ class NoiseLevels(BaseModel):
         return TUNING.rest * self.speed
 
     @property
+    def load_quantile(self) -> float:
+        """Half width of 95 % intervals of a payload, in standard deviations: Student's t, for an estimated variance.
+
+        The variance was found without payload, which is right for the evidence. With one, errors are not smaller than
+        in the prior: friction grows with the load.
+        """
+        with_load = max(TUNING.prior_variance / self.load_variance, 1.0)
+        return float(stdtrit(self.load_freedom, 0.975)) * math.sqrt(with_load)
+
+    @property
     def supported_alarms(self) -> float:
         """Lowest rate of false alarms [1/min] that the training logs support: one in their whole duration."""
         return 1 / self.minutes
 
+    def resting_torque(self, qd: np.ndarray) -> np.ndarray:
+        """Return the error of friction near standstill, at velocities (..., n), (..., n) [Nm, N].
+
+        It is bounded, and so it is added to thresholds, in which the noise is multiplied by its rarest peaks.
+        """
+        torque: np.ndarray = self.resting * np.exp(-np.abs(qd) / self.resting_speed)
+        return torque
+
+    @property
+    def tail_peaks(self) -> float:
+        """Number of peaks of all joints in the exponential tail per minute."""
+        return 60 / TUNING.window * TUNING.tail * len(self.observer)
+
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the thresholds of the normalised observer, (n,), for a total rate of false alarms of all joints."""
-        windows = 60 / TUNING.window * TAIL * len(self.observer)
-        tail = self.peak_start + self.peak_scale * math.log(windows / alarms_per_minute)
-        return math.sqrt(TUNING.variance) * np.maximum(tail, 1.0)
-
-
-TAIL = 0.2
-"""Fraction of the peaks to which the exponential tail is fitted."""
+        tail = self.peak_start + self.peak_scale * math.log(self.tail_peaks / alarms_per_minute)
+        return TUNING.other_days * np.maximum(tail, 1.0)

@@ -52,18 +52,23 @@ class Payload:
 NO_REPORT = Payload()
 
 
-def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Payload:
+def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quantile: float) -> Payload:
     """Return the payload for the estimate of the payload filter, mean (10,) and covariance (10, 10).
 
-    factor: on the covariance of the likelihood. "not yet" also if rounding errors make a matrix indefinite.
+    "not yet" also if rounding errors make a matrix indefinite.
+
+    Args:
+        mean, covariance: of the filter, whose prior is removed.
+        factor: on the covariance of the likelihood.
+        quantile: half width of the intervals in standard deviations.
     """
     try:
-        return _found_payload(mean, covariance, factor)
+        return _found_payload(mean, covariance, factor, quantile)
     except np.linalg.LinAlgError:
         return NO_REPORT
 
 
-def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Payload:
+def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quantile: float) -> Payload:
     """Return the payload; arguments: see `find_payload`. Raises LinAlgError if a matrix is not positive definite."""
     precision = _inverse(covariance)
     linear = precision @ mean / factor
@@ -77,10 +82,10 @@ def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> P
     theta = weights @ thetas
     # of a mixture: the mean covariance, and the covariance of the means
     spread = np.tensordot(weights, inverses, 1) + np.cov(thetas.T, ddof=0, aweights=weights)
-    limit = theta[0] + TUNING.normal * math.sqrt(spread[0, 0])
+    limit = theta[0] + quantile * math.sqrt(spread[0, 0])
     if log_odds > TUNING.payload_odds:
         return Payload("no payload" if log_odds > TUNING.no_payload_odds else "not yet", log_odds, limit)
-    return _described(theta, spread, log_odds, limit)
+    return _described(theta, spread, quantile, log_odds, limit)
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
@@ -119,7 +124,7 @@ def _at_scale(
             decrement = gradient @ step
             theta = theta - step / (1 + math.sqrt(2 * decrement) if decrement > 0.01 else 1)
             # the error after a full step is about the square of the one before
-            if decrement < (0.1 if power else 1e-8):
+            if decrement < (0.1 if power else 1e-12):
                 break
     inertia = np.einsum("i,iab->ab", theta, _UNITS)
     log_width, log_hessian, log_inertia = (np.linalg.slogdet(x)[1] for x in (width, hessian, inertia))
@@ -127,14 +132,16 @@ def _at_scale(
     return theta, inverse, float(TUNING.evidence - TUNING.degrees / 2 * log_width - cost - 0.5 * log_hessian)
 
 
-def _described(theta: np.ndarray, covariance: np.ndarray, log_odds: float, limit: float) -> Payload:
+def _described(
+    theta: np.ndarray, covariance: np.ndarray, quantile: float, log_odds: float, limit: float
+) -> Payload:
     """Return the payload with parameters (10,) and their covariance (10, 10); intervals by linearisation."""
     values = _mass_center_inertia(theta)
     # derivatives by complex steps, which have no rounding error (Squire and Trapp, SIAM Review 40:110, 1998)
     tiny = 1e-30
     steps = [_mass_center_inertia(theta + tiny * 1j * unit).imag for unit in np.eye(10)]
     jacobian = np.array(steps).T / tiny
-    half = TUNING.normal * np.sqrt(np.einsum("ki,ij,kj->k", jacobian, covariance, jacobian))
+    half = quantile * np.sqrt(np.einsum("ki,ij,kj->k", jacobian, covariance, jacobian))
     intervals = np.stack([values - half, values + half], axis=1)
     low, high = intervals[0].tolist()
     return Payload(

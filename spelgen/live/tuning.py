@@ -29,18 +29,17 @@ class LiveTuning:
 
     # Filters (`live.filters`).
 
-    # [kg, kg m, kg m^2] Prior standard deviations of mass, first moments and inertia of a payload: of 20 kg.
-    load_mass: float = 20.0
-    load_moment: float = 4.0
-    load_inertia: float = 0.8
+    # [kg, kg m, kg m^2] Prior standard deviations of mass, first moments and inertia of a payload of 10 kg. The report
+    # removes this prior: larger ones only add rounding errors.
+    load_mass: float = 10.0
+    load_moment: float = 2.0
+    load_inertia: float = 0.4
     # [1] Prior standard deviation of the friction scale.
-    friction: float = 0.03
+    friction: float = 0.01
     # [1/s] Variance per second of the random walk of the friction scale.
-    friction_walk: float = 1e-5
+    friction_walk: float = 1e-4
     # [1] Prior standard deviation of the torque offset, relative to the effort limit.
     offset: float = 0.01
-    # [1] Factor on the variance of the noise: errors of models are larger on other days than between training logs.
-    variance: float = 1.5
     # [1] Residuals beyond this number of standard deviations have a larger noise (Huber, Robust Statistics, 1981).
     outlier: float = 3.0
     # [1] Factor on the variance of friction whose state is unknown: a uniform distribution has 1/3 of the squared
@@ -55,7 +54,7 @@ class LiveTuning:
     # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
     contact_disturbance: float = 8.0
     # [1] Log likelihood ratio, and [s] time in motion, from which on a changed load is accepted.
-    changed: float = 30.0
+    changed: float = 15.0
     changed_after: float = 1.0
     # [s] Time in motion after which the hypotheses are dropped; after `changed_after` if the log likelihood ratio is
     # below `unlikely`.
@@ -69,12 +68,16 @@ class LiveTuning:
     # [1] Smallest standard deviation of the momentum observer, relative to the effort of a joint: logs without noise
     # give positive thresholds.
     min_observer_noise: float = 1e-3
-    # [1] Standard deviation of the friction of a joint that is nearly at rest, relative to its Coulomb friction.
-    resting_friction: float = 0.6
+    # [s] Time constant at which the disturbance is removed from the external torque: longer than it takes to find a
+    # contact, so that the disturbance does not absorb the contact.
+    baseline: float = 0.3
+    # [1] Factor on the thresholds: errors of models are larger on other days than between training logs.
+    other_days: float = 1.22
     # [1/min] Default rate of false alarms.
     alarms_per_minute: float = 1.0
-    # [s] Window of the peaks from which thresholds are found.
+    # [s] Window of the peaks from which thresholds are found, and the fraction of the peaks in the exponential tail.
     window: float = 0.5
+    tail: float = 0.2
 
     # Payload (`live.payload`).
 
@@ -94,9 +97,6 @@ class LiveTuning:
     # [1] Weights of the likelihood below one, powers of 1/4, and Newton steps for each.
     weights: int = 12
     iterations: int = 40
-    # [1] Standard deviations of a 95 % interval.
-    normal: float = 1.96
-
     # [s] Predictions up to this time ahead contain the disturbance.
     disturbance_ahead: float = 0.3
 
@@ -112,6 +112,14 @@ class LiveTuning:
     disturbance_ratios: tuple[float, ...] = (0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5)
     # [1] Lengths of the trials of the payload filter, in blocks: 5 and 10 s.
     trial_blocks: tuple[int, ...] = (25, 50)
+    # [1] Prior of the factor on the covariance of payloads, and the number of trials that it counts as: arms with few
+    # logs have too few trials of their own.
+    prior_variance: float = 2.25
+    prior_trials: int = 4
+    # [1] Speeds below which friction errs more that are compared, relative to the largest speed, and ratios of the
+    # noise at rest to that in motion.
+    resting_speeds: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
+    resting_ratios: tuple[float, ...] = (0, 1, 2, 4, 8, 16)
 
     # Reports (`live.replay`).
 

@@ -210,16 +210,10 @@ def _following_table(joints: Sequence[JointReport]) -> Listing:
     head = ("joint", "lag", "tracking RMS", "steady-state error", "saturated")
     rows = []
     for joint in joints:
-        cells: tuple[str, ...] = ("-",) * 4
-        if joint.following is not None:
-            lag, error = joint.following.lag, joint.following.steady_state_error
-            cells = (
-                "-" if lag is None else f"{1000 * lag:.0f} ms",
-                number(1000 * joint.following.tracking_rms),
-                "-" if error is None else number(1000 * error),
-                percent(joint.following.saturated, 1),
-            )
-        rows.append((joint.name, *cells))
+        x = joint.following or JointFollowing()
+        lag = "-" if x.lag is None else f"{1000 * x.lag:.0f} ms"
+        tracking, error = (number(y and 1000 * y) for y in (x.tracking_rms, x.steady_state_error))
+        rows.append((joint.name, lag, tracking, error, percent(x.saturated, 1)))
     note = (
         "lag: delay of positions after commands; tracking RMS: delayed command minus position; steady-state error: "
         "90th percentile of the distance from the command at rest [mrad, mm]; saturated: fraction of time with "

@@ -45,10 +45,10 @@ class JointFollowing:
     - q) exceeds the effort limit.
     """
 
-    lag: float | None
-    tracking_rms: float
-    steady_state_error: float | None
-    saturated: float | None
+    lag: float | None = None
+    tracking_rms: float | None = None
+    steady_state_error: float | None = None
+    saturated: float | None = None
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,7 @@ CHECKS: list[Check[JointSignals]] = [
         do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
     ),
     Check(
-        "degrees", "error", find_units, unless=("jumps",), expected="radians and rad/s",
+        "degrees", "error", find_units, unless=("jumps",), expected="rad and rad/s, m and m/s",
         do="write 'units' under 'logs' in the robot's YAML, or declare them in the Parquet schema's metadata",
     ),
     Check(

@@ -114,7 +114,7 @@ class JointSignals(NamedTuple):
 
 def is_factor(value: float, unit: float) -> bool:
     """Return True if a factor equals the factor of a unit within a tolerance."""
-    # a measured factor within this ratio counts as the factor of the unit
+    # within this ratio a measured factor is the factor of a unit
     return 0.8 < value / unit < 1.25
 
 

@@ -92,7 +92,7 @@ class LogSegments:
             if size <= self._kept_bytes or len(self._segments) + len(kept) <= 1:
                 self._count += len(pieces)
                 return kept
-            # halving keeps the rest evenly spread, for any files read before
+            # each second segment is dropped, so that the others remain evenly spread
             self.every *= 2
             self._segments = self._segments[::2]
             self._bytes = sum(x.values.nbytes for x in self._segments)

@@ -86,7 +86,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     # loggers have orders of their own, ROS often the alphabetical one
     order = _order_in_cells(table, joints)
     by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in found.items()}
-    # velocities of some joints only are replaced by differentiated velocities of all
+    # without velocities of all joints, all are differentiated: logs have them for all joints or none
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)

@@ -278,7 +278,7 @@ class LogMapping(Group):
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
-            # a stated period may belong to a register, and is then larger than a turn
+            # a stated period may be the range of a register, which is larger than a turn
             unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
             turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
             period = logged.period.model_copy(update=turns)

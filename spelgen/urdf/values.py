@@ -135,7 +135,7 @@ class Element:
             self.error(f"{len(words)} numbers ({excerpt!r})", expected, key=key)
             return []
         for word in words:
-            # no exporter writes numbers of this length: the file is damaged
+            # no exporter writes more digits: the file is damaged
             if len(word) > longest:
                 self.error(f"a number of {len(word)} characters", f"at most {longest}", key=key)
                 return []
