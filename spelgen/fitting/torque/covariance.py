@@ -44,7 +44,7 @@ def parameter_covariance(estimate: TorqueEstimate) -> torch.Tensor:
     covariance = torch.linalg.inv(curvature.sum(dim=0) + prior)
     if blocks > 1:
         jackknife = jackknife_covariance(curvature, descent[:, free], prior)[1]
-        # either alone is too small in some directions: of ten blocks some agree by chance, and the posterior covariance
+        # each of both is too small in some directions: of ten blocks some agree by chance, and the posterior covariance
         # does not know of differences between motions
         covariance = larger_covariance(jackknife, covariance) * student_scale(blocks) ** 2
     return problem.of_all_parameters(covariance)

@@ -275,7 +275,7 @@ def refine(
 ) -> TorqueEstimate:
     """Return the estimate refitted to other samples or residual terms, with the given one as warm start."""
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
-    # the former noise is that of other samples, or without these terms
+    # the former noise belongs to other samples, or to a fit without these terms
     noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
     return alternate(replace(estimate.problem, noise=noise), estimate.state)
 
