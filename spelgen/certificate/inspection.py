@@ -128,13 +128,13 @@ class Inspection:
         # Logs of positions do not determine the scale of torques: kp, mass and friction may be multiplied by a factor.
         rank = servo_rank(self.arm)
         # One known torque parameter determines the scale of a group of joints.
-        known = f"those of {' or of '.join(map(joints_in_ranges, rank.groups))}"
+        determined = f"those of {' or of '.join(map(joints_in_ranges, rank.groups))}"
         if len(rank.groups) == 1:
-            known = "all"
+            determined = "all"
         text = (
             "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2; logs of "
             "positions determine inertia, weight and friction in ratio to kp only: one known kp, mass or load "
-            f"determines {known}"
+            f"determines {determined}"
         )
         undetermined: dict[str, list[int]] = {}
         for name, joint in rank.open:

@@ -135,7 +135,7 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
     for quantity, values in written.items():
         # Relative to the magnitude of each number, so that light bodies count; bounded below against rounding errors.
         scale = np.abs(values).max(axis=0) + (1e-3 * np.abs(values).max() or 1.0)
-        pair = (np.abs(other[quantity] - values) / scale for other in (theirs, ours))
+        pair = (np.abs(samples[quantity] - values) / scale for samples in (theirs, ours))
         differences.append(ReadingDifference(quantity, *(float(apart.max()) for apart in pair)))
     return differences
 

@@ -109,8 +109,8 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
             secant = rise / torch.where(velocity == 0, 1.0, velocity)
             effective = load.inertia + torch.diag_embed(damping + secant)
             velocity = torch.linalg.solve(effective, momentum.unsqueeze(-1)).squeeze(-1)
-            others = applied(load.inertia, velocity) - inertia * velocity
-            velocity = slipped(momentum - others, inertia + damping, bristle_stiffness, bent, reach)
+            coupling = applied(load.inertia, velocity) - inertia * velocity
+            velocity = slipped(momentum - coupling, inertia + damping, bristle_stiffness, bent, reach)
     displacement = h * velocity
     qd = qd + (velocity - qd) / theta
     return ServoState(q + displacement, qd, moved_bristles(z, displacement, drives.reach))

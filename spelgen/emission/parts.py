@@ -91,10 +91,10 @@ def _joint(joint: JointSpec) -> Call:
         limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
     fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
     fields |= {"armature": joint.armature, "gear": joint.gear}
-    shown = _unless(
+    statements = _unless(
         fields | {"typical_range": typical}, gear=joint.gear == 1, typical_range=typical == limits
     )
-    return call("Joint", joint.name, joint.joint_type, **shown)
+    return call("Joint", joint.name, joint.joint_type, **statements)
 
 
 def _link(spec: ModelSpec, link: LinkSpec) -> Call:
@@ -111,14 +111,14 @@ def _link(spec: ModelSpec, link: LinkSpec) -> Call:
         "offset": link.offset,
         "joint_type": link.joint_type,
     }
-    shown = _unless(
+    statements = _unless(
         fields,
         rotation=np.array_equal(link.rotation, np.eye(3)),
         ratio=link.ratio == 1,
         offset=link.offset == 0,
         joint_type=link.joint_type == joint.joint_type,
     )
-    return call("Link", link.name, **shown)
+    return call("Link", link.name, **statements)
 
 
 def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:

@@ -59,9 +59,9 @@ def bundle(arm: str, model: str) -> Bundle:
     needed = {name: definition for name, definition in runtime.definitions.items() if name in used}
     # classes of the rows are defined before the rows, all other definitions after the arm
     rows = [definition for name, definition in needed.items() if name in runtime.rows]
-    others = {name: definition for name, definition in needed.items() if name not in runtime.rows}
-    blocks = tuple(name for name, definition in others.items() if definition.is_block)
-    return Bundle(_imports(used, runtime), _joined(rows), _joined(others.values()), blocks)
+    definitions = {name: definition for name, definition in needed.items() if name not in runtime.rows}
+    blocks = tuple(name for name, definition in definitions.items() if definition.is_block)
+    return Bundle(_imports(used, runtime), _joined(rows), _joined(definitions.values()), blocks)
 
 
 def _joined(definitions: Iterable[Definition]) -> str:

@@ -150,7 +150,7 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
         if isinstance(model, PortHamiltonian):  # gears may connect motors and joints
             inputs = model.input_matrix(q).numpy()
         gravity = model.gravity(q)
-        parts = {
+        curves = {
             "inertia": (model.mass_matrix(q) @ qdd.unsqueeze(-1)).squeeze(-1).numpy(),
             "Coriolis": (model.nonlinear_effects(q, qd) - gravity).numpy(),
             "gravity": gravity.numpy(),
@@ -163,7 +163,7 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
     # the samples are evenly spaced after the filter
     t = np.arange(len(samples.q)) / samples.rate
     # friction includes an offset of the torque
-    stored = parts["inertia"] + parts["Coriolis"] + parts["gravity"]
+    stored = curves["inertia"] + curves["Coriolis"] + curves["gravity"]
     works = {
         "work of the drives": measured,
         "stored": stored,
@@ -180,7 +180,7 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
         qd=samples.qd,
         measured=measured,
         predicted=predicted,
-        parts=parts,
+        parts=curves,
         energy=energy,
     )
 

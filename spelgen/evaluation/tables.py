@@ -248,9 +248,11 @@ def figures(results: Results) -> list[Figure]:
         candidates.append(("joint.nmse", "nMSE of the worst joint's torque", "variance", torque.worst_nmse))
     # the longest horizon is the hardest, and the relevant one for simulation
     for horizon in results.horizons[-1:]:
-        errors, after = horizon.errors[MODEL], f"after {horizon.name}"
-        candidates.append(("rollout.rms", f"rollout error {after}", "motion", errors.mean_relative_rms))
-        candidates.append(("tip.mm", f"tip error {after}", "mm", errors.tip_mm))
+        errors, horizon_name = horizon.errors[MODEL], f"after {horizon.name}"
+        candidates.append(
+            ("rollout.rms", f"rollout error {horizon_name}", "motion", errors.mean_relative_rms)
+        )
+        candidates.append(("tip.mm", f"tip error {horizon_name}", "mm", errors.tip_mm))
     for replay in results.replays:
         label = f"position error, commands replayed, {replay.name}"
         mean = 1000 * replay.errors[MODEL].mean

@@ -53,11 +53,11 @@ class Collisions:
     def __init__(self, arm: Arm, surroundings: Surroundings, bounds: MotionBounds) -> None:
         """Raises LookupError if the URDF has no collision shape that can be read."""
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
-        found = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
-        self.unread = found.unread_text
-        if self.unread and not found.shapes:
+        shapes = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
+        self.unread = shapes.unread_text
+        if self.unread and not shapes.shapes:
             raise LookupError(f"no collision shape can be read: {self.unread}")
-        if not found.shapes:
+        if not shapes.shapes:
             raise LookupError("the URDF has no collision geometry")
         frames = lump_links(robot, choose_chain(robot, chain.joint_names, None), arm.angle_tolerance).frames
         self._model, self._constraint = kinematic_model(chain), body_constraint(chain)
@@ -65,7 +65,7 @@ class Collisions:
         self._bodies: list[int] = []  # body of each object, -1: the root link
         # largest distance of a shape from the origin of its body [m]
         self._extents = np.zeros(len(chain.bodies))
-        for shape in found.shapes:
+        for shape in shapes.shapes:
             frame = frames[shape.link]
             pose = _pose(frame.rotation, frame.position) @ shape.pose
             self._add(shape.link, frame.body, pose, _geometry(shape))

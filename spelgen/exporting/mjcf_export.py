@@ -265,11 +265,11 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
     omitted: dict[str, None] = {}
     poses = link_poses(arm)
     for kind, attributes in _CONTACTS.items():
-        found = link_shapes(
+        shapes = link_shapes(
             arm.robot.path, "visual" if kind == "visual" else "collision", names, TUNING.faces
         )
-        omitted |= dict.fromkeys(found.unread)
-        for shape in found.shapes:
+        omitted |= dict.fromkeys(shapes.unread)
+        for shape in shapes.shapes:
             if shape.mesh is not None and _is_flat(shape.mesh[0]):
                 omitted[shape.link] = None
                 continue

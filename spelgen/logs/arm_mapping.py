@@ -87,18 +87,18 @@ def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | 
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):
-        given = load_mapping(mapping, joints)
+        override = load_mapping(mapping, joints)
     else:
-        given = validated(LogMapping, dict(mapping or {}), YamlDocument(Path("mapping"), None))
+        override = validated(LogMapping, dict(mapping or {}), YamlDocument(Path("mapping"), None))
     if stated is None:
-        return given
+        return override
     return LogMapping.model_validate(
-        _merged(stated.model_dump(exclude_unset=True), given.model_dump(exclude_unset=True))
+        _merged(stated.model_dump(exclude_unset=True), override.model_dump(exclude_unset=True))
     )
 
 
-def _merged(stated: object, given: object) -> object:
+def _merged(stated: object, override: object) -> object:
     """Return the union of two groups of keys, recursively; a key of both has the value of the second."""
-    if isinstance(stated, Mapping) and isinstance(given, Mapping):
-        return {**stated, **{key: _merged(stated.get(key), value) for key, value in given.items()}}
-    return given
+    if isinstance(stated, Mapping) and isinstance(override, Mapping):
+        return {**stated, **{key: _merged(stated.get(key), value) for key, value in override.items()}}
+    return override

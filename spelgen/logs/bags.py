@@ -77,14 +77,14 @@ def _joint_states(path: Path, messages: Sequence[tuple[int, Any]], names: Sequen
                 f"{', '.join(missing)} in it too",
             )
             raise LogError(got, file=path, element=element, expected=expected)
-        places, row = [state.name.index(name) for name in names], []
+        indices, row = [state.name.index(name) for name in names], []
         for field in FIELDS.values():
             logged = np.asarray(getattr(state, field), dtype=float)
             if len(logged) not in (0, len(state.name)):
                 got = f"{len(logged)} values for {len(state.name)} joints"
                 raise LogError(got, file=path, element=f"{element}, {field}", expected="one of each")
             # a field of a message may be empty
-            row.append(logged[places] if len(logged) else np.full(len(names), np.nan))
+            row.append(logged[indices] if len(logged) else np.full(len(names), np.nan))
         times.append(stamp)
         rows.append(row)
     if not rows:
@@ -141,9 +141,9 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
 def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> Iterator[tuple[int, bytes]]:
     """Yield times [ns] and contents of the joint states of one topic."""
     with open_bag(path) as reader:
-        others = {f"{x.topic} ({x.msgtype})" for x in reader.connections}
+        topics = {f"{x.topic} ({x.msgtype})" for x in reader.connections}
         connections = [x for x in reader.connections if x.msgtype == MESSAGE]
-        chosen = _chosen_topic({x.topic for x in connections}, others, topic, path)
+        chosen = _chosen_topic({x.topic for x in connections}, topics, topic, path)
         for _, recorded, raw in reader.messages([x for x in connections if x.topic == chosen]):
             yield recorded, raw
 

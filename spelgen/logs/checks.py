@@ -93,9 +93,9 @@ def run_checks(
         # one message per cause: velocities in degrees would also fail the check of derivatives
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
-        found = check.find(subject)
-        if found is not None:
-            results[check.code] = check, Advice(found) if isinstance(found, str) else found
+        advice = check.find(subject)
+        if advice is not None:
+            results[check.code] = check, Advice(advice) if isinstance(advice, str) else advice
     return list(results.values())
 
 
@@ -211,10 +211,10 @@ class LogChecks:
     def add(self, trajectory: Trajectory) -> None:
         """Add a trajectory."""
         self._count += 1
-        found: list[tuple[Check[Any], Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
-        found += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
-        found += [(REMARKED, Advice(message)) for message in trajectory.remarks]
-        for check, advice in found:
+        findings: list[tuple[Check[Any], Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
+        findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
+        findings += [(REMARKED, Advice(message)) for message in trajectory.remarks]
+        for check, advice in findings:
             self._add(advice.message, check, advice, trajectory)
         products = velocity_products(trajectory)
         self.products += products

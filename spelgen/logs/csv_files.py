@@ -95,8 +95,8 @@ def _beginning(file: Path) -> Beginning:
     # at least one line remains as the header, and one as values
     comments = len(list(takewhile(lambda line: line.startswith("#"), lines[:-1])))
     header, rows = lines[comments], lines[comments + 1 :]
-    others = list(takewhile(lambda x: x and (x == header or not re.search(r"\d", x)), rows[:-1]))
-    return Beginning(encoding, comments, header, len(others), "\n".join(rows[len(others) :]))
+    skipped = list(takewhile(lambda x: x and (x == header or not re.search(r"\d", x)), rows[:-1]))
+    return Beginning(encoding, comments, header, len(skipped), "\n".join(rows[len(skipped) :]))
 
 
 def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:

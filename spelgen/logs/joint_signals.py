@@ -156,9 +156,9 @@ def find_dropouts(signals: JointSignals) -> str | None:
 def find_jumps(signals: JointSignals) -> str | Advice | None:
     """Find signals that jump: undecoded register words, wrapped angles, joined recordings."""
     for name in signals.trajectory.quantities:
-        found = _find_words(signals, name)
-        if found is not None:
-            return found
+        words = _find_words(signals, name)
+        if words is not None:
+            return words
     sound = ~is_outlier(signals.q, smooth=True)
     t, q = signals.trajectory.t[sound], signals.q[sound]
     rows = jumps(t, q)
@@ -255,11 +255,11 @@ def _apparent_inertia(
     # [Hz] below, gravity and friction dominate; links of arms have resonances between 3 and 30 Hz
     lowest, highest = 0.9, 30.0
     frequency = np.fft.rfftfreq(length, 1 / rate)
-    kept = (frequency >= lowest) & (frequency <= min(highest, rate / 3))
-    frequency = frequency[kept]
+    band = (frequency >= lowest) & (frequency <= min(highest, rate / 3))
+    frequency = frequency[band]
     segments = sliding_window_view(np.stack([qd, tau]), length, axis=1)[:, :: length // 2]
     segments = (segments - segments.mean(axis=2, keepdims=True)) * np.hanning(length)
-    velocity, torque = np.fft.rfft(segments, axis=2)[..., kept]
+    velocity, torque = np.fft.rfft(segments, axis=2)[..., band]
     acceleration = velocity * (2j * np.pi * frequency)
     power = np.stack([np.abs(acceleration) ** 2, np.abs(torque) ** 2]).sum(axis=1)
     cross = (acceleration.conj() * torque).sum(axis=0).real

@@ -78,13 +78,13 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
             outliers[first + 1 : second + 1] = True
     if smooth or not outliers.any():
         return outliers
-    others = values[~outliers]
-    margin = np.ptp(others) / 2
-    is_beyond = (values > others.max() + margin) | (values < others.min() - margin) | is_lost(values)
+    inliers = values[~outliers]
+    margin = np.ptp(inliers) / 2
+    is_beyond = (values > inliers.max() + margin) | (values < inliers.min() - margin) | is_lost(values)
     return np.asarray(outliers & is_beyond)
 
 
-def is_stale(values: np.ndarray, changes: np.ndarray, least: float) -> np.ndarray:
+def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.ndarray:
     """Return a mask (T,) of samples that repeat an old value for long, in a signal that otherwise changes.
 
     The step to the value after them is large: quantised signals, and drives with a dead zone, go on with a typical one.
@@ -98,7 +98,7 @@ def is_stale(values: np.ndarray, changes: np.ndarray, least: float) -> np.ndarra
     is_long &= (steps > 4.0 * _usual(steps[:-1])) & (len(starts) > 1)
     for start, length in zip(starts[is_long], lengths[is_long], strict=True):
         rows = slice(start + 1, start + length)
-        if np.ptp(changes[rows]) > least:
+        if np.ptp(changes[rows]) > min_change:
             stale[rows] = True
     return stale
 
@@ -198,13 +198,13 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
         if not is_signed and values.max() >= size:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
-            left = np.abs(np.diff(reading.values))
+            jumps = np.abs(np.diff(reading.values))
             # the steps of a fast motion, or of one across a gap, only become smaller by a period
-            if np.median(left[rows]) > TUNING.jump * usual:
+            if np.median(jumps[rows]) > TUNING.jump * usual:
                 continue
             bends = np.abs(np.diff(reading.values, 2))
             score = (
-                float(np.count_nonzero(left > limit)),
+                float(np.count_nonzero(jumps > limit)),
                 float(bends[np.clip(around, 0, len(bends) - 1)].sum()),
             )
             if score < best_score:

@@ -122,13 +122,13 @@ def _with_matrix_columns(
     if matrix not in arrays.names or arrays[matrix].ndim != 2:
         return mapping
     names = [mapping.log_name(joint) for joint in joints]
-    places = dict(zip(names, _matrix_columns(arrays, matrix, names), strict=True))
+    column_of = dict(zip(names, _matrix_columns(arrays, matrix, names), strict=True))
     columns: dict[str, dict[str, str | None]] = {}
     for joint, name in zip(joints, names, strict=True):
         column = mapping.column(quantity, joint)
         # a joint may have the column of another one
         owners = [x for x in (name, *names) if pattern.replace("{joint}", x) == column]
-        columns[joint] = {quantity: f"{matrix}[{places[owners[0]]}]" if owners else column}
+        columns[joint] = {quantity: f"{matrix}[{column_of[owners[0]]}]" if owners else column}
     return mapping.with_joint_columns(columns)
 
 

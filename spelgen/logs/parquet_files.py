@@ -100,8 +100,8 @@ def _with_scale(
             "'units: {q: normalised}' and 'calibration' under 'logs' convert"
         )
         return mapping, (doubt,) if unit == "deg" else ()
-    found = mapping.calibration or _calibration(folder)
-    if not all(mapping.log_name(joint) in found for joint in unstated):
+    calibration = mapping.calibration or _calibration(folder)
+    if not all(mapping.log_name(joint) in calibration for joint in unstated):
         raise LogError(
             f"positions up to {largest:.4g} without a unit, within LeRobot's normalised range of -100..100",
             file=folder, expected="degrees, or the calibration of the motors",
@@ -110,7 +110,7 @@ def _with_scale(
             "that file into the folder of the data set as calibration.json",
         )  # fmt: skip
     units = mapping.units.model_copy(update={"q": "normalised"})
-    mapping = mapping.model_copy(update={"units": units, "calibration": found})
+    mapping = mapping.model_copy(update={"units": units, "calibration": calibration})
     collect(mapping.misfits(joints))
     return mapping, ("normalised positions were converted by the ranges of the motors' calibration",)
 

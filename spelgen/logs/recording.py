@@ -96,7 +96,7 @@ def _without_repeats(data: np.ndarray, positions: int, mapping: LogMapping) -> R
 def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> Repaired:
     """Return rows (T, C) without lost samples and outliers, and messages that list them."""
     outliers = np.zeros(len(data), bool)
-    found = []
+    dropped = []
     columns = dict(zip(signals, data[:, 1:].T, strict=True))
     for (quantity, joint), values in columns.items():
         rows = outlier_rows(quantity, values)
@@ -105,10 +105,10 @@ def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> R
         # commands may jump
         if quantity != "u" and rows.any():
             outliers |= rows
-            found.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
-    if not found:
+            dropped.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
+    if not dropped:
         return data, ()
-    message = f"{counted(int(outliers.sum()), 'row')} left out as dropouts: {'; '.join(found)}"
+    message = f"{counted(int(outliers.sum()), 'row')} left out as dropouts: {'; '.join(dropped)}"
     return data[~outliers], (message,)
 
 
@@ -133,9 +133,9 @@ def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, 
 
 def listed_times(t: np.ndarray) -> str:
     """Return a text with the first of the times (T,) [s] and the number of the others."""
-    shown = ", ".join(f"{x:.4g}" for x in t[: TUNING.listed].tolist())
-    more = len(t) - TUNING.listed
-    return f"{shown} s" + (f" and {more} more" if more > 0 else "")
+    times = ", ".join(f"{x:.4g}" for x in t[: TUNING.listed].tolist())
+    unlisted = len(t) - TUNING.listed
+    return f"{times} s" + (f" and {unlisted} more" if unlisted > 0 else "")
 
 
 def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaired:

@@ -55,8 +55,8 @@ class LogSegments:
             raise LogError("no rows", file=layout.file, expected="at least one window of samples")
         start, pieces = clock_start(table, layout), []
         for name, rows in _recordings(layout, table):
-            parts = 1 if self._kept_bytes == inf else -(-len(rows) // TUNING.segment_samples)
-            pieces += [(self._recordings, name, part) for part in np.array_split(rows, parts)]
+            count = 1 if self._kept_bytes == inf else -(-len(rows) // TUNING.segment_samples)
+            pieces += [(self._recordings, name, piece) for piece in np.array_split(rows, count)]
             self._recordings += 1
         pieces = self._selected(pieces, 8 * len(layout.columns))
         # a table that is kept completely is converted at once: this is faster, and errors count its rows
@@ -87,11 +87,11 @@ class LogSegments:
     def _selected(self, pieces: list[Piece], row_bytes: int) -> list[Piece]:
         """Return the pieces of a table to keep, after the removal of segments that exceed the bound of memory."""
         while True:
-            kept = pieces[-self._count % self.every :: self.every]
-            size = self._bytes + row_bytes * sum(len(rows) for _, _, rows in kept)
-            if size <= self._kept_bytes or len(self._segments) + len(kept) <= 1:
+            selected = pieces[-self._count % self.every :: self.every]
+            size = self._bytes + row_bytes * sum(len(rows) for _, _, rows in selected)
+            if size <= self._kept_bytes or len(self._segments) + len(selected) <= 1:
                 self._count += len(pieces)
-                return kept
+                return selected
             # each second segment is dropped, so that the others remain evenly spread
             self.every *= 2
             self._segments = self._segments[::2]

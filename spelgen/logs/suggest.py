@@ -77,15 +77,15 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     with reading(file):
         table = log_format.columns(file)
     columns = [_column_name(name) for name in _names(table)]
-    found = _by_quantity(columns, commands, joints)
-    if not found["t"]:
+    columns_of = _by_quantity(columns, commands, joints)
+    if not columns_of["t"]:
         got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
         raise LogError(got, file=file, expected="one of times, called t or time")
     # a header has the time of measurement, other columns may be times of receipt; else the shortest name is used
-    clock = min(found.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
+    clock = min(columns_of.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
     # loggers have orders of their own, ROS often the alphabetical one
     order = _order_in_cells(table, joints)
-    by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in found.items()}
+    by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in columns_of.items()}
     # without velocities of all joints, all are differentiated: logs have them for all joints or none
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
@@ -107,9 +107,9 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         if units.get("q") == "counts":
             lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
     used = {column.name for named in by_joint.values() for column in named.values()}
-    others = [x.name for quantity in by_joint for x in found[quantity] if x.name not in used]
-    if others:  # of a gripper, or of another arm with the same names
-        lines.append(f"# not used: {shortened(others, TUNING.listed)}")
+    unused = [x.name for quantity in by_joint for x in columns_of[quantity] if x.name not in used]
+    if unused:  # of a gripper, or of another arm with the same names
+        lines.append(f"# not used: {shortened(unused, TUNING.listed)}")
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     return _suggestion(lines, missing, "column")
 
@@ -141,9 +141,9 @@ def _column_name(name: str) -> ColumnName:
     """Return a name with its words and its unit; the unit is in brackets, or the last word."""
     bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d]+)[\])]", name)
     base, unit = bracketed.groups() if bracketed else (name, "")
-    known = set().union(*UNITS.values())
+    unit_names = set().union(*UNITS.values())
     last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s)?)", name)
-    if not unit and last and last[2].lower() in known - BARE and last[2] != name[:1]:
+    if not unit and last and last[2].lower() in unit_names - BARE and last[2] != name[:1]:
         base, unit = last.groups()
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", base)
     return ColumnName(name, set(re.findall(r"[a-z]+", separated.lower())), unit.strip().lower())
@@ -153,7 +153,7 @@ def _by_quantity(
     columns: Sequence[ColumnName], commands: bool, joints: Sequence[str]
 ) -> dict[str, list[ColumnName]]:
     """Return the columns per quantity: by the words of their names, or else by their units."""
-    found: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
+    by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
     names = {joint.lower() for joint in joints}
     for column in columns:
         quantity = next((x for x, words in WORDS.items() if column.words & words), None)
@@ -163,9 +163,9 @@ def _by_quantity(
             quantity = "u"
         elif column.words & (NOT_MEASURED - names):
             continue
-        if quantity in found:
-            found[quantity].append(column)
-    return found
+        if quantity in by_quantity:
+            by_quantity[quantity].append(column)
+    return by_quantity
 
 
 def _units(
@@ -202,7 +202,7 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
     for name, column in zip(table.schema.names, table.columns if len(table) else (), strict=False):
         numbers, first = re.findall(r"\d+", name), column[0].as_py()
         if isinstance(first, list):
-            order |= {text: place for place, text in enumerate(first) if text in joints}
+            order |= {text: position for position, text in enumerate(first) if text in joints}
         elif numbers and first in joints:
             order[first] = int(numbers[-1])
     return order
@@ -225,7 +225,7 @@ def _by_joint(
     """Return the column per joint: by the joint's name, else by the last number, in the order of URDF or cells."""
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
     numbers = [(re.findall(r"\d+", column.name), column) for column in columns]
-    numbered = {int(found[-1]): column for found, column in numbers if found}
+    numbered = {int(match[-1]): column for match, column in numbers if match}
     if named or len(numbered) < len(joints):
         return named
     if set(order) == set(joints):

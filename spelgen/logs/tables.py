@@ -88,9 +88,9 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
         if columns.count(name) > 1:
             got, expected = "one column for several joints", "'{joint}' in its name under 'logs'"
             raise LogError(got, file=file, element=element, expected=expected)
-        places = [str(k) for k, other in enumerate(schema.names, start=1) if other == name]
-        if len(places) > 1:
-            got = f"the same name for the columns {', '.join(places)}"
+        numbers = [str(k) for k, column in enumerate(schema.names, start=1) if column == name]
+        if len(numbers) > 1:
+            got = f"the same name for the columns {', '.join(numbers)}"
             raise LogError(got, file=file, element=element, expected="it once", do="rename one of them")
     missing = [x for x in columns if x not in schema.names and not list_element(x, schema.names)]
     if missing:

@@ -246,12 +246,12 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
     # from the command that was held at that time
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
-    held = np.concatenate([u[:1], u[:-1]])  # the command held until each sample
+    previous = np.concatenate([u[:1], u[:-1]])  # the command held until each sample
     corners = np.concatenate(
         [t[:1] - 1e3, t]
     )  # [s] the first command is assumed to hold before the recording
     integral = np.zeros((len(t) + 1, u.shape[1]))
-    integral[1:] = np.cumsum(np.diff(corners)[:, None] * held, axis=0)
+    integral[1:] = np.cumsum(np.diff(corners)[:, None] * previous, axis=0)
     edges = samples[:-1, None] + np.diff(samples)[:, None] * np.arange(steps) / steps
     edges = np.append(edges.ravel(), samples[-1])
     values = [np.interp(edges - delay, corners, column) for column in integral.T]

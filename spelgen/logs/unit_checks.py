@@ -136,10 +136,10 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
         return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
     trajectory, mapping, k = signals.trajectory, signals.trajectory.mapping, signals.number
-    for other, fit in zip(signals.joints, signals.correlations, strict=True):
+    for joint, fit in zip(signals.joints, signals.correlations, strict=True):
         if fit > max(SIGNALS.agreement, correlation):
-            columns = {"qd": mapping.column("qd", other)}
-            return Advice(f"{message}; that of joint {other!r} is", {"columns": columns})
+            columns = {"qd": mapping.column("qd", joint)}
+            return Advice(f"{message}; that of joint {joint!r} is", {"columns": columns})
     exchanged = velocity_products(replace(trajectory, q=trajectory.qd, qd=trajectory.q))
     factors, correlations = velocity_agreement(exchanged)
     if correlations[k, k] > SIGNALS.agreement and abs(factors[k] - 1) < 0.5:
@@ -164,12 +164,12 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
     rate = signals.trajectory.sample_rate
     if signals.trajectory.u is not None or not shows_accelerations(rate):
         return None
-    held = {name: held_samples(signals.signal(name)) for name in signals.measured}
+    repeated = {name: held_samples(signals.signal(name)) for name in signals.measured}
     message = find_held(signals)
-    if message is None or shows_accelerations(rate / max(held.values())):
+    if message is None or shows_accelerations(rate / max(repeated.values())):
         return None
     # positions that are new show the velocities
-    is_mended = all(often == 1 for name, often in held.items() if name != "qd")
+    is_mended = all(often == 1 for name, often in repeated.items() if name != "qd")
     return Advice(message, keys={"velocity": "differentiated"}) if is_mended else message
 
 

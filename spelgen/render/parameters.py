@@ -88,10 +88,10 @@ def base_table(
     note = "Intervals are of 95 % [kg, m, s]"
     if posterior is not None:
         # friction models differ: only base parameters of bodies and armatures are common
-        known = {x.name: x for x in posterior.base_parameters}
-        columns["model, 95 %"] = [known[name].text if name in known else "" for name in names]
+        estimates = {x.name: x for x in posterior.base_parameters}
+        columns["model, 95 %"] = [estimates[name].text if name in estimates else "" for name in names]
         pairs = zip(names, determined, strict=True)
-        determined = [known[name].determined if name in known else word for name, word in pairs]
+        determined = [estimates[name].determined if name in estimates else word for name, word in pairs]
         note += (
             "; a value of least squares may lie outside the interval of the model because of an effect that least "
             "squares has no column for"

@@ -49,9 +49,9 @@ def read_motion(file: Path, joints: Sequence[str]) -> Motion:
         values = np.stack([table[name].cast(pa.float64()).to_numpy() for name in columns], axis=1)
     except (pa.ArrowException, UnicodeError) as error:
         raise refused(f"unreadable ({in_one_line(error)})", expected="CSV of numbers") from error
-    few = len(values) < TUNING.min_samples
-    if few or not np.isfinite(values).all():
-        got = f"{len(values)} rows" if few else "a value that is no finite number"
+    too_short = len(values) < TUNING.min_samples
+    if too_short or not np.isfinite(values).all():
+        got = f"{len(values)} rows" if too_short else "a value that is no finite number"
         raise refused(got, expected=f"{TUNING.min_samples} rows of numbers or more")
     t = values[:, 0]
     steps = np.diff(t)

@@ -70,8 +70,8 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
     """
     dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
     limit = np.array([coordinate.effort or TUNING.servo_effort for coordinate in arm.coordinates])
-    known = [settings.joint(coordinate.name).kp for coordinate in arm.coordinates]
-    kp = np.array([gain or 2 * effort for gain, effort in zip(known, limit, strict=True)])
+    gains = [settings.joint(coordinate.name).kp for coordinate in arm.coordinates]
+    kp = np.array([gain or 2 * effort for gain, effort in zip(gains, limit, strict=True)])
     kd = TUNING.servo_lag * kp
     interval = t[1] - t[0]
     steps = int(np.ceil(interval / TUNING.servo_step))

@@ -53,8 +53,8 @@ def base_parameter_count(arm: Chain) -> int:
 @lru_cache(maxsize=16)  # least squares, checks of logs and closed forms use the same arm
 def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     """Return the base parameters of ``arm``, in the order of the bodies from the root."""
-    places = [INERTIAL_PARAMETERS.index(name) for name in BASE_ORDER]
-    order = [10 * body + place for body in range(len(arm.bodies)) for place in places]
+    indices = [INERTIAL_PARAMETERS.index(name) for name in BASE_ORDER]
+    order = [10 * body + offset for body in range(len(arm.bodies)) for offset in indices]
     result = []
     for row in _reduced_rows(arm, order):
         pairs = zip(order, row, strict=True)

@@ -164,8 +164,8 @@ def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) 
     # most logs contain joint torques, for which no transmission is needed
     optional = Notes(notes.path)
     driven = []
-    for each in xml.findall("joint"):
-        joint, joint_name = Element(optional, each, where), each.get("name") or ""
+    for element in xml.findall("joint"):
+        joint, joint_name = Element(optional, element, where), element.get("name") or ""
         if joint_name not in joints:
             message = f"names the unknown joint {joint_name!r}; {suggestion(joint_name, joints)}"
             notes.warn(joint.line, "unknown-transmission-joint", where, message)
@@ -174,9 +174,9 @@ def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) 
             (joint_name, joint.number_in_text("mechanicalReduction"), joint.number_in_text("offset"))
         )
     actuators = []
-    for each in xml.findall("actuator"):
-        reduction = Element(optional, each, where).number_in_text("mechanicalReduction")
-        actuators.append((each.get("name") or "", reduction))
+    for element in xml.findall("actuator"):
+        reduction = Element(optional, element, where).number_in_text("mechanicalReduction")
+        actuators.append((element.get("name") or "", reduction))
     notes.add_as_warnings(optional)
     # ROS 1 uses an element, some exporters an attribute
     kind = (xml.findtext("type") or xml.get("type") or "").strip()

@@ -16,17 +16,17 @@ Finding = tuple[str, str, int, str]
 
 def lint(robot: Robot) -> list[Diagnostic]:
     """Return the diagnostics of inertials, joints, rigid groups and limits, which the reader sorts by line."""
-    found = [
+    findings = [
         finding
         for link in robot.links
         if link.inertial
         for finding in _lint_inertial(link.name, link.inertial)
     ]
-    found += _lint_placeholders([link.inertial for link in robot.links if link.inertial])
+    findings += _lint_placeholders([link.inertial for link in robot.links if link.inertial])
     moving = [joint for joint in robot.joints if joint.moves]
-    found += [finding for joint in moving for finding in _lint_joint(joint)]
-    found += _lint_groups(robot, moving)
-    warnings = [Diagnostic("warning", code, where, line, message) for code, where, line, message in found]
+    findings += [finding for joint in moving for finding in _lint_joint(joint)]
+    findings += _lint_groups(robot, moving)
+    warnings = [Diagnostic("warning", code, where, line, message) for code, where, line, message in findings]
     return [*warnings, *_unlimited([joint for joint in moving if joint.mimic is None])]
 
 
