@@ -122,6 +122,7 @@ def estimate(
     from spelgen.live.estimator import torque_model
     from spelgen.live.levels import noise_levels
     from spelgen.live.replay import replay
+    from spelgen.live.tuning import TUNING
     from spelgen.logs.read import read_logs
     from spelgen.render.estimate_page import write_estimate
 
@@ -136,7 +137,10 @@ def estimate(
     record: dict[str, object] = {"run": str(run), "page": str(page)}
     record["supported_alarms_per_minute"] = rate = levels.supported_alarms
     record["logs"] = [result.to_dict() for result in results]
-    supported = f"thresholds of contact are supported down to {rate:.2g} false alarms per minute"
+    wanted = alarms or TUNING.alarms_per_minute
+    supported = (
+        f"contact thresholds: {wanted:g} false alarms per minute (training logs support >= {rate:.2g})"
+    )
     answer(format, record, *(result.text() for result in results), supported, f"wrote {page}")
 
 

@@ -35,9 +35,9 @@ class LiveTuning:
     load_moment: float = 2.0
     load_inertia: float = 0.4
     # [1] Prior standard deviation of the friction scale.
-    friction: float = 0.01
+    friction: float = 0.02
     # [1/s] Variance per second of the random walk of the friction scale.
-    friction_walk: float = 1e-4
+    friction_walk: float = 3e-5
     # [1] Prior standard deviation of the torque offset, relative to the effort limit.
     offset: float = 0.01
     # [1] Residuals beyond this number of standard deviations have a larger noise (Huber, Robust Statistics, 1981).
