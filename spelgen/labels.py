@@ -1,7 +1,5 @@
 """Names of joints, units, entries of M and predictors in charts, tables and sentences."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby

@@ -6,8 +6,6 @@ integral. Each function of a reason returns None if it knows none. ``{joints}`` 
 placeholders for the other joints of the entries, and for their axes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction

@@ -8,8 +8,6 @@ of the derivation cannot detect, because the derivation starts from the chain. P
 with rounded angles is also made from the file without rounding.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """The friction state z along a measured path: deflections of the bristles at every sample, in one pass."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Equations of motion M qdd = force at given positions, and one step of their integration."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

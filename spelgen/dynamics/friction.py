@@ -1,7 +1,5 @@
 """Friction of drives: with constant coefficients, and as columns that are linear in the constants of each joint."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Regressor of the bodies of an arm, and dynamics of inertial parameters that need not be physically consistent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

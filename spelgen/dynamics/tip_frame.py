@@ -1,7 +1,5 @@
 """The frame of the tip link of an arm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """ModelSpec -> the parts of a model: one table, from which a model is assembled and a module is written."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass

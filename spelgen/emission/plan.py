@@ -1,7 +1,5 @@
 """Arm, structure and nominal values -> ModelSpec: the function ``derive_spec``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction

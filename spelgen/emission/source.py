@@ -1,7 +1,5 @@
 """Values -> source text: calls, tuples and assignments, laid out to be read."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Text from a URDF becomes string literals and JSON strings in docstrings, never c
 executed.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import re

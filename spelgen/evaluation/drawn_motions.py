@@ -1,7 +1,5 @@
 """The motions that charts show: predictions, torques and replays of median and of largest error."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Arrays and numbers in JSON: five digits, None if not finite."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """--to urdf: the arm's URDF and settings with the trained parameters, and a file with the friction model."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import yaml

@@ -1,7 +1,5 @@
 """The result of a fit, in memory or from a run folder."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

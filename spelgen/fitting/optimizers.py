@@ -4,8 +4,6 @@ The gradient of a few hundred windows costs no more than the gradient of a batch
 the curvature: this matters for simulated logs, which can be fitted to many digits, and for short logs.
 """
 
-from __future__ import annotations
-
 import inspect
 import math
 from abc import ABC, abstractmethod

@@ -4,8 +4,6 @@ The covariance of the fitted parameters (`fitting.torque.covariance`) is propaga
 function f is |df/dx R|^2 with the covariance R R^T. Torque predictions add the residual of held-out samples.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,8 +1,6 @@
 """Search for the hypothesis about the columns of a log with the best fit to its torques: single changes, orders of
 joints, combinations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product

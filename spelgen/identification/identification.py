@@ -1,7 +1,5 @@
 """Method and result of a linear identification: base parameters with standard deviations."""
 
-from __future__ import annotations
-
 import textwrap
 from collections import Counter
 from dataclasses import dataclass, field

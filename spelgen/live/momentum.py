@@ -7,8 +7,6 @@ The generalised momentum p = M qd of the arm, and P theta of a payload with the 
 with L the Lagrangian (De Luca and Mattone, ICRA 2005): no acceleration is needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

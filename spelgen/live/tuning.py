@@ -1,7 +1,5 @@
 """Constants of the estimator; noise levels are found from the training logs (`live.levels`)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Check logs against the robot: limits of its joints, and the gravity of its URDF in each joint's torque."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial

@@ -4,8 +4,6 @@ All charts have the same margins, so that the time axes of charts in a column ar
 element contain the axes, from which a script computes the values at a pixel.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The charts of a run's report, from the traces of its evaluation, its metrics and the coverage of its logs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

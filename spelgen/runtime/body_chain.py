@@ -1,7 +1,5 @@
 """The bodies of an arm: inertial parameters; positions, velocities and accelerations of their masses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

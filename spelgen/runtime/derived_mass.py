@@ -3,8 +3,6 @@
 Also M from constants only, and M^-1(q) over all three axes of every joint, without any structure of the arm.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Friction of each joint with trained constants and a hysteresis state."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Inertials are perturbed; the drives have armature, viscous friction, Coulomb fri
 presliding hysteresis. The result is a URDF with a settings file: the ground truth of simulated logs.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -6,8 +6,6 @@ initial parameters with and without a dead zone, under the load and the delay of
 independent. A dead zone is kept if it lowers the joint's negative log posterior by more than significance^2 / 2.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

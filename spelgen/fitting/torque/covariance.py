@@ -1,7 +1,5 @@
 """Errors of a torque fit: covariance of its parameters, and torque residual of samples that were not fitted."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """Torque residual of rigid bodies, drives and friction on samples, with its Jacobian and normal equations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import NamedTuple

@@ -5,8 +5,6 @@ spring. Such features are therefore compared after orthogonalization against the
 regression (Frisch and Waugh, Econometrica 1:387, 1933).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple

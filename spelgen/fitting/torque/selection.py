@@ -9,8 +9,6 @@ are repeated with the held-out samples at positions within the range of the fitt
 extrapolate. Of the accepted candidates of a joint the one with the largest error reduction is selected.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
