@@ -57,8 +57,7 @@ def excite(
             motion; in the approach, the acceleration that reaches the used speed in one second.
         start: position from which the approach starts, (n,) [rad, m]; default: zero if the limits allow it, per joint,
             otherwise the middle of the range.
-        surroundings: floor, boxes and clearance, or the path of a YAML file with these; default: no floor, no boxes,
-            10 mm.
+        surroundings: floor, boxes and clearance, or the path of a YAML file; default: a clearance of 10 mm.
         trials: evaluations of the criterion by the optimizer, in addition to 40 random motions.
         seed: of the random motions.
         progress: is called with the numbers of finished and of all trials.
