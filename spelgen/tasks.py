@@ -66,7 +66,7 @@ def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     import ray
 
-    cluster: dict[str, object] = {"address": address}
+    cluster: dict[str, Any] = {"address": address}
     if address is None:
         # Without the dashboard, which opens a port. Tasks exchange only paths and a few numbers: 100 MB are plenty.
         cluster = {"num_cpus": jobs, "include_dashboard": False, "object_store_memory": 100_000_000}
