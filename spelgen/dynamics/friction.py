@@ -11,7 +11,7 @@ from spelgen.settings.settings import JointSettings
 
 
 class DampedJoint(Protocol):
-    """A joint with <dynamics> of a URDF."""
+    """A joint with the damping and friction of <dynamics> in a URDF."""
 
     @property
     def name(self) -> str: ...
@@ -77,7 +77,7 @@ def joint_friction(
             losses.append((drive.viscous, *drive.coulomb))
         else:
             losses.append((joint.damping, joint.friction, -joint.friction))
-    # Without coupling two products with C are saved in each step of an integration.
+    # Drives that are not coupled have C = 1: without it each integration step saves two matrix products.
     if speeds is not None and np.array_equal(speeds, np.eye(len(speeds))):
         speeds = None
     viscous, forward, backward = np.array(losses).T

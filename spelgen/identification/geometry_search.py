@@ -209,7 +209,7 @@ def _refined(
 def _with_offset(
     problem: GeometryProblem, base: HypothesisFit, joint: int, revolute: bool
 ) -> list[HypothesisFit]:
-    """Return the fit with the best zero offset of a joint; an empty list for an offset below calibration errors."""
+    """Return the fit with the best zero offset of a joint, in a list that is empty if the offset is negligible."""
     reading = base.hypothesis
     unit = np.eye(len(reading.offset))[joint]
     smallest = GEOMETRY.min_angle if revolute else GEOMETRY.min_shift

@@ -108,7 +108,7 @@ class JointFunction:
 
 
 class ProjectedTerms(NamedTuple):
-    """Torques of position that a fit eliminates: linear terms per joint, and the candidates they consist of."""
+    """Position-dependent torques, eliminated in a fit: the linear terms per joint, and the candidates they join."""
 
     terms: dict[int, LinearTerms]
     candidates: tuple[JointFunction, ...]
