@@ -214,7 +214,7 @@ class TorqueEstimate:
     """MAP estimate: the problem with its noise and prior, and the solver's last state.
 
     covariance: (K, K), posterior covariance of x. After `alternate` it is the one under the noise and prior before
-    their last update; `with_current_covariance` recomputes it. termination: of the last call of the solver.
+    their last update; `with_current_covariance` recomputes it.
     """
 
     problem: TorqueProblem
