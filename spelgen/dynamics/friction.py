@@ -48,9 +48,9 @@ class DriveFriction:
         return self.torque(qd, np.tanh(v / self.smoothing_velocity))
 
     def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the joint torque (..., n) at velocity qd (..., n), with the direction of dry friction given.
+        """Return the joint friction torque (..., n) at velocities qd (..., n) for a direction of dry friction.
 
-        direction: (..., n) in [-1, 1], of the drives: s of `__call__`, or the direction of a friction state.
+        direction: (..., n) in [-1, 1] per drive: tanh(v / smoothing_velocity), or from the friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
         # s (f - b) / 2 + s^2 (f + b) / 2 is f at s = 1, b at s = -1, and has no jump between them.

@@ -234,7 +234,7 @@ class LogChecks:
         self._results.setdefault((group, check), []).append(occurrence)
 
     def findings(self) -> Findings:
-        """Return the findings: errors per check, with all its joints; notes per check and joint, or message."""
+        """Return the findings: one error per check, with all its joints; one note per check and joint or message."""
         summary = Findings()
         groups: dict[tuple[AnyCheck, str], list[str]] = {}
         for (group, check), occurrences in self._results.items():

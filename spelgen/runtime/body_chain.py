@@ -19,7 +19,7 @@ class ChainConfiguration(NamedTuple):
     mass: Tensor  # square roots of the masses, (..., 1, bodies, 4)
     axes: Tensor  # twist of a body per rate of its own displacement, (..., 6, bodies)
     jacobian: Tensor  # of the points, zero for bodies that a body does not carry, (..., bodies, 12 bodies)
-    weight: Tensor  # -gravity, the equivalent acceleration of the base, (..., 12 bodies)
+    weight: Tensor  # -gravity, the equivalent acceleration of the base, times root masses, (..., 12 bodies)
 
 
 class BodyChain(nn.Module):
