@@ -59,7 +59,7 @@ def read_bytes(
 
 
 def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
-    """Return the object in a JSON file. Raises ``error`` if the file is absent, malformed, or has no object at the top."""
+    """Return the object in a JSON file. Raises ``error`` if the file is absent, malformed, or contains no object."""
     try:
         content = json.loads(read_bytes(path, error))
     except (ValueError, RecursionError) as problem:

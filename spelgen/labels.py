@@ -35,7 +35,7 @@ BASE_ORDER = ("Izz", "Ixx", "Ixy", "Ixz", "Iyz", "hx", "hy", "m", "Iyy", "hz")
 
 
 def parameter_name(index: int) -> str:
-    """Return the name of an inertial parameter, index from 0: ``Izz2`` is the tensor component zz of the second body."""
+    """Return the name of an inertial parameter (index from 0), such as ``Izz2``: component zz of the second body."""
     return f"{INERTIAL_PARAMETERS[index % 10]}{index // 10 + 1}"
 
 
@@ -72,7 +72,7 @@ def joints_in_ranges(joints: tuple[int, ...]) -> str:
 
 
 def entry_name(row: int, column: int) -> str:
-    """Return the name of an entry of M, ``M21`` for row 1 and column 0; a comma separates numbers above 9: ``M12,1``."""
+    """Return the name of an entry of M: ``M21`` for row 1 and column 0; with a comma from ten on, ``M12,1``."""
     # Without a comma M111 could mean row 1 and column 11, or row 11 and column 1.
     comma = "," * (max(row, column) >= 9)
     return f"M{row + 1}{comma}{column + 1}"

@@ -1,4 +1,4 @@
-"""The model that is evaluated, with its fit and its arm if they are known."""
+"""The model that is evaluated, with its fit and its arm if these are known."""
 
 import copy
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,11 @@ from spelgen.urdf.read import read_urdf
 
 @dataclass(frozen=True)
 class Subject:
-    """The evaluated model. joints: names as in the URDF and in logs. urdf: of its robot, fit: None if unknown."""
+    """The evaluated model.
+
+    joints: names of the joints in the URDF and in logs. urdf: URDF of the robot; None if unknown. fit: fit of the
+    model; None if unknown.
+    """
 
     model: ArmModel
     joints: Sequence[str]
@@ -36,12 +40,12 @@ class Subject:
 
     @property
     def spec(self) -> ModelSpec | None:
-        """Specification of the model; None of a model that was not built from a URDF."""
+        """Specification of the model; None for a model that was not built from a URDF."""
         return spec_of(self.model)
 
     @property
     def window(self) -> int:
-        """Number of samples of the windows that it was fitted to, or a typical one."""
+        """Number of samples of the training windows; a typical number for a model not fitted to windows."""
         if self.fit is not None and isinstance(self.fit.config, OnWindows):
             return self.fit.config.window
         return TUNING.model_window
@@ -55,18 +59,18 @@ class Subject:
 
     @property
     def trained_on(self) -> frozenset[str]:
-        """Names of its training and validation logs."""
+        """Names of the training and validation logs of the model."""
         names = [] if self.fit is None else [*self.fit.record.training, *self.fit.record.validation]
         return frozenset(names)
 
     @property
     def baselines(self) -> FittedBaselines:
-        """The baselines that were fitted with it; {} if there are none."""
+        """Baselines that were fitted to the training logs of the model; {} if there are none."""
         return {} if self.fit is None else self.fit.baselines
 
     @property
     def fitted_arm(self) -> Arm | None:
-        """The arm that the baselines of its fit were fitted for. Raises UrdfError, ArmError or SettingsError."""
+        """Arm for which the baselines of the fit were fitted. Raises UrdfError, ArmError or SettingsError."""
         urdf = None if self.fit is None else self.fit.urdf
         return arm_of_model(self.model, urdf) if urdf is not None and self.baselines else None
 
@@ -85,7 +89,7 @@ class Subject:
 
     @property
     def linear_servos(self) -> LinearServoRecord | None:
-        """Parameters of the linear servos that were fitted with it."""
+        """Parameters of the linear servos that were fitted to the training logs of the model."""
         servo = None if self.fit is None else self.fit.record.servo
         linear: LinearServoRecord | None = None if servo is None else servo["linear"]
         return linear
@@ -110,13 +114,13 @@ def read_test_logs(
 ) -> list[Trajectory]:
     """Return the test logs of a run's arm: the files test.* of a folder, or all files if none has this name.
 
-    mapping: None: the mapping of the training logs.
+    mapping: mapping of the log columns; None for the mapping of the training logs.
     """
     run = RunFolder(folder)
     record, spec = run.read_record(), run.read_spec()
-    # test logs usually come from the same logger as the training logs
+    # By default the mapping of the training logs is used, since test logs usually come from the same logger.
     if mapping is None:
         mapping = record.mapping
-    elif isinstance(mapping, str | Path) and run.urdf.exists():  # it may contain all joints of the URDF
+    elif isinstance(mapping, str | Path) and run.urdf.exists():  # the mapping may contain all joints of the URDF
         mapping = load_mapping(mapping, read_urdf(run.urdf).joint)
     return read_logs(paths, spec.joint_names, mapping, "test", joint_types=spec.joint_types)

@@ -117,7 +117,7 @@ def computed_torque(
     """
     q, qd, qdd = motion
     mass = dynamics.mass_matrix(q)
-    # A joint with dominant viscous friction follows viscous qd = k e: k = viscous omega gives the time constant 1/omega.
+    # With dominant viscous friction, viscous qd = k e: k = viscous omega gives the time constant 1 / omega.
     slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
     torque = mass @ (qdd + 2 * omega * velocity_error + omega**2 * error) + slow * error
     return np.asarray(torque + dynamics.nonlinear_effects(q, qd) + friction(qd))
