@@ -123,9 +123,9 @@ def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
 
 
 def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
-    """Return ten seconds from the middle of each log, as logs begin and end at rest, at the samples of a chart."""
+    """Return ten seconds of each log, subsampled for charts: from the middle, as logs begin and end at rest."""
     motions = []
-    # logs too slow for accelerations by a filter still show their torques
+    # At a low sample rate a filter gives no accelerations; torques are then shown per sample interval, see `_steps`.
     slow = [piece for piece in logs.pieces if not shows_accelerations(piece.sample_rate)]
     for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
@@ -164,7 +164,7 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
     measured = _at_joints(inputs, samples.tau)
     # After the filter, samples are evenly spaced.
     t = np.arange(len(samples.q)) / samples.rate
-    # friction includes an offset of the torque
+    # The friction term of the model includes the constant torque offset.
     stored = curves["inertia"] + curves["Coriolis"] + curves["gravity"]
     works = {
         "work of the drives": measured,

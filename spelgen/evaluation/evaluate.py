@@ -134,10 +134,10 @@ def _evaluate_torques(
     truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
-    """Evaluate the torques, and the motion under the logged torques."""
+    """Evaluate the inverse dynamics, and the motion predicted under the logged torques."""
     samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=tested.reach)
     samples = [sample for sample in samples if len(sample.q)]
-    # a rollout needs an initial sample and one more
+    # A rollout needs at least two samples: the initial state and one prediction.
     pieces = used.pieces(logs, shortest=2)
     tests = EvaluatedLogs(pieces, samples, used, tested.reach, tested.model.joint_types)
     lengths = horizon_lengths(tests, *ahead, notes)

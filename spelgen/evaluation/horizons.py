@@ -140,7 +140,7 @@ class EvaluatedLogs:
         return max(map(len, self.pieces)) - 1
 
     def stride(self, span: int, window_count: int) -> int:
-        """Return the number of samples from one window's start to the next, for `window_count` windows of `span` steps."""
+        """Return the samples from the start of a window to the next, for `window_count` windows of `span` steps."""
         return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // window_count)
 
     def starts(self, span: int, window_count: int) -> list[tuple[Trajectory, int]]:
@@ -191,9 +191,9 @@ def predict(
     tip: TipPosition | None,
     notes: list[Diagnostic],
 ) -> tuple[Horizon, Predictions]:
-    """Evaluate rollouts of `steps` samples: open loop, and with the disturbance observed before they start."""
+    """Evaluate rollouts of `steps` samples: open loop, and with the disturbance observed before the rollout starts."""
     past = past_steps(logs.rate)
-    # without room for the past, the open-loop prediction is still evaluated
+    # If the logs are too short for the observer before a rollout, only open-loop predictions are evaluated.
     if past + steps > logs.longest:
         message = f"no observer over {name}: the longest trajectory has {logs.longest} steps"
         notes.append(Diagnostic("info", "no-observer", "logs", None, message))

@@ -52,9 +52,9 @@ class Subject:
 
     @property
     def reach(self) -> BristleReach:
-        """Break-away displacement (n, K) [rad, m] of the bristles of its friction, or a typical one."""
+        """Break-away displacements (n, K) [rad, m] of friction bristles; typical ones if the model has no bristles."""
         reach = bristle_reach(self.model)
-        # if the model's friction has no state, z is still computed for least squares with bristles
+        # Without bristles in the model, z is still needed for the baseline of least squares with bristles.
         return reach if reach.elements else reach_of(self.model.joint_types)
 
     @property
@@ -75,12 +75,12 @@ class Subject:
         return arm_of_model(self.model, urdf) if urdf is not None and self.baselines else None
 
     def assessed(self, results: Results) -> Results:
-        """Return the results of its evaluation with their assessment."""
+        """Return the results of the evaluation of this model, with the assessment added."""
         limits, independent = [], []
         if self.spec is not None:
             depends = {*self.spec.potential, *(k for entry in self.spec.entries for k in entry[3])}
             for k, joint in enumerate(self.spec.joints):
-                # a single limit states no range
+                # A joint with only one limit has no range.
                 bound = None if joint.lower is None or joint.upper is None else (joint.lower, joint.upper)
                 limits.append(bound)
                 if k not in depends:
@@ -96,14 +96,14 @@ class Subject:
 
 
 def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = None) -> Subject:
-    """Return the subject of an evaluation: a model, a fit or the folder of a run; arm: see `evaluate`."""
+    """Return the subject of an evaluation. tested: a model, a fit or the folder of a run. arm: see `evaluate`."""
     if isinstance(tested, str | Path):
         tested = load_run(tested)
     model, fit = (tested.model, tested) if isinstance(tested, Fit) else (tested, None)
     urdf = None if fit is None else fit.urdf
     if arm is not None:
         urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
-    # logs are float64 on the CPU
+    # Logs are read as float64 on the CPU, so the model must have the same type and device.
     if any(weights.dtype != torch.float64 or not weights.is_cpu for weights in model.parameters()):
         model = copy.deepcopy(model).double().cpu()
     return Subject(model, model.joint_names, urdf, fit)

@@ -130,7 +130,7 @@ def sines(
 
 
 def _amplitude(arm: Chain, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the amplitudes (n,) [rad; m] of sines within low..high, (n,) each. Raises SettingsError for larger ones."""
+    """Return the amplitudes (n,) [rad; m] of sines within low..high, (n,) each. Raises SettingsError beyond these."""
     amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()
     if "amplitude" not in settings.tracking.model_fields_set:
         amplitude = np.minimum(amplitude, SIMULATION.used_range * (high - low) / 2)
