@@ -71,7 +71,7 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
 
 def without_past(windows: Windows, past: int) -> Windows:
-    """Return the windows without their first `past` steps; the friction state z belongs to the new first sample."""
+    """Return the windows without their first `past` steps; z is still the friction state before these steps."""
     dt, q, qd, tau = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
     return Windows(dt, q, qd, tau, windows.z)
 
@@ -210,7 +210,7 @@ def predict(
             continue
         with torch.no_grad():
             started, disturbance = observe(integrable(predictor.solver.dynamics), windows, past)
-        # Both rollouts run in one batch: the time depends on the number of operations, not on their size.
+        # Both rollouts form one batch, which needs half as many operations.
         disturbances = torch.cat([torch.zeros_like(disturbance), disturbance])
         q, qd = predictor.solver(joined([started, started]), disturbances)
         count = len(started)

@@ -213,7 +213,7 @@ def _by_joint(
 ) -> Table:
     """Return a table with a row for each joint; the unit is in the title if all joints have the same."""
     units = [asdict(UNITS[joint_type])[quantity] for joint_type in results.joint_types]
-    # a unit per row only if needed: it makes the first column wide
+    # If all joints have the same unit, it is in the title: a unit in each row would widen the first column.
     labels, common = results.joints, f" [{units[0]}]"
     if len(set(units)) > 1:
         pairs = zip(results.joints, units, strict=True)

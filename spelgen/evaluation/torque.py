@@ -104,7 +104,7 @@ def _mean(nmse: np.ndarray) -> float | None:
 def coarse_torques(
     logs: Sequence[Trajectory], joints: Sequence[str], notes: list[Diagnostic]
 ) -> dict[str, float]:
-    """Return joint -> quantisation step [Nm, N] for joints whose torque spans only a few steps; add a note for each."""
+    """Return joint -> quantisation step [Nm, N], for joints whose torque is not much larger than it; add notes."""
     steps = {}
     for k, joint in enumerate(joints):
         # A log without quantisation counts as infinite; the median is finite if most logs are quantised.

@@ -93,10 +93,13 @@ def motion_traces(
     predictions: Predictions | None,
     tip: TipPosition | None,
 ) -> Traces:
-    """Return all curves of an arm under torques. dynamics: by predictor. predictions: over the longest horizon."""
+    """Return all curves of an arm under torques.
+
+    dynamics: name of a predictor -> dynamics. predictions: predictions over the longest horizon.
+    """
     growth: Growth | None = None
     predicted: tuple[PredictedMotion, ...] = ()
-    # errors are divided by the motion, which is zero at rest
+    # At rest there are no relative errors, because errors are divided by the motion.
     if predictions is not None and predictions.windows.q.diff(dim=1).abs().max() >= AT_REST:
         errors = _relative_errors(predictions, logs.joint_types)
         growth = _growth(predictions, errors, tip)

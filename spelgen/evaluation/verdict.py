@@ -115,7 +115,7 @@ def _assess_torques(results: Results, uses: _Uses) -> None:
 
 
 def _worst_torque(results: Results) -> tuple[str, float]:
-    """Return the joint of the largest nMSE of the model, and its nMSE; joints of coarsely quantised torque are omitted."""
+    """Return the joint of the model's largest nMSE, and the nMSE; joints of coarsely quantised torque are omitted."""
     torque = results.torque.get(MODEL)
     pairs = [] if torque is None else zip(results.joints, torque.joint_nmse, strict=False)
     worst = ("", -math.inf)
@@ -177,7 +177,7 @@ def _better_baselines(results: Results) -> list[str]:
         if errors[best] < model_error:
             better.setdefault(best, []).append(f"after {horizon.name}")
     torque = {name: x.mean_nmse for name, x in results.torque.items() if x.mean_nmse is not None}
-    # Torques are compared without an observer, since inverse dynamics has no observer.
+    # Torques are compared without the observer, which only corrects predictions of motion.
     best = min(torque, key=torque.__getitem__, default=MODEL)
     if MODEL in torque and best != MODEL:
         better.setdefault(best, []).append("in torque")
@@ -208,7 +208,7 @@ def _worst_joint(results: Results) -> tuple[str, str, str]:
 
 
 def _worst_motion(results: Results) -> tuple[str, float]:
-    """Return the joint of the largest error at the longest horizon, divided by the motion of the joint, and the error."""
+    """Return the joint of the largest relative error at the longest horizon, and the error divided by the motion."""
     for last in results.horizons[-1:]:
         errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN
         if np.isfinite(errors).all():
@@ -217,7 +217,7 @@ def _worst_motion(results: Results) -> tuple[str, float]:
 
 
 def _slow_or_fast(results: Results, k: int) -> str:
-    """Return the words for slow or fast motion of joint k: the one of larger torque residual, or "" if similar."""
+    """Return the words for slow or fast motion of joint k: for the larger torque residual, or "" if neither is."""
     if not results.traces.torques:
         return ""
     residuals, speeds = [], []
@@ -226,7 +226,7 @@ def _slow_or_fast(results: Results, k: int) -> str:
         speeds.append(np.abs(trace.qd[:, k]))
     squares, speed = np.square(np.concatenate(residuals)), np.concatenate(speeds)
     slow = speed < TUNING.slow * np.nanmax(speed)
-    # a root mean square needs more than five samples
+    # With at most five slow or fast samples a root mean square is too uncertain.
     if not 5 < slow.sum() < len(slow) - 5:
         return ""
     ratio = np.sqrt(np.nanmean(squares[slow]) / np.nanmean(squares[~slow]))
@@ -243,11 +243,14 @@ def _recommendations(
     worst: str,
     speed: str,
 ) -> dict[str, str]:
-    """Return motions to record, the most useful first, with reasons. worst: the worst joint, at `speed`."""
+    """Return motions to record, with reasons, the most useful first.
+
+    worst: joint of the largest error. speed: words for the speed of larger error, see `_worst_joint`.
+    """
     recommendations = {}
     trained = identified.get("coverage") or {}
     unseen = identified.get("unseen_directions")
-    # first: parameters that no log determines cannot be improved by any further fit
+    # Undetermined parameters come first: no further fit to these logs can improve them.
     if unseen:
         reason = f"The training logs do not excite {unseen} directions of the base parameters."
         recommendations["a richer motion (as spelgen excite proposes)"] = reason
@@ -274,14 +277,14 @@ def _recommendations(
 def _outside(
     trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str], independent: Collection[str]
 ) -> list[str]:
-    """Return the quantities whose range in the test logs exceeds their range in the training logs by a tenth."""
+    """Return the quantities whose range in the test logs exceeds the range in the training logs by a tenth."""
     exceeded = []
     for quantity, word in (("q", "positions"), ("qd", "velocities")):
         ranges = zip(joints, trained.get(quantity, ()), tested.get(quantity, ()), strict=False)
         for name, inner, outer in ranges:
             if quantity == "q" and name in independent:
                 continue
-            # a tenth: models extrapolate a little without harm
+            # A tenth is tolerated, because models extrapolate over small distances.
             room = 0.1 * (inner["high"] - inner["low"])
             if outer["low"] < inner["low"] - room or outer["high"] > inner["high"] + room:
                 exceeded.append(f"{word} of {name}")
