@@ -49,7 +49,7 @@ def roll_out_stiff(
         inside = ((qd.abs() <= TUNING.bounds * largest) & q.isfinite()).all(dim=-1, keepdim=True)
         if not inside.any():
             break
-        # NaN propagates to all later samples
+        # A diverged state becomes NaN, which propagates to all later samples.
         q, qd = torch.where(inside, q, torch.nan), torch.where(inside, qd, torch.nan)
         positions[:, k], velocities[:, k] = q, qd
     return positions, velocities
@@ -166,12 +166,12 @@ class Solver:
 
 
 def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
-    """Return the solver with the fewest steps per sample interval that suffice: twice as many change little."""
+    """Return the solver with the fewest steps per sample interval for which doubling the steps changes little."""
     windows = thinned(probe, TUNING.probed_windows)
     motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
     solver = Solver(dynamics, 1)
     coarse = solver(windows)[1]
-    # only dynamics that diverge would need shorter steps, and cannot be predicted with them either
+    # The step length has a lower bound: diverging dynamics cannot be predicted with shorter steps either.
     max_substeps = min(TUNING.most_substeps, windows.dt.mean().item() / TUNING.shortest_step)
     while 2 * solver.substeps <= max_substeps:
         finer = replace(solver, substeps=2 * solver.substeps)

@@ -131,10 +131,10 @@ def simulated_figures(
 
 
 def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
-    """Return the median time of the loss of a batch and its gradient, without the optimizer [s]."""
+    """Return the median time to compute the loss of a batch and its gradient [s]; the optimizer is not included."""
     windows = spread_windows(logs, config.window, decimation)[: config.batch or DEFAULTS.batch]
     scales = loss_scales(windows, model.joint_types)
-    # Loaded models are frozen; a training step needs gradients.
+    # Parameters of loaded models are frozen, but a training step needs gradients.
     model.requires_grad_(True)
     durations = []
     for _ in range(TUNING.timed_steps):
@@ -154,7 +154,7 @@ def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) ->
 
 
 def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> PredictionLoss:
-    """Return the loss of predictions from the first sample of each window, with `substeps` integrator steps per sample."""
+    """Return the loss of predictions from the first sample of the windows. substeps: integrator steps per sample."""
     with torch.no_grad():
         q, qd = roll_out(model, windows, substeps)
         difference = position_difference(q, windows.q[:, 1:], model.joint_types)
@@ -171,7 +171,7 @@ def sizes(model: ArmModel) -> Sizes:
         for name, module in model.named_modules():
             masks = [x for key, x in module.named_buffers(recurse=False) if key.startswith("mask")]
             if masks and quantity in name.split("."):
-                # Only outputs that depend on a joint are counted: V of an arm without gravity has one output without inputs.
+                # Outputs without inputs are not counted: V of an arm without gravity has one such output.
                 count = int(masks[-1].flatten(1).any(dim=1).sum())
                 if quantity == "mass":
                     inputs = int(masks[0].flatten(1).any(dim=0).sum())

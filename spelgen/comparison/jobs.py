@@ -98,11 +98,11 @@ class Job(Group):
 
     @property
     def key(self) -> str:
-        """Return a digest of all that the result depends on; the places of files are not part of it."""
+        """Return a hash of all inputs of the run; paths of files are not included."""
         protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
         options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
-        # The content of the design, not its name: a YAML file may have changed.
-        # another version of spelgen may have other results
+        # The content of the design is included, and not its name, since a YAML file may have changed.
+        # The version is included, since results may differ between versions of spelgen.
         sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
         return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
 
@@ -125,11 +125,11 @@ class Job(Group):
         return result if result.key == self.key else None
 
     def config(self, model: ArmModel) -> FitConfig | FitOptions:
-        """Return the configuration of the fit, or its options."""
+        """Return the configuration of the fit to simulated logs, or the options of the fit to logs of the user."""
         if self.inputs.truth is not None:
             return self.equal_steps()
         objective = self.training.objective
-        # a momentum fit is for networks: the other presets of the comparison have their default
+        # The momentum objective is for networks only; rigid-body presets are fitted with their default objective.
         if objective == "momentum" and isinstance(model, RigidBodyDynamics):
             objective = None
         return FitOptions(objective, {}, self.training.options)
@@ -192,7 +192,7 @@ def run_job(job: Job) -> RunResult:
 
 
 def _own_checkpoint(job: Job, run: RunFolder) -> bool:
-    """Return whether the folder has a checkpoint of this run; a checkpoint with another key is deleted."""
+    """Return whether the folder has a checkpoint of this run; a checkpoint with another key is discarded."""
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()
@@ -202,12 +202,12 @@ def _own_checkpoint(job: Job, run: RunFolder) -> bool:
 
 
 def _errors(results: Results) -> Errors:
-    """Return the errors of all predictors, by measure: replays, horizons from the longest on, torque."""
+    """Return measure -> predictor -> error, in the order replays, horizons (longest first), torque."""
     errors: Errors = {}
     for replay in results.replays:
         measure = f"position RMS, {replay.name} [{thousandths(results.joint_types)}]"
         errors[measure] = {name: 1000 * error.mean for name, error in replay.errors.items()}
-    # the first measure ranks the models: the longest horizon is the hardest
+    # The first measure ranks the models: long horizons come first, since they are the most difficult.
     for horizon in reversed(results.horizons):
         open_loop = [name for name in horizon.errors if not name.endswith(observed(""))]
         relative = {name: horizon.errors[name].mean_relative_rms for name in open_loop}

@@ -23,7 +23,7 @@ class TorqueErrors:
 
     The nMSE is the mean squared error divided by the variance of the torque. nmse: nMSE per trajectory, mean over
     joints. All other errors are pooled over the samples of all trajectories, so that a short log has little weight.
-    joint_nmse: nMSE per joint. rmse: RMS error per joint [Nm, N]. Both are None for a joint of constant torque.
+    joint_nmse: nMSE per joint, None for a joint of constant torque. rmse: RMS error per joint [Nm, N].
     mean_nmse: mean nMSE over joints. nmse_with_pauses: mean nMSE over joints, pauses between motions included.
     """
 
