@@ -30,8 +30,8 @@ SIMULATED_PRESETS: tuple[str, ...] = ("phnode", "spel", "spel-kan", "minimal", "
 class Study:
     """A comparison that is ready to run.
 
-    jobs: all runs. results: name of a finished run -> result. failures: name of an arm or run -> reason. estimates: name
-    of an unfinished run -> expected time [s].
+    jobs: all runs. results: name of a finished run -> result. failures: name of an arm or run -> reason.
+    estimates: name of an unfinished run -> expected time [s].
     """
 
     folder: Path

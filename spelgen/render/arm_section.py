@@ -50,7 +50,7 @@ class AnimatedMotion:
 
 @dataclass(frozen=True)
 class AnimatedArm:
-    """The animated picture of the arm. data: JSON for the script. motions: labels of the motions. tubes: see ``Scene``."""
+    """The animated picture of an arm. data: JSON for the script. motions: their labels. tubes: see ``Scene``."""
 
     data: Markup
     motions: tuple[str, ...]
