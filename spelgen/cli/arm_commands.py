@@ -52,7 +52,7 @@ def inspect(
     inspection = inspect_arm(arm, assume=assume)
     proof = None
     if verify:
-        # imported here: Pinocchio and SymPy, which take seconds
+        # Imported here, because Pinocchio and SymPy take seconds to import.
         from spelgen.certificate.verify import verify as verified
 
         proof = verified(arm.robot, arm.chain, inspection.structure)
@@ -60,7 +60,7 @@ def inspect(
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE
 
-        # a program reads formulas of any length, a person does not
+        # Formulas for programs may have any length; formulas for people are limited.
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
     # the result comes first; --strict and a failed proof only decide the exit code
@@ -75,7 +75,7 @@ def inspect(
 def _text(
     format: str, inspection: Inspection, closed: Formulas | None, proof: Verification | None, urdf: Path
 ) -> str:
-    """Return the result in a format, with a line end; closed: closed forms of M and V."""
+    """Return the text of the inspection in a format, with a line end. closed: closed-form formulas of M and V."""
     if closed and format in ("latex", "sympy"):
         return _formula_file(format, closed, proof)
     if format == "html":
@@ -100,7 +100,7 @@ def _text(
 
 
 def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> str:
-    """Return a file of formulas. The proof and the names of omitted formulas are printed to stderr."""
+    """Return the text of a file of formulas; print the proof and the names of omitted formulas to stderr."""
     from spelgen.certificate import formula_files
 
     names = [formula.name for formula in closed.unwritten]
@@ -138,7 +138,7 @@ def identify(
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
-    # an option of names and not one flag per effect: new effects need no new option
+    # One option takes the names of all friction effects, so that a new effect needs no new option.
     effects = options.names(friction) or []
     for name in effects:
         if name not in EFFECTS:

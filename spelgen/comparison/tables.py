@@ -38,7 +38,7 @@ SIZES: dict[str, Figure] = {
     "smallest eigenvalue of M / mean": lambda run: run.invariants.least_eigenvalue,
 }
 RATIO = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
-"""Label of a row -> label of the row below it, with the ratio of the baseline's figure to the figure of each model."""
+"""Label of a row -> name in the label of the next row, which shows the baseline's figure divided by each model's."""
 
 
 @dataclass(frozen=True)

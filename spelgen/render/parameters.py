@@ -72,7 +72,8 @@ def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
 def base_table(
     model: ArmModel | None, arm: Arm, identified: Content, posterior: Posterior | None = None
 ) -> ParameterTable:
-    """Return the table of base parameters: of least squares and of a rigid-body model with intervals, and of the URDF."""
+    """Return the table of base parameters: from least squares and a rigid-body model with intervals, and from the URDF.
+    """
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
     # The base parameters are derived again here, because they depend on the URDF and friction model only, not on logs.
@@ -80,7 +81,7 @@ def base_table(
     parameters = identified["base_parameters"]
     names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
     nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
-    # no URDF has friction and drives in this form, and some have no inertials
+    # A URDF has no friction and drive parameters of this form, and may have no inertials: these cells are empty.
     nominal[base.bodies :] = np.nan
     if not arm.chain.inertials_complete:
         nominal[:] = np.nan
@@ -106,7 +107,7 @@ def base_table(
         columns["model"] = list(map(_number, learned))
     columns["least squares, 95 %"] = list(map(_interval, parameters))
     columns["determined"] = determined
-    # a parameter of one body is its own formula
+    # The formula is omitted if it equals the name: the parameter is then not combined with others.
     columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
     rows = list(zip(*columns.values(), strict=True))
     sure = tuple(row for row in rows if row[-2] in DETERMINED)
@@ -141,7 +142,7 @@ def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None
         if arm.chain.inertials_complete:
             nominal = urdf_parameters(arm.chain).reshape(-1, 10)
     rows = []
-    # the URDF's values below the model's values of the same body, so that a column shows their difference
+    # The values of the URDF are below the model's values of the same body, so that they are easy to compare.
     for k, name in enumerate(names):
         rows.append((name, "model", *_about_center(values[k])))
         if nominal is not None:
@@ -176,7 +177,7 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
     columns = {"joint": list(model.joint_names)}
     note = "Viscous and Coulomb friction are fitted to the model's friction law."
     if posterior is not None:
-        # The columns of the posterior have intervals and replace the columns of the same name.
+        # The posterior has intervals. Without a posterior, the table has the nearest friction model, without intervals.
         columns |= posterior.drive_columns
         note += " Intervals are of 95 %."
     else:

@@ -81,7 +81,7 @@ def stacks(
         charts = []
         for row in rows:
             lines = [Line(label, t, values[:, k], style) for label, values, style in row.columns]
-            # Each column has one time axis, below its last chart; this chart is higher, so that all plot areas are equal.
+            # Only the last chart of a column has a time axis; it is higher, so that all plot areas have the same height.
             time, height = "", row.height
             if row is rows[-1]:
                 time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare

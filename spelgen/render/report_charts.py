@@ -116,7 +116,7 @@ def friction_panels(
 
 
 def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
-    """Return y limits that contain the model's curve and the values (K,) [Nm, N] except outliers; None without values."""
+    """Return limits of the y axis that contain the model's curve and the values (K,) [Nm, N] except outliers."""
     values = values[np.isfinite(values)]
     if not values.size:
         return None

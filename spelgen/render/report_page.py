@@ -83,7 +83,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
     spec, record = run.spec, run.config
-    # the page of a run that is not evaluated has the same sections, which state that they are empty
+    # The page of a run without evaluation has the same sections, each with a note that it is empty.
     traces, tables = Traces({}), []
     if run.results is not None:
         traces, tables = run.results.traces, result_tables(run.results)
@@ -165,7 +165,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 def _verdict(runs: Mapping[str, Results]) -> str:
     """Return a sentence that states the run with the smallest error, for each figure that all runs have."""
-    # Figure -> (error, text, run) of each run; the first element is compared.
+    # Figure -> (value, run, text) of each run; `min` compares the values first.
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():
         for figure in figures(results):
@@ -176,7 +176,7 @@ def _verdict(runs: Mapping[str, Results]) -> str:
         if len(of_runs) == len(runs):
             _, name, text = min(of_runs)
             smallest.setdefault(name, []).append(text)
-    # runs with other horizons or logs cannot be ranked
+    # Runs without a common figure, for example with other horizons, cannot be ranked.
     if not smallest:
         return "These runs have no common horizons or logs."
     sentences = [f"{name} has the smallest {listed(labels)}." for name, labels in smallest.items()]

@@ -100,14 +100,14 @@ def open_run(path: Path | str) -> Run:
 
 
 def head_numbers(run: Run) -> list[tuple[str, str]]:
-    """Return the most important figures of a run as (figure, label)."""
+    """Return the most important figures of a run, each as its text and label."""
     numbers = []
     if run.results is not None:
         numbers = [(figure.text(), figure.label) for figure in figures(run.results)]
     summary = None if run.config is None else servo_summary(run.config.servo)
     if summary is not None:
         numbers.append(summary.headline)
-    # parameters that the fit switched off are not counted: the number states the size of the model in use
+    # Parameters that the fit switched off are not counted: the number is the size of the model in use.
     elif run.model is not None:
         numbers.append((f"{used_parameter_count(run.model):,}", "trained parameters"))
     for last in run.metrics[-1:]:

@@ -140,7 +140,7 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
     if not below and inertial is not None:
         meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
-        # A prismatic joint is a square block, a revolute joint a drum: (sides, radius, half length), lengths in tube radii.
+        # A prismatic joint is drawn as a square block, a revolute joint as a drum. Width and half length in tube radii.
         sides, width, half = (4, 1.8, 2.4) if joint.type == "prismatic" else (10, 1.5, 1.725)
         ends = half * radius * _axis(joint)
         meshes += tube(-ends, ends, width * radius, sides)
@@ -160,7 +160,7 @@ def _rotation(joint: UrdfJoint) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A triangle mesh: vertices (V, 3) [m] in the link frame, and vertex indices (F, 3), counterclockwise from outside."""
+    """Triangle mesh: vertices (V, 3) [m] in the link frame, vertex indices (F, 3) counterclockwise from outside."""
 
     vertices: Curve
     faces: Annotated[np.ndarray, PlainValidator(np.array), PlainSerializer(np.ndarray.tolist)]
