@@ -63,7 +63,7 @@ def inspect(
         # Formulas for programs may have any length; formulas for people are limited.
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
-    # the result comes first; --strict and a failed proof only decide the exit code
+    # The result is printed in any case; --strict and a failed proof only affect the exit code.
     deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
     if strict:
         refuse_warnings(f"{robot}: ", [x.severity for x in inspection.diagnostics].count("warning"))
@@ -145,10 +145,10 @@ def identify(
             raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
     method = LeastSquares(weights, FrictionModel(**dict.fromkeys(effects, True)))
     arm = options.load(robot, joints, tip, angle_tolerance)
-    # codes on the command line are accepted in addition to those in the settings
+    # Error codes on the command line are accepted in addition to the codes in the settings.
     log_mapping = options.log_mapping(arm, mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")
-    # least squares would fit logs in wrong units without an error
+    # Logs are checked first: least squares would fit logs in wrong units without any error.
     for diagnostic in require_sound_logs(logs, arm, log_mapping):
         note(diagnostic)
     result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
@@ -156,7 +156,7 @@ def identify(
         note(diagnostic)
 
     def page() -> str:
-        # pages and charts are imported only for this format
+        # Pages and charts are slow to import and needed for this format only.
         from spelgen.render.arm_pages import identification_page
 
         return identification_page(result, arm)

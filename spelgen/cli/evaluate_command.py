@@ -53,7 +53,7 @@ def evaluate(
     from spelgen.logs.preprocessing import Preprocessing
 
     logs = read_test_logs(run, paths, mapping)
-    # after the logs, whose errors are more frequent and reported sooner
+    # The run is loaded after the logs are read, since errors in logs are more frequent.
     model = load_run(run)
     with progress_bar("evaluating") as progress:
         results = evaluate_model(
@@ -66,14 +66,14 @@ def evaluate(
             progress=progress,
         )
     record = results.to_dict()
-    # before anything is printed: a closed pipe must not lose the result
+    # The file is written before anything is printed, so that a closed pipe does not lose the result.
     write_json(RunFolder(run).evaluation, record)
-    # on stderr: stdout has the result only, which scripts read
+    # Diagnostics go to stderr, because scripts read the result from stdout.
     for diagnostic in results.diagnostics:
         note(diagnostic)
     forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
     options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
-    # after the result, so that a script gets the figures in any case
+    # Limits are tested after the result is printed, so that a script gets the figures in any case.
     values = {figure.name: figure.value for figure in figures(results)}
     exceeded = []
     for name, limit_value in limits:
@@ -127,7 +127,7 @@ def estimate(
     from spelgen.render.estimate_page import write_estimate
 
     fit = load_run(run)
-    # reported before logs are read
+    # A model without torques is an error, which is raised here before logs are read.
     torque_model(fit)
     levels = noise_levels(fit)
     joints = list(fit.model.joint_names)

@@ -95,7 +95,7 @@ def train(
     from spelgen.fitting.train import train as train_files
     from spelgen.logs.preprocessing import Preprocessing
 
-    # Device and threads are not recorded, because the result does not depend on them.
+    # Device and threads are not recorded, because they describe the machine and not the result.
     machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
     try:
@@ -120,9 +120,10 @@ def train(
 
 
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
-    """Return the payload in the logs of an adapted run, estimated with the noise levels of the source run.
+    """Return the payload in the logs of a model that was adapted to a load; None for any other fit.
 
-    None for a new fit, for which noise levels are computed and stored, and for a source run without noise levels.
+    The estimator of the source run computes it, with noise levels of that run; None if that run has no noise levels.
+    A new fit gets noise levels of its own, an adapted run keeps the noise levels of its source run.
     """
     from spelgen.live.levels import keep_levels, stored_levels
     from spelgen.live.replay import carried_payload
@@ -137,7 +138,7 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
 
     original = load_run(source)
     levels = stored_levels(original)
-    # a run of an earlier version, or one whose logs were too short for the noise levels
+    # Runs of earlier versions, and runs with too short logs, have no noise levels.
     if levels is None:
         return None
     keep_levels(fit, levels)

@@ -72,8 +72,7 @@ def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
 def base_table(
     model: ArmModel | None, arm: Arm, identified: Content, posterior: Posterior | None = None
 ) -> ParameterTable:
-    """Return the table of base parameters: from least squares and a rigid-body model with intervals, and from the URDF.
-    """
+    """Return the table of base parameters: from the URDF, and with intervals from least squares and the model."""
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
     # The base parameters are derived again here, because they depend on the URDF and friction model only, not on logs.

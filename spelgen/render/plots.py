@@ -81,7 +81,7 @@ def stacks(
         charts = []
         for row in rows:
             lines = [Line(label, t, values[:, k], style) for label, values, style in row.columns]
-            # Only the last chart of a column has a time axis; it is higher, so that all plot areas have the same height.
+            # Only the last chart of a column has a time axis. It is higher, so that all plot areas are equally high.
             time, height = "", row.height
             if row is rows[-1]:
                 time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare
