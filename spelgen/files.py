@@ -100,8 +100,8 @@ def limited_memory(size: int) -> Iterator[None]:
 def replacing(path: Path | str) -> Iterator[Path]:
     """Yield a hidden file in the folder of `path`; at the end it replaces `path` atomically, even if power fails.
 
-    Creates the folder, and sends the file to its address if it has one. An interrupted or failed write does not change
-    `path`. Raises OSError with the path if it cannot be written, for instance on a full disk.
+    An absent folder is created, and a file with an address is sent to the address. An interrupted or failed write does
+    not change `path`. Raises OSError with the path if the file cannot be written, for instance on a full disk.
     """
     path = Path(path)
     with naming(path):
@@ -111,7 +111,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
             yield unfinished
-            # fsync puts the content on disk before the file is renamed: a power failure leaves no empty file.
+            # fsync puts the content on disk before the file is renamed: a power failure cannot result in an empty file.
             with unfinished.open("rb+") as file:
                 os.fsync(file.fileno())
             os.replace(unfinished, path)
@@ -154,7 +154,8 @@ def write_json(path: Path | str, content: Mapping[str, object]) -> Path:
     return write_text(path, json.dumps(content, indent=2) + "\n")
 
 
-# One slash is sufficient, as `Path` reduces two to one. Two letters or more: `C:/` is a drive of Windows.
+# One slash is accepted, because `Path` reduces two slashes to one. A scheme has at least two letters, because `C:/`
+# is a drive of Windows.
 ADDRESS = re.compile(r"^([a-z][a-z0-9+.-]+):/+(?=[^/])")
 
 _copies: dict[str, Path] = {}  # address -> local copy
@@ -179,7 +180,7 @@ def local(path: Path | str) -> Path:
 
 
 def sent(path: Path) -> None:
-    """Send a written file to its address, or remove it there if it was removed here."""
+    """Copy a written local file to its address, or remove the file at the address if the local file was removed."""
     target = address_of(path)
     if target is None:
         return
@@ -245,7 +246,7 @@ def _fetch(address: str) -> Path:
 
 
 def _inside(folder: Path, name: str, address: str) -> Path:
-    """Return the path of a name in a folder. Raises SpelgenError if it is outside the folder.
+    """Return the path of a name in a folder. Raises SpelgenError if the path is outside the folder.
 
     Archives and object stores accept any text as a key, such as `../../.bashrc`.
     """

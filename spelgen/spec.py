@@ -1,7 +1,7 @@
 """ModelSpec: everything that a model is made of, as frozen data with a canonical JSON form.
 
 The derivation of an arm's structure produces a ModelSpec; models are assembled and modules are written from it.
-Neither side needs the code of the other.
+It is thus the interface between the derivation of structure and the training of models.
 """
 
 import hashlib

@@ -182,8 +182,8 @@ def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
 def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequence[str] | None) -> LogMapping:
     """Return the mapping of log columns, by default from the settings of the arm.
 
-    codes: codes of errors in logs that are accepted in addition to those of the mapping. Raises a usage error for an
-    unknown code.
+    codes: codes of errors in logs that are accepted in addition to the codes in the mapping. Raises a usage error for
+    an unknown code.
     """
     from spelgen.logs.arm_mapping import log_source
 

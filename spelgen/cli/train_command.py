@@ -167,7 +167,7 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
         outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
     outcome += [] if posterior is None else [table.text() for table in posterior.listings]
     answer(format, record, *outcome, f"run folder: {folder}")
-    # The exit code tells a script whether the fit was interrupted, as in shells.
+    # By the exit code, a script can distinguish an interrupted fit from a finished one, as in shells.
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)

@@ -57,7 +57,7 @@ class Request:
     warm_start: bool = False
 
     def values_of(self, keys: Iterable[str]) -> dict[str, Any]:
-        """Return key -> value for those of the keys that `--set` has set."""
+        """Return key -> value, without keys that `--set` has not set."""
         return {name: self.values[name] for name in keys if name in self.values}
 
     def settings(self, defaults: TrainingSettings) -> TrainingSettings:

@@ -192,7 +192,7 @@ def run_job(job: Job) -> RunResult:
 
 
 def _own_checkpoint(job: Job, run: RunFolder) -> bool:
-    """Return whether the folder has a checkpoint of this run; a checkpoint with another key is discarded."""
+    """Return True if the folder has a checkpoint of this run; a checkpoint with another key is discarded."""
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()

@@ -1,4 +1,4 @@
-"""The motions that charts show: of all predictions, torques and replays, those of median and of largest error."""
+"""The motions that charts show: the predictions, torques and replays of median error and of largest error."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -71,7 +71,7 @@ def evaluate(
         logs: test logs of the same arm.
         arm: result of ``load_arm``, or the path of a URDF; by default the arm of the fit. It is needed for the URDF as
             a baseline, and for tip errors.
-        baselines: dynamics that are evaluated in addition to those of `baselines.registry`, by name, for example
+        baselines: name -> dynamics, evaluated in addition to the baselines of `baselines.registry`, for example
             ``{"truth": identify(...).dynamics}``.
         preprocessing: filter and delay of states and torques; by default the preprocessing of the fit.
         steps: prediction horizons [samples].
@@ -191,7 +191,7 @@ def _evaluate_torques(
 def _results(
     tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces
 ) -> Results:
-    """Return the results with the names of the arm and the logs."""
+    """Return the results of an evaluation, to which names of the arm, the joints and the logs are added."""
     return Results(
         robot=tested.spec.robot if tested.spec else type(tested.model).__name__,
         joints=tuple(tested.joints),

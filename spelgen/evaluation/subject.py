@@ -1,4 +1,4 @@
-"""The model that is evaluated, with its fit and its arm if these are known."""
+"""The model that is evaluated, with its fit and its arm if known."""
 
 import copy
 from collections.abc import Iterable, Sequence
@@ -121,8 +121,6 @@ def read_test_logs(
     # By default the mapping of the training logs is used, since test logs usually come from the same logger.
     if mapping is None:
         mapping = record.mapping
-    elif (
-        isinstance(mapping, str | Path) and run.urdf.exists()
-    ):  # the mapping may contain all joints of the URDF
+    elif isinstance(mapping, str | Path) and run.urdf.exists():  # a mapping may contain all joints of a URDF
         mapping = load_mapping(mapping, read_urdf(run.urdf).joint)
     return read_logs(paths, spec.joint_names, mapping, "test", joint_types=spec.joint_types)

@@ -25,7 +25,7 @@ class EvaluationTuning:
     # [1] Fraction of the torque variance that a model must explain for feed-forward control.
     explained_for_feed_forward: float = 0.95
     # [1] Fraction of the torque variance that a model must explain for gravity compensation: on most logs gravity
-    # and friction alone explain about this fraction.
+    # and friction explain about this fraction.
     explained_for_gravity: float = 0.8
     # [1] Largest prediction error, divided by the motion, for which the assessment recommends simulation.
     close_prediction: float = 0.1

@@ -71,7 +71,7 @@ def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
 
 def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
     """Return name of an entry of M -> text: the joints it depends on, the facts that mention it, and its formula."""
-    # The facts are those of `spelgen inspect`, so that pages and the terminal explain an entry equally.
+    # `spelgen inspect` prints the same facts, so that pages and the terminal explain an entry equally.
     every_fact = facts(arm, structure)
     closed = {formula.name: formula for formula in formulas(arm, structure).rows}
     explanations = {}
@@ -105,7 +105,7 @@ def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) 
 
 
 def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
-    """Return predicted motions, coloured by position error, then test motions coloured by torque residual."""
+    """Return predicted motions, whose colour is the position error, then test motions, coloured by torque residual."""
     motions = []
     for example in traces.trajectories:
         extent = np.ptp(example.q, axis=0)

@@ -196,7 +196,7 @@ def mass_panels(
         lines = [Line(label, t, mass[number], styles[label]) for label, mass in masses.items()]
         if np.nanmax(np.abs([line.heights for line in lines])) > zero:
             name = entry_name(i, j)
-            # The unit of an entry between a revolute and a prismatic joint is that of a first moment.
+            # An entry between a revolute and a prismatic joint has the unit of a first moment.
             unit = UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
             chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=width)
             panels.append(Panel(name, (chart,)))

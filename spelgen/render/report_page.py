@@ -130,7 +130,7 @@ def write_runs(folders: Sequence[Path], output: Path) -> Path:
 
 def render_runs(folders: Sequence[Path]) -> str:
     """Return the page about several runs as HTML."""
-    # All runs are read before the page is written, so that an unreadable run leaves no incomplete page.
+    # All runs are read before the page is written, so that an unreadable run does not result in an incomplete page.
     runs: dict[str, Run] = {}
     results: dict[str, Results] = {}
     for name, folder in zip(_names(folders), folders, strict=True):

@@ -1,4 +1,4 @@
-"""The arm as built: a random robot that differs from its URDF as much as real robots do.
+"""The arm as built: a random robot with realistic differences from its URDF.
 
 Inertials are perturbed; the drives have armature, viscous friction, Coulomb friction that depends on the direction, and
 presliding hysteresis. The result is a URDF with a settings file, which is the ground truth of simulated logs.
