@@ -173,7 +173,7 @@ def report(
         listing = summary(Results.from_dict(folder.read_json(folder.evaluation)))
     if listing is not None:
         say(listing.text() + "\n")
-    say(f"wrote {path}: the report, for any browser")
+    say(f"wrote {path}: the report, for any browser" if path.suffix == ".html" else f"wrote {path}")
 
 
 Jobs = Annotated[
