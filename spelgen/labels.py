@@ -15,7 +15,7 @@ LINEAR_SERVOS, DELAYED_COMMAND = "linear servo", "delayed command"
 
 @dataclass(frozen=True)
 class Units:
-    """Units of the quantities of a joint. torque: of its torque or force. inertia: of the diagonal entry of M."""
+    """Units of joint quantities: position, velocity, torque (or force), and inertia, the diagonal entry of M."""
 
     position: str
     velocity: str

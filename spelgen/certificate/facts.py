@@ -64,7 +64,7 @@ class _Sentences:
     def entries(
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
     ) -> Iterator[Fact]:
-        """Yield the facts about entries of this kind; entries with the same reason share a sentence."""
+        """Yield facts about the entries of M of this kind: one fact for all entries with the same reason."""
         # a table of facts would repeat one reason for every entry of a wrist
         groups: dict[Reason, list[MassEntry]] = {}
         for entry in self.structure.entries:

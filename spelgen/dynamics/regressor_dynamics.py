@@ -111,7 +111,7 @@ class RegressorDynamics:
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return qdd, (..., n), under the inputs tau (..., n)."""
         equations = self.equations_at(q)
-        force = equations.force(qd, tau, z).unsqueeze(-1)  # one column: vectors would need the same batch
+        force = equations.force(qd, tau, z).unsqueeze(-1)  # (..., n, 1): M need not have the batch of tau
         qdd: Tensor = torch.linalg.solve(equations.mass, force)
         return qdd.squeeze(-1)
 

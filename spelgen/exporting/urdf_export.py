@@ -138,7 +138,7 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
 
 
 def _plain(value: npt.ArrayLike) -> object:
-    """Return a number, or the numbers of (K,), for YAML: readable with twelve digits, more precise than any fit."""
+    """Return a number, or an array (K,) as a list, with twelve digits for YAML: more precise than any fit."""
     rounded = np.vectorize(lambda x: float(_number(x)), otypes=[float])
     return rounded(value).tolist()
 

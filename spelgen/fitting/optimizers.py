@@ -144,7 +144,7 @@ class LBFGS(WindowOptimizer):
         return self.minimise(lambda: [loss(windows)], steps)
 
     def minimise(self, summands: Summands, steps: int) -> float:
-        """Take steps on the sum of these losses, see `run`; only one of them is in memory with its graph."""
+        """Minimise the sum of losses like `run`; only one summand at a time is in memory with its graph."""
         group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps
         self._finite = False

@@ -166,7 +166,7 @@ class Identification:
         )
 
     def quality(self) -> str:
-        """Return the condition number and the number of parameters per precision."""
+        """Return a text: the condition number, and the number of parameters per class of precision (firm, ...)."""
         conditioned = f"Condition number {self.condition:.3g} (columns of length one): "
         if self.unseen:
             conditioned = (

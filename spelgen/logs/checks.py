@@ -201,9 +201,9 @@ CHECKS: list[Check[JointSignals]] = [
 
 
 class LogChecks:
-    """Checks of logs without their robot, one trajectory at a time, so that only one need be in memory.
+    """Checks of logs that need no robot. Trajectories are added one at a time: only one has to be in memory.
 
-    products: of all velocities and positions, see `velocity_products`.
+    products: (2n, 2n), sum of `velocity_products` over all trajectories.
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
@@ -234,7 +234,7 @@ class LogChecks:
         self._results.setdefault((group, check), []).append(occurrence)
 
     def findings(self) -> Findings:
-        """Return the findings: errors per check, with all its joints; notes per check and joint, or message."""
+        """Return the findings: one error per check, with all its joints; one note per check and joint or message."""
         summary = Findings()
         groups: dict[tuple[AnyCheck, str], list[str]] = {}
         for (group, check), occurrences in self._results.items():

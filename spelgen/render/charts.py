@@ -131,7 +131,7 @@ class Dots(Line):
     shape = "dots"
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return lines of length zero, whose round caps are the dots, for the points within both axes."""
+        """Return an SVG path of the points within both axes: lines of length zero, whose round caps are dots."""
         x, y = _floats(self.x), _floats(self.y)
         inside = x_axis.contains(x) & y_axis.contains(y)
         dots = np.stack([x_axis.pixels(x[inside]), y_axis.pixels(y[inside])], axis=1)

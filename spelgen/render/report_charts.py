@@ -116,7 +116,7 @@ def friction_panels(
 
 
 def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
-    """Return the range of the y axis: of values (K,) without outliers, and of the model's curve (speeds,)."""
+    """Return the limits of the y axis, which contain the values (K,) except outliers, and the model's curve."""
     values = values[np.isfinite(values)]
     if not values.size:
         return None
