@@ -161,3 +161,12 @@ def test_degrees_of_encoders_and_rounded_degrees_are_no_normalised_positions(arm
     step = 2 * np.pi / np.array(turns)
     right = changed(logs, q=lambda x: np.round(x.q / step) * step, mapping=lambda x: DEGREES)
     assert not spelgen.check_logs(right, arm).errors
+
+
+def test_commands_in_radians_beside_positions_in_degrees_are_an_error_with_the_line(arm, logs):
+    # both converted from degrees: such commands look constant
+    small = changed(logs, u=lambda x: np.radians(x.u))
+    errors = [str(error) for error in spelgen.check_logs(small, arm).errors]
+    assert len(errors) == 2
+    for error, joint in zip(errors, arm.chain.joint_names, strict=True):
+        assert f"write 'joints: {{{joint}: {{units: {{q: deg, u: rad}}}}}}'" in error

@@ -171,7 +171,7 @@ def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[Hypoth
     rng = np.random.default_rng(0)
     starts += [rng.permutation(len(joints)) for _ in range(6)]
     fits = {}
-    # the motion alone is rarely in another order, and each order of it needs another regressor
+    # only the motion is rarely in another order, and each order of it needs another regressor
     motion, both = ("motion-order",), ("joint-order", "torque-order")
     for code, start in [*product(both, starts), *product(motion, starts[:3])]:
         fit = problem.fit(_changed(unchanged.hypothesis, code, **dict.fromkeys(ORDERS[code], start)))

@@ -155,8 +155,8 @@ class ServoLogs:
                 saturation[k] = coordinate.effort / kp
         mapping = self._logs[0].mapping
         if all(mapping.unit("q", name) == "deg" for name in names):
-            for check, found in run_checks([NORMALISED], reports, self._logs[0].accepted):
-                summary.add(check, found.message, "all joints")
+            for normalised, found in run_checks([NORMALISED], reports, self._logs[0].accepted):
+                summary.add(normalised, found.message, "all joints")
         following = measure_following(self._logs, saturation)
         if following is None:
             message = f"no {FILTER_SAMPLES} samples without a gap: no servo is determined"
@@ -205,16 +205,16 @@ def _odd_command(
             "commands-are-positions",
             "u is q, to the last bit: are the commands those that were sent?",
         )
-    # a constant command does not determine the servo
-    elif not following.moves[k]:
-        width = report.high["u"] - report.low["u"]
-        code, message = "idle-command", f"its command moves by only {width:.3g}: its servo is not determined"
     # the amplitudes of command and motion are equal within a fifth, unless one of them is in degrees
     elif correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         units = {"q": "deg", "u": "rad"} if gain > 1 else {"q": "rad", "u": "deg"}
         do = mapping_line({"joints": {joints[k]: {"units": units}}})
         return LogError(got, element=where, expected="both in radians", do=do)
+    # a constant command does not determine the servo
+    elif not following.moves[k]:
+        width = report.high["u"] - report.low["u"]
+        code, message = "idle-command", f"its command moves by only {width:.3g}: its servo is not determined"
     elif correlation < -FOLLOWS:
         got = f"positions that move against commands (correlation {correlation:.2g})"
         return LogError(got, element=where, expected="one sense", do="check the signs of q and u")
