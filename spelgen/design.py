@@ -1,7 +1,5 @@
 """Design: the form of each quantity of a model, as in the file of a preset; validated when it is created."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path

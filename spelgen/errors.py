@@ -1,7 +1,5 @@
 """Errors for users, with one exception per subject, and diagnostics, which do not stop a command."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass
 from difflib import get_close_matches

@@ -4,8 +4,6 @@ Addresses are URLs of fsspec, such as `s3://bucket/logs`. All other code works o
 folder until the process ends, and files written to it are sent to the address.
 """
 
-from __future__ import annotations
-
 import atexit
 import json
 import os

@@ -1,7 +1,5 @@
 """Names of joints, units, entries of M and predictors in charts, tables and sentences."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
@@ -17,7 +15,7 @@ LINEAR_SERVOS, DELAYED_COMMAND = "linear servo", "delayed command"
 
 @dataclass(frozen=True)
 class Units:
-    """Units of the quantities of a joint. torque: of its torque or force. inertia: of the diagonal entry of M."""
+    """Units of joint quantities: position, velocity, torque (or force), and inertia, the diagonal entry of M."""
 
     position: str
     velocity: str

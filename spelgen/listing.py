@@ -1,7 +1,5 @@
 """Tables as text and as HTML: for a terminal, a file, a page and a notebook."""
 
-from __future__ import annotations
-
 import math
 import re
 import textwrap

@@ -4,8 +4,6 @@ It is the boundary between deriving and training: the derivation of structure pr
 assembled and modules are written from it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Run independent tasks: one after the other here, or several at a time on Ray, which reruns tasks of dead workers."""
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

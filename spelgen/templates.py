@@ -3,8 +3,6 @@
 Every page has the same frame: style sheet, scripts, and a policy that forbids all other scripts and all loading.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -119,6 +119,8 @@ def test_what_is_no_module_is_refused(tmp_path):
         assert told.endswith(f"{REMEDY}, or check the path") and "\n" not in told
     path.write_bytes(b"\xff\xfe")
     assert refusal(path).startswith(f"{path}: got no specification of spelgen in it (UnicodeDecodeError)")
+    robot = ROBOTS / "rpr.urdf"
+    assert refusal(robot).endswith(f"`spelgen build {robot}` writes its module")
 
 
 def test_a_module_of_an_earlier_version_is_refused_with_a_remedy(module, tmp_path):

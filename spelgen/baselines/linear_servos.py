@@ -1,7 +1,5 @@
 """Predictors of arms under position servos: the delayed command, and a linear second-order servo at each joint."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Predictors of the motion of an arm, under torques or under position commands, and the integration of dynamics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol

@@ -1,7 +1,5 @@
 """All baselines, in the order in which tables show them: `fit` fits them, `evaluate` compares a model with them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

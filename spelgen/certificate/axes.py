@@ -4,8 +4,6 @@ A relation is tested exactly at random rational configurations. A relation that 
 them with a probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 from fractions import Fraction

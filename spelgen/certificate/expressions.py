@@ -6,8 +6,6 @@ not the length of formulas that are short enough to be read. Printed decimals ha
 SymPy has exact fractions. Blanks at which a line must not be broken are no-break spaces until the text is wrapped.
 """
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@ integral. Each function of a reason returns None if it knows none. ``{joints}`` 
 placeholders for the other joints of the entries, and for their axes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -66,7 +64,7 @@ class _Sentences:
     def entries(
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
     ) -> Iterator[Fact]:
-        """Yield the facts about entries of this kind; entries with the same reason share a sentence."""
+        """Yield facts about the entries of M of this kind: one fact for all entries with the same reason."""
         # a table of facts would repeat one reason for every entry of a wrist
         groups: dict[Reason, list[MassEntry]] = {}
         for entry in self.structure.entries:

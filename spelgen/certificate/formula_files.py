@@ -4,8 +4,6 @@ Names in formulas consist of letters and numbers of joints. In files, names from
 JSON strings, which contain neither line ends nor control characters.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import textwrap

@@ -4,8 +4,6 @@ Each entry is expanded exactly (``expansion``), its terms are collected per base
 expressed with sums of angles (``expressions``). For an entry that is too long, only the number of terms is given.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Whether a module is up to date with its URDF: the function ``check``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -8,8 +8,6 @@ of the derivation cannot detect, because the derivation starts from the chain. P
 with rounded angles is also made from the file without rounding.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -170,8 +168,8 @@ def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
 def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
     """Return kinematic and dynamic quantities of the B moving bodies at positions q (S, n).
 
-    "axes of the joints": twists of unit rates in the root frame, (S, 6, B). "masses and inertias": M with twice its
-    diagonal, and the gravity torque as the last column, (S, B, B + 1).
+    "axes of the joints": twists of unit rates in the root frame, (S, 6, B). "masses and inertias": M, with
+    its diagonal doubled, and the gravity torque as the last column, (S, B, B + 1).
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]

@@ -5,8 +5,6 @@ parameters of the URDF. The verification shares only the chain with the derivati
 reading of the file by Pinocchio (``numeric_samples``).
 """
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Output of commands: results to stdout, one line per error to stderr, documented exit codes."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import json

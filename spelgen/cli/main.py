@@ -3,8 +3,6 @@
 Commands import modules when they run, so that `spelgen --help` is fast and `spelgen inspect` never imports torch.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import sys

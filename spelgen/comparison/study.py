@@ -1,7 +1,5 @@
 """A comparison from its arms to its results: prepare the inputs, estimate the time, run the unfinished jobs."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Tables and sentences of a comparison: medians over seeds and splits, and published figures."""
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence

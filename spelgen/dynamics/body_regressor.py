@@ -3,8 +3,6 @@
 Base parameters are equal to `identification.base_parameters`, but from the kinematics only, without exact arithmetic.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """The friction state z along a measured path: deflections of the bristles at every sample, in one pass."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -72,7 +70,7 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     drives, reach = np.arange(path.shape[1]), torch.from_numpy(bristles.values)
     turned_at = np.take_along_axis(path, corners, axis=0)
     at_corners = [torch.zeros_like(reach)]
-    # Few reversals, one after the other; all samples between them are independent given the last reversal.
+    # Only reversals are sequential, and they are few: given z at the last reversal, samples are independent.
     for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
         at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))

@@ -1,7 +1,5 @@
 """Mimic joints: the positions of all joints of a robot are K q + offset, with q the coordinates of an arm."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

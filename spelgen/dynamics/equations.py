@@ -1,7 +1,5 @@
 """Equations of motion M qdd = force at given positions, and one step of their integration."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -38,7 +36,7 @@ class OwnEquations(Protocol):
     """Dynamics with their own equations of motion, which take fewer operations than the general ones."""
 
     def equations_at(self, q: Tensor) -> MotionEquations:
-        """Return the equations at q, (W, n)."""
+        """Return the equations of motion at positions q, (W, n) [rad, m], of W rollouts."""
 
 
 def equations_of(dynamics: object) -> EquationsAt:

@@ -1,7 +1,5 @@
 """Friction of drives: with constant coefficients, and as columns that are linear in the constants of each joint."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,7 +11,7 @@ from spelgen.settings.settings import JointSettings
 
 
 class DampedJoint(Protocol):
-    """A joint with <dynamics> of a URDF."""
+    """A joint with the damping and friction of <dynamics> in a URDF."""
 
     @property
     def name(self) -> str: ...
@@ -50,9 +48,9 @@ class DriveFriction:
         return self.torque(qd, np.tanh(v / self.smoothing_velocity))
 
     def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the joint torque (..., n) at velocity qd (..., n), with the direction of dry friction given.
+        """Return the joint friction torque (..., n) at velocities qd (..., n) for a direction of dry friction.
 
-        direction: (..., n) in [-1, 1], of the drives: s of `__call__`, or the direction of a friction state.
+        direction: (..., n) in [-1, 1] per drive: tanh(v / smoothing_velocity), or from the friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
         # s (f - b) / 2 + s^2 (f + b) / 2 is f at s = 1, b at s = -1, and has no jump between them.
@@ -79,7 +77,7 @@ def joint_friction(
             losses.append((drive.viscous, *drive.coulomb))
         else:
             losses.append((joint.damping, joint.friction, -joint.friction))
-    # Without coupling two products with C are saved in each step of an integration.
+    # Drives that are not coupled have C = 1: without it each integration step saves two matrix products.
     if speeds is not None and np.array_equal(speeds, np.eye(len(speeds))):
         speeds = None
     viscous, forward, backward = np.array(losses).T

@@ -1,7 +1,5 @@
 """Group, unit and number of a model's trained parameters; other parameters than its own; removal of residual terms."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Rigid-body dynamics of an arm by Pinocchio, with the rotor inertia of its settings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

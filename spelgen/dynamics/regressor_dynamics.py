@@ -1,7 +1,5 @@
 """Regressor of the bodies of an arm, and dynamics of inertial parameters that need not be physically consistent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -113,7 +111,7 @@ class RegressorDynamics:
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return qdd, (..., n), under the inputs tau (..., n)."""
         equations = self.equations_at(q)
-        force = equations.force(qd, tau, z).unsqueeze(-1)  # one column: vectors would need the same batch
+        force = equations.force(qd, tau, z).unsqueeze(-1)  # (..., n, 1): M need not have the batch of tau
         qdd: Tensor = torch.linalg.solve(equations.mass, force)
         return qdd.squeeze(-1)
 

@@ -7,8 +7,6 @@ order (Liniger and Willoughby, SIAM J. Numerical Analysis 7:47, 1970): 1/2 for s
 and towards 1 for motion that is too fast for a step. The friction state is exact in the displacement of a step.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

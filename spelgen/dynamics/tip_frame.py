@@ -1,7 +1,5 @@
 """The frame of the tip link of an arm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +15,7 @@ class Tip:
     """The frame of the tip link.
 
     carrier: index of the body that carries the link; -1: the root link. pose: (4, 4), in the frame of this body.
-    bodies: of the arm with the unrounded angles of the URDF, since the tip is compared with other readers of the file.
+    bodies: of the arm with the unrounded angles of the URDF, so that poses equal the ones of other URDF parsers.
     """
 
     link: str

@@ -1,7 +1,5 @@
 """From a URDF to a model in memory: the function ``build``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm

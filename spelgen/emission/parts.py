@@ -1,7 +1,5 @@
 """ModelSpec -> the parts of a model: one table, from which a model is assembled and a module is written."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -57,7 +55,7 @@ def _inputs(spec: ModelSpec) -> Call:
     n = range(len(spec.joints))
     values = {(x.joint, x.motor): x.value for x in spec.inputs}
     matrix = tuple(tuple(values.get((joint, motor), 0.0) for motor in n) for joint in n)
-    # Trained gains are a mask, so that the values of known gears are constants.
+    # A mask marks the trained gains; the ratios of known gears are constants.
     trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
     mask = tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
     return call("MotorInputs", matrix, **_unless({"trained": mask}, trained=not trained))
@@ -145,7 +143,7 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
 def _friction_laws(spec: ModelSpec) -> Call:
     if spec.design.memory == "none":
         return call("SlidingFriction", JOINTS)
-    # of the types of the arm's joints, in the order of the table
+    # only for joint types of the arm, in the order of BREAKAWAY: the emitted text is deterministic
     breakaway = {name: row for name, row in BREAKAWAY.items() if name in spec.joint_types}
     rounding = {"stribeck_rounding": SERVO_STRIBECK_ROUNDING} if spec.servos else {}
     return call("FrictionLaws", JOINTS, breakaway=breakaway, **rounding)

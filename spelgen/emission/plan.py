@@ -1,7 +1,5 @@
 """Arm, structure and nominal values -> ModelSpec: the function ``derive_spec``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -157,7 +155,7 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
 
 
 def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
-    """Return the servo of a joint; an unknown servo has its full effort at half a unit from its command."""
+    """Return the servo of a joint; without a given kp, the effort is reached at `full_effort_at` from the command."""
     effort = _plausible(coordinate.effort, TUNING.largest_effort)
     # a known gain is constant, a guessed one is trained
     kp = drive.kp or rounded((effort or TUNING.servo_effort) / TUNING.full_effort_at, 3)

@@ -1,7 +1,5 @@
 """Values -> source text: calls, tuples and assignments, laid out to be read."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 
@@ -81,7 +79,7 @@ def _escaped(text: str) -> str:
 
 
 def _items(value: object) -> list[tuple[str, object]]:
-    """Return the items of a call, a dictionary or a tuple, each with the text before it; none of other values."""
+    """Return (prefix, item) for the items of a call ("key="), a dictionary ("key: ") or a tuple (""); else []."""
     if isinstance(value, Call):
         return [(f"{key}=" if key else "", item) for key, item in value.arguments]
     if isinstance(value, dict):

@@ -1,7 +1,5 @@
 """From a URDF to the specification of a model, and to its module: the function ``generate``."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

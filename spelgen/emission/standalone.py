@@ -1,7 +1,5 @@
 """The part of ``spelgen.runtime`` that a standalone module contains, and the imports that it needs."""
 
-from __future__ import annotations
-
 import ast
 from collections import defaultdict
 from collections.abc import Iterable

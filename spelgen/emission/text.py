@@ -4,8 +4,6 @@ Text from a URDF becomes string literals and JSON strings in docstrings, never c
 executed.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import re
@@ -285,9 +283,7 @@ def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
 
 def _no_module(problem: Exception | None, file: Path | None) -> ModuleError:
     reason = f" ({type(problem).__name__})" if problem is not None else ""
-    return ModuleError(
-        f"no specification of spelgen in it{reason}",
-        file=file,
-        expected=_EXPECTED,
-        do="build it again, or check the path",
-    )
+    got, do = f"no specification of spelgen in it{reason}", "build it again, or check the path"
+    if file is not None and file.suffix in (".urdf", ".xacro", ".xml"):
+        got, do = "a robot description", f"`spelgen build {file}` writes its module"
+    return ModuleError(got, file=file, expected=_EXPECTED, do=do)

@@ -1,7 +1,5 @@
 """Constants of models: initial values without data in the URDF, and sizes of networks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

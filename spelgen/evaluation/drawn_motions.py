@@ -1,7 +1,5 @@
 """The motions that charts show: predictions, torques and replays of median and of largest error."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -108,7 +106,9 @@ def predicted_motion(trajectory: str, windows: Windows, states: States, k: int =
 
 
 def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
-    """Return a log of position servos and its replay. error: (T-1, n) [rad, m] after the first sample."""
+    """Return the measured and the predicted motion of a log of position servos.
+
+    error: (T-1, n) predicted minus measured positions after the first sample [rad, m]."""
     return PredictedMotion(
         trajectory=log.name,
         error=number(float(np.sqrt(np.square(error).mean()))),

@@ -1,7 +1,5 @@
 """Evaluate a model and its baselines on test logs, on the same windows and with the same integrator."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Predictions of test logs some samples or seconds ahead, by all predictors from the same starting points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

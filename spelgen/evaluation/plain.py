@@ -1,9 +1,7 @@
 """Arrays and numbers in JSON: five digits, None if not finite."""
 
-from __future__ import annotations
-
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -34,7 +32,7 @@ Curve = Annotated[np.ndarray, PlainValidator(array), PlainSerializer(listed)]
 """An array along a trajectory; nested lists in JSON."""
 
 
-def record(value: object) -> dict[str, Any]:
+def record(value: object) -> dict[str, object]:
     """Return the JSON form of a dataclass with numbers and curves."""
     return dict(TypeAdapter(type(value)).dump_python(value))
 

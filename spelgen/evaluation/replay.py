@@ -1,7 +1,5 @@
 """Evaluate arms under position servos by replaying logged commands: over whole logs, and over windows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

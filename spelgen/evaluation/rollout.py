@@ -1,7 +1,5 @@
 """Forward simulation of a model, its invariants, and the error of M of simulated arms whose truth is known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The model that is evaluated, with its fit and its arm if they are known."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Torque errors of inverse dynamics on measured trajectories, by one protocol for all predictors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

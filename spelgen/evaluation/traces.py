@@ -3,8 +3,6 @@
 All are arrays [rad, m, s, Nm, N, kg m^2, J], NaN for unknown numbers; JSON has five digits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

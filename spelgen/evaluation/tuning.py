@@ -1,7 +1,5 @@
 """Constants of the evaluation and of its report."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

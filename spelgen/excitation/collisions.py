@@ -4,8 +4,6 @@ The shapes are the <collision> elements of the URDF; a mesh is replaced by its c
 signed distances are exact and have a gradient, and no contact is overlooked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import ceil

@@ -57,8 +57,7 @@ def excite(
             motion; in the approach, the acceleration that reaches the used speed in one second.
         start: position from which the approach starts, (n,) [rad, m]; default: zero if the limits allow it, per joint,
             otherwise the middle of the range.
-        surroundings: floor, boxes and clearance, or the path of a YAML file with these; default: no floor, no boxes,
-            10 mm.
+        surroundings: floor, boxes and clearance, or the path of a YAML file; default: a clearance of 10 mm.
         trials: evaluations of the criterion by the optimizer, in addition to 40 random motions.
         seed: of the random motions.
         progress: is called with the numbers of finished and of all trials.
@@ -70,13 +69,10 @@ def excite(
     ranges = arm.robot.joint, arm.settings.simulation.positions
     limits = motion_bounds(arm.chain, 1.0, 1.0, *ranges)
     bounds = motion_bounds(arm.chain, reach, speed, *ranges)
-    # without limits, the approach reaches its speed in one second
-    strongest = bounds.speed
+    strongest = bounds.speed  # without limits, the approach reaches its speed in one second
     if acceleration is not None:
         strongest = _joint_values("acceleration", acceleration, arm.chain, positive=True)
         bounds = replace(bounds, acceleration=strongest)
-    if not isinstance(surroundings, Surroundings):
-        surroundings = Surroundings() if surroundings is None else read_surroundings(Path(surroundings))
     collisions, statement = _collisions(arm, surroundings, limits)
     beginning = _start(start, arm.chain, limits, collisions)
     contacts: list[str] = []
@@ -96,11 +92,7 @@ def excite(
     else:
         do = "use less of the ranges (--reach), begin elsewhere (--from), or lower the clearance"
         raise ArmError(f"no motion without a contact: {'; '.join(contacts)}", element="excite", do=do)
-    if contacts:
-        statement += (
-            f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed "
-            f"{seed + attempt} and {reach * fraction:.0%} of the ranges."
-        )
+    statement += _other_designs(seed, attempt, reach * fraction)
     first, states = criterion.states(starts[0]), np.stack([motion.q, motion.qd, motion.qdd])
     return Excitation(
         arm=arm.chain,
@@ -112,6 +104,16 @@ def excite(
         condition=criterion.condition(criterion.states(best)),
         efforts=criterion.largest_efforts(torch.from_numpy(states)),
         first_efforts=criterion.largest_efforts(first),
+    )
+
+
+def _other_designs(seed: int, attempt: int, reach: float) -> str:
+    """Return a sentence about the designs before an attempt, which had contacts; "" for the first attempt."""
+    if attempt == 0:
+        return ""
+    return (
+        f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed {seed + attempt} and "
+        f"{reach:.0%} of the ranges."
     )
 
 
@@ -148,8 +150,12 @@ def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, pos
     return array
 
 
-def _collisions(arm: Arm, surroundings: Surroundings, limits: MotionBounds) -> tuple[Collisions | None, str]:
+def _collisions(
+    arm: Arm, surroundings: Surroundings | Path | str | None, limits: MotionBounds
+) -> tuple[Collisions | None, str]:
     """Return distances of links and surroundings, None if they are unknown, and a statement of the checks."""
+    if not isinstance(surroundings, Surroundings):
+        surroundings = Surroundings() if surroundings is None else read_surroundings(Path(surroundings))
     try:
         # imported here: Pinocchio is an extra
         from spelgen.excitation.collisions import Collisions

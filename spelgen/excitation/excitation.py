@@ -1,7 +1,5 @@
 """A proposed motion and its quality: for a terminal, a notebook, as CSV, and as a message for ROS 2 controllers."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Constants of the design of exciting motions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -3,8 +3,6 @@
 The functions of the model that only the estimator calls are CasADi expressions, equal to `live.momentum`.
 """
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Iterable

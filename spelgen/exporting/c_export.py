@@ -1,7 +1,5 @@
 """--to c: a C99 header and source, compiled and compared with the model if there is a compiler."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess

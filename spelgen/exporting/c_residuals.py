@@ -4,8 +4,6 @@ Splines are tables of polynomials, one per interval; harmonics are powers of a p
 functions that compute the symbols of its expressions (see `residual_expressions`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from textwrap import wrap
 

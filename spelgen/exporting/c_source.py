@@ -1,7 +1,5 @@
 """C99 header and source of a trained model, which need only the standard math library."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain

@@ -1,7 +1,5 @@
 """--to casadi: a file with a CasADi function for each entry point."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path

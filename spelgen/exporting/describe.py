@@ -253,7 +253,7 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]
             used = np.flatnonzero((c != 0) | (s != 0))
-            # trailing zeros would cost a rotation of the phasor each
+            # without trailing zeros: each harmonic costs a rotation of the phasor
             if used.size:
                 last = used[-1] + 1
                 ripple.append(Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))

@@ -1,7 +1,5 @@
 """A trained model for exporters of source code, as plain numbers, and the functions of an export by entry points."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

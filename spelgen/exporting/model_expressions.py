@@ -1,7 +1,5 @@
 """Entry points of a trained model as CasADi expressions of q, qd, the friction state and symbols of residual terms."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import casadi as ca

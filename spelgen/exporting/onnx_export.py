@@ -1,7 +1,5 @@
 """--to onnx: programs of torch.export as ONNX files in float64 or float32, for any batch size."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -112,9 +112,9 @@ def check_parity(
 
 
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0) -> Values:
-    """Return random states in the joints' ranges, (states, n) each, and z, (states, memory).
+    """Return random inputs of the exported functions: joint quantities (states, n), and z (states, memory).
 
-    They are the same in each call, since exports are reproducible.
+    The seed is fixed, since exports are reproducible.
     """
     random = np.random.default_rng(0)
     # velocities within the limits: friction at higher speeds is extrapolated

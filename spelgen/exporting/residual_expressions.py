@@ -14,8 +14,6 @@ to q, second derivatives in blocks of n columns per joint. They also need ``stif
 derivatives ``torque_slope`` and ``factor_slope`` with respect to the position of the joint.
 """
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import casadi as ca

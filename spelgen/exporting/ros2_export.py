@@ -1,7 +1,5 @@
 """--to ros2: a colcon package with the C files, a ros2_control controller and an inverse_dynamics_solver plugin."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from dataclasses import replace

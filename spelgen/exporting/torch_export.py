@@ -1,7 +1,5 @@
 """--to torch: programs of torch.export, which need only torch, and the trained parameters as safetensors."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Constants of the exports."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """--to urdf: the arm's URDF and settings with the trained parameters, and a file with the friction model."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 import yaml
@@ -140,7 +138,7 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
 
 
 def _plain(value: npt.ArrayLike) -> object:
-    """Return a number, or the numbers of (K,), for YAML: readable with twelve digits, more precise than any fit."""
+    """Return a number, or an array (K,) as a list, with twelve digits for YAML: more precise than any fit."""
     rounded = np.vectorize(lambda x: float(_number(x)), otypes=[float])
     return rounded(value).tolist()
 

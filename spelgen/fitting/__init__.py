@@ -1,1 +1,1 @@
-"""Logs and a module to a run folder with a trained model."""
+"""Fits of a module to logs, written to a run folder."""

@@ -1,7 +1,5 @@
 """The request of a fit, and its data: logs checked, split, filtered and cut into windows; validation on the windows."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Fit a model to logs, in memory; the command `spelgen train` is this with files."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

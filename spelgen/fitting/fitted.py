@@ -1,7 +1,5 @@
 """The result of a fit, in memory or from a run folder."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -57,12 +55,12 @@ class Fit:
 
     @property
     def config(self) -> FitConfig:
-        """The configuration, resolved: the options that apply to the model."""
+        """The configuration with all defaults set: the options that apply to the model."""
         return self.record.config
 
     @property
     def preprocessing(self) -> Preprocessing:
-        """The preprocessing of the logs, resolved."""
+        """The preprocessing of the logs, with all defaults set."""
         return self.record.preprocessing
 
     @property

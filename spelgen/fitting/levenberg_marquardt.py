@@ -6,8 +6,6 @@ by it, and the step is repeated. A problem defines its own parameters (a vector,
 the solver compares costs only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import Enum

@@ -1,7 +1,5 @@
 """Objective momentum: fit the weak form of the equations of motion, the first stage of fits of windows."""
 
-from __future__ import annotations
-
 import copy
 import math
 import time

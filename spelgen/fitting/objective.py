@@ -1,7 +1,5 @@
 """The base class of all objectives, and the record of a fit."""
 
-from __future__ import annotations
-
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable

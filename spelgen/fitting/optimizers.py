@@ -4,8 +4,6 @@ The gradient of a few hundred windows costs no more than the gradient of a batch
 the curvature: this matters for simulated logs, which can be fitted to many digits, and for short logs.
 """
 
-from __future__ import annotations
-
 import inspect
 import math
 from abc import ABC, abstractmethod
@@ -146,7 +144,7 @@ class LBFGS(WindowOptimizer):
         return self.minimise(lambda: [loss(windows)], steps)
 
     def minimise(self, summands: Summands, steps: int) -> float:
-        """Take steps on the sum of these losses, see `run`; only one of them is in memory with its graph."""
+        """Minimise the sum of losses like `run`; only one summand at a time is in memory with its graph."""
         group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps
         self._finite = False

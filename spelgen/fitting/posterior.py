@@ -4,8 +4,6 @@ The covariance of the fitted parameters (`fitting.torque.covariance`) is propaga
 function f is |df/dx R|^2 with the covariance R R^T. Torque predictions add the residual of held-out samples.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -178,7 +176,7 @@ class Posterior:
 
     @property
     def drive_columns(self) -> dict[str, list[str]]:
-        """Cells of a table of the drives, (n,) per quantity."""
+        """Columns of the table of drives: quantity -> texts of value and unit, (n,), empty for joints without it."""
         columns = {}
         for quantity, of_joints in self.drives.items():
             cells = {x.name: f"{x.text} {x.unit}".rstrip() for x in of_joints}
@@ -272,7 +270,7 @@ def posterior_of(
         do = "restore it from a copy, or fit again"
         raise RunError("a posterior of another model", file=file, element="posterior", do=do)
     late = Interval("torque delay", delay, delay_std, "s") if delay else None
-    model = copy.deepcopy(model).double().cpu().requires_grad_(False)  # a user may change the model
+    model = copy.deepcopy(model).double().cpu().requires_grad_(False)  # the caller may change its own
     return Posterior(model, covariance, torque_std.numpy(), late)
 
 

@@ -1,7 +1,5 @@
 """Objective rollout: epochs of predicted windows, with checkpoints and rollbacks of diverged epochs."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A run folder: its files, each of which is written completely or not at all, and its model."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Sequence

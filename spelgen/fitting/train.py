@@ -1,7 +1,5 @@
 """Fit a module to log files and write a run folder: the function behind `spelgen train`."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Constants of the solvers and of fits to windows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -5,8 +5,6 @@ in every command. Combinations with friction and drives are numerical, from the 
 the span of the columns before it is regrouped into these (Gautier and Khalil, IEEE T-RA 6:368, 1990).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -266,7 +266,7 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     best = _with_best_ratio(nearest, problem.in_one_block(1).cost)
     logged = problem.errors[:, best.pair].mean(axis=1)
     coupled = problem.coupled(best).errors[:, best.pair].mean(axis=1)
-    # torques that no model explains in some block are no evidence
+    # no evidence if the coupled model has a large error in any block: then neither model explains the torques
     explained = coupled.max() < HINTS.coupling_gain
     if not (explained and _is_sure(logged, coupled, HINTS.coupling_gain, len(candidates))):
         return None

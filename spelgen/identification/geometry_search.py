@@ -1,8 +1,6 @@
 """Search for the hypothesis about the columns of a log with the best fit to its torques: single changes, orders of
 joints, combinations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
@@ -171,7 +169,7 @@ def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[Hypoth
     rng = np.random.default_rng(0)
     starts += [rng.permutation(len(joints)) for _ in range(6)]
     fits = {}
-    # only the motion is rarely in another order, and each order of it needs another regressor
+    # few orders of only the motion: such logs are rare, and each order needs another regressor
     motion, both = ("motion-order",), ("joint-order", "torque-order")
     for code, start in [*product(both, starts), *product(motion, starts[:3])]:
         fit = problem.fit(_changed(unchanged.hypothesis, code, **dict.fromkeys(ORDERS[code], start)))
@@ -211,7 +209,7 @@ def _refined(
 def _with_offset(
     problem: GeometryProblem, base: HypothesisFit, joint: int, revolute: bool
 ) -> list[HypothesisFit]:
-    """Return the fit with the best zero offset of a joint; an empty list for an offset below calibration errors."""
+    """Return [fit], with the best zero offset of a joint; [] if the offset is as small as calibration errors."""
     reading = base.hypothesis
     unit = np.eye(len(reading.offset))[joint]
     smallest = GEOMETRY.min_angle if revolute else GEOMETRY.min_shift

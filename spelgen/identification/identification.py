@@ -1,7 +1,5 @@
 """Method and result of a linear identification: base parameters with standard deviations."""
 
-from __future__ import annotations
-
 import textwrap
 from collections import Counter
 from dataclasses import dataclass, field
@@ -168,7 +166,7 @@ class Identification:
         )
 
     def quality(self) -> str:
-        """Return the condition number and the number of parameters per precision."""
+        """Return a text: the condition number, and the number of parameters per class of precision (firm, ...)."""
         conditioned = f"Condition number {self.condition:.3g} (columns of length one): "
         if self.unseen:
             conditioned = (

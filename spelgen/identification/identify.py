@@ -1,7 +1,5 @@
 """Identification of an arm from logs: base parameters, friction and drives by linear least squares."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """95 % intervals of estimates, and the covariance of estimates whose errors are correlated."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

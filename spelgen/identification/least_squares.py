@@ -1,7 +1,5 @@
 """Linear least squares on torques, from one triangular factor per joint, independent of the weights of joints."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

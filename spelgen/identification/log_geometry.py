@@ -269,11 +269,11 @@ def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
-    """Return a root (10, 10) of the covariance of (m, m c, I) of a body.
+    """Return R (10, 10), with R R^T the prior covariance of the inertial parameters (m, m c, I) of a body.
 
     The columns are the derivatives with respect to the mass at a fixed shape, the centre of mass and the tensor about
-    the centre, times their standard deviations. own: (10,). length: to the next joint [m]. typical: mass of a body
-    without an inertial [kg].
+    the centre, times their standard deviations. own: (10,) inertial parameters of the URDF. length: largest distance
+    to a joint it carries [m]. typical: mass assumed for a body without an inertial [kg].
     """
     if own[0] <= 0:
         # wide: an extent of half a metre, a standard deviation of 20 times the mass of another body

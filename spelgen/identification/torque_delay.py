@@ -1,7 +1,5 @@
 """Estimate the delay of torques relative to positions in logs, by least squares on torques shifted in time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Constants of least squares on logs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

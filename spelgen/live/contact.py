@@ -1,7 +1,5 @@
 """External torques by a first-order momentum observer (De Luca and Mattone, ICRA 2005), with thresholds per joint."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The estimator: payload, friction drift and external torques, sample by sample, without accelerations."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 from dataclasses import dataclass

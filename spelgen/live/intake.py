@@ -1,7 +1,5 @@
 """Checks of each measured sample, and bounds of the friction state."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal, get_args
 

@@ -3,8 +3,6 @@
 The torque residual of each log is of a model that was fitted to other logs: the residual of the fit would be too small.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -7,8 +7,6 @@ The generalised momentum p = M qd of the arm, and P theta of a payload with the 
 with L the Lagrangian (De Luca and Mattone, ICRA 2005): no acceleration is needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -55,7 +53,8 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
     frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(-2, -3)  # (T, 1, 4, 4)
     velocity = velocities[..., -1, :]  # of the frame, (T, 3, 4)
     axes, turned = (torch.unflatten(x.mT @ chain.motions, -1, (3, 4)) for x in (pose.axes, turning))
-    # derivatives of the frame with respect to q and their rates, (T, n, 3, 4); the last body is carried by few bodies
+    # derivatives of the frame of the last body with respect to q, and their rates, (T, n, 3, 4): only the bodies that
+    # carry it contribute
     ratios = chain.carriers[:, -1:] * chain.ratios
     changes = axes @ frame, turned @ frame + axes[..., :3] @ velocity.unsqueeze(-3)
     jacobian, rate = (torch.einsum("bn,tbxa->tnxa", ratios, change) for change in changes)

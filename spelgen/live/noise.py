@@ -1,7 +1,5 @@
 """Noise levels of an arm, which are found from its training logs and stored with the run as estimator.json."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

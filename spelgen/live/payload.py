@@ -7,8 +7,6 @@ several masses are compared with "no payload" by Laplace's approximation of the 
 4:415, 1992).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Literal

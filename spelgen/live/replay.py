@@ -1,7 +1,5 @@
 """The estimator along recorded logs: payload, contacts and drift, as `spelgen estimate` reports them."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass

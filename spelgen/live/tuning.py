@@ -1,7 +1,5 @@
 """Constants of the estimator; noise levels are found from the training logs (`live.levels`)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -94,7 +92,8 @@ class LiveTuning:
 
     # [1] Degrees of freedom of the Wishart prior of the pseudo-inertia.
     degrees: int = 6
-    # [1] Weights of the likelihood below one, powers of 1/4, and Newton steps for each.
+    # [1] Newton's method with an increasing weight of the likelihood: number of weights 4^-k below one, and largest
+    # number of steps for each.
     weights: int = 12
     iterations: int = 40
     # [s] Predictions up to this time ahead contain the disturbance.

@@ -1,7 +1,5 @@
 """Lines of the settings for a better hypothesis about a log, and the finding as a message."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

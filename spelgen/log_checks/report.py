@@ -1,7 +1,5 @@
 """Report of `check_logs`: for a terminal, a notebook, a page or a program."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

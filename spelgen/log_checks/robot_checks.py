@@ -1,7 +1,5 @@
 """Check logs against the robot: limits of its joints, and the gravity of its URDF in each joint's torque."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -126,7 +124,7 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
     limits = {"velocity": joint.coordinate.velocity, "effort": joint.coordinate.effort}
     bound, unit = limits[limit], asdict(UNITS[joint.coordinate.joint_type])[MEASURES[quantity]]
     largest = joint.report.largest(quantity)
-    # 1 % more is noise
+    # noise exceeds a limit by up to 1 %
     if not bound or largest <= bound * 1.01:
         return None
     return f"{limit} up to {largest:.4g} {unit}, the limit is {bound:.4g}"

@@ -1,7 +1,5 @@
 """Statistics of one trajectory: its clock, the ranges and the noise of its signals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -30,6 +30,8 @@ SCHEMA, CHANNEL, MESSAGE_RECORD, CHUNK = 3, 4, 5, 6  # operation codes of MCAP
 
 StampedState = tuple[int, int, Any]
 """Times [ns] of a joint state: of its header, 0 if it has none, and of the recorder; and the joint state."""
+TimedState = tuple[int, Any]
+"""Time [ns] of a joint state, and the joint state."""
 
 
 def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -49,7 +51,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     return [(replace(layout, remarks=tuple(remarks)), table)]
 
 
-def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[tuple[int, Any]]:
+def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[TimedState]:
     """Return times [ns] of one clock, and the states; the clocks of header and recorder may differ by hours."""
     # a stamp of 0 means that the publisher has set none
     stamped = [(stamp, state) for stamp, _, state in messages if stamp]
@@ -61,7 +63,7 @@ def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[tuple
     return stamped
 
 
-def _joint_states(path: Path, messages: Sequence[tuple[int, Any]], names: Sequence[str]) -> pa.Table:
+def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[str]) -> pa.Table:
     """Return the columns `t`, `q_<name>`, `qd_<name>`, `tau_<name>`; fields that are always empty are omitted."""
     times: list[int] = []
     rows: list[list[np.ndarray]] = []

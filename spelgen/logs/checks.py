@@ -61,6 +61,10 @@ class Check(Generic[Subject]):
     do: str | None = None
 
 
+# findings of checks of different subjects are kept together
+AnyCheck = Check[Any]
+
+
 @dataclass(frozen=True)
 class Findings:
     """Results of checks: notes, and errors, which prevent training."""
@@ -70,7 +74,7 @@ class Findings:
 
     def add(
         self,
-        check: Check[Any],
+        check: AnyCheck,
         message: str,
         where: str,
         file: Path | None = None,
@@ -197,21 +201,21 @@ CHECKS: list[Check[JointSignals]] = [
 
 
 class LogChecks:
-    """Checks of logs without their robot, one trajectory at a time, so that only one need be in memory.
+    """Checks of logs that need no robot. Trajectories are added one at a time: only one has to be in memory.
 
-    products: of all velocities and positions, see `velocity_products`.
+    products: (2n, 2n), sum of `velocity_products` over all trajectories.
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
         self.products = np.zeros((2 * len(joints),) * 2)
         self._joints, self._kinds = joints, joint_types
-        self._results: dict[tuple[str, Check[Any]], list[tuple[Advice, str, Path | None]]] = {}
+        self._results: dict[tuple[str, AnyCheck], list[tuple[Advice, str, Path | None]]] = {}
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
         """Add a trajectory."""
         self._count += 1
-        findings: list[tuple[Check[Any], Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
+        findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
         findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
         findings += [(REMARKED, Advice(message)) for message in trajectory.remarks]
         for check, advice in findings:
@@ -225,14 +229,14 @@ class LogChecks:
             for check, advice in run_checks(CHECKS, signals, trajectory.accepted):
                 self._add(joint, check, advice, trajectory)
 
-    def _add(self, group: str, check: Check[Any], advice: Advice, trajectory: Trajectory) -> None:
+    def _add(self, group: str, check: AnyCheck, advice: Advice, trajectory: Trajectory) -> None:
         occurrence = advice, f"trajectory {trajectory.name}", trajectory.file
         self._results.setdefault((group, check), []).append(occurrence)
 
     def findings(self) -> Findings:
-        """Return the findings: errors per check, with all its joints; notes per check and joint, or message."""
+        """Return the findings: one error per check, with all its joints; one note per check and joint or message."""
         summary = Findings()
-        groups: dict[tuple[Check[Any], str], list[str]] = {}
+        groups: dict[tuple[AnyCheck, str], list[str]] = {}
         for (group, check), occurrences in self._results.items():
             # joints at rest are a finding only if they never move
             if not check.everywhere or len(occurrences) == self._count:

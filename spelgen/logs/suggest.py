@@ -228,7 +228,7 @@ def _names(table: pa.Table) -> list[str]:
 def _by_joint(
     columns: Sequence[ColumnName], joints: Sequence[str], order: Mapping[str, int]
 ) -> dict[str, ColumnName]:
-    """Return the column per joint: by the joint's name, else by the last number, in the order of URDF or cells."""
+    """Return the column per joint, by its name; if no column has one, by its last number: `order`, or ascending."""
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
     numbers = [(re.findall(r"\d+", column.name), column) for column in columns]
     numbered = {int(match[-1]): column for match, column in numbers if match}

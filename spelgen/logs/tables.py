@@ -161,7 +161,7 @@ def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequenc
 def _renaming(
     name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
 ) -> str:
-    """Return the advice to rename an unused column of the same joint, or else to write the names in the settings."""
+    """Return the advice for a missing column `name`: rename an unused column of its joint, or map the names."""
     named = [
         joint for names in of_quantity.values() for x, joint in zip(names, joints, strict=True) if x == name
     ]

@@ -1,7 +1,5 @@
 """Page section about the arm: an animated picture, and the mass matrix M with the reason for each entry's structure."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ All charts have the same margins, so that the time axes of charts in a column ar
 element contain the axes, from which a script computes the values at a pixel.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -133,7 +131,7 @@ class Dots(Line):
     shape = "dots"
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return lines of length zero, whose round caps are the dots, for the points within both axes."""
+        """Return an SVG path of the points within both axes: lines of length zero, whose round caps are dots."""
         x, y = _floats(self.x), _floats(self.y)
         inside = x_axis.contains(x) & y_axis.contains(y)
         dots = np.stack([x_axis.pixels(x[inside]), y_axis.pixels(y[inside])], axis=1)

@@ -1,7 +1,5 @@
 """The page of a comparison: the result in a sentence and a table, then curves."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The page of `spelgen estimate`: payload, external torques and friction drift over time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

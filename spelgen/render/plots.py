@@ -1,7 +1,5 @@
 """Panels of charts that several pages show: quantities per joint, prediction errors, entries of M."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The charts of a run's report, from the traces of its evaluation, its metrics and the coverage of its logs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -118,7 +116,7 @@ def friction_panels(
 
 
 def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
-    """Return the range of the y axis: of values (K,) without outliers, and of the model's curve (speeds,)."""
+    """Return the limits of the y axis, which contain the values (K,) except outliers, and the model's curve."""
     values = values[np.isfinite(values)]
     if not values.size:
         return None

@@ -1,7 +1,5 @@
 """The pages of a run and of several runs. Files that a run folder does not have are named on the page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The bodies of an arm: inertial parameters; positions, velocities and accelerations of their masses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,7 +19,7 @@ class ChainConfiguration(NamedTuple):
     mass: Tensor  # square roots of the masses, (..., 1, bodies, 4)
     axes: Tensor  # twist of a body per rate of its own displacement, (..., 6, bodies)
     jacobian: Tensor  # of the points, zero for bodies that a body does not carry, (..., bodies, 12 bodies)
-    weight: Tensor  # -gravity, the equivalent acceleration of the base, (..., 12 bodies)
+    weight: Tensor  # -gravity, the equivalent acceleration of the base, times root masses, (..., 12 bodies)
 
 
 class BodyChain(nn.Module):
@@ -50,7 +48,8 @@ class BodyChain(nn.Module):
         # displacements are ratios q + offset, (bodies, n) and (bodies,)
         self.ratios = nn.Buffer(vector(ratio).unsqueeze(-1) * torch.eye(n)[list(joint)])
         self.offset, self.turns = nn.Buffer(vector(offset)), nn.Buffer(turns)
-        # Rodrigues: a rotation by x is 1 + sin x rate + (1 - cos x) rate^2, a translation 1 + x rate
+        # Rodrigues: with the 4 x 4 generator `rate` of a joint, a rotation by x is
+        # 1 + sin(x) rate + (1 - cos(x)) rate^2, a translation 1 + x rate.
         start, rate = torch.eye(4).double().repeat(count, 1, 1), torch.zeros(count, 4, 4).double()
         start[:, :3] = torch.tensor(placement, dtype=torch.float64)
         rate[:, 1, 0], rate[:, 0, 1], rate[:, 2, 3] = turns, -turns, 1 - turns

@@ -3,8 +3,6 @@
 Also M from constants only, and M^-1(q) over all three axes of every joint, without any structure of the arm.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -145,7 +143,7 @@ class DerivedMass(LinearMass):
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
         network, fraction = intermediates
-        # d(1/2 qd^T M' qd) / dM' = 1/2 qd qd^T, and M' has t times the derivative of M.
+        # d(1/2 qd^T M' qd) / dM' = 1/2 qd qd^T and dM' = t dM, with the network's output M and constant t.
         half = 0.5 * fraction.unsqueeze(-1) * qd
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 

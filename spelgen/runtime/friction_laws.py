@@ -1,7 +1,5 @@
 """Friction of each joint with trained constants and a hysteresis state."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -16,7 +14,7 @@ SMOOTHING_VELOCITY = 0.006
 
 
 class FrictionConstants(NamedTuple):
-    """The constants of all joints, (n,); not negative, and zero for a joint without friction."""
+    """The constants of all joints, (n,); not negative, and torques are zero for a joint without friction."""
 
     viscous: Tensor  # [Nm s/rad, N s/m]
     saturation: Tensor  # limit of the viscous friction that saturates [Nm, N]
@@ -87,8 +85,8 @@ class FrictionLaws(nn.Module):
 
     The direction, from -1 to 1, is sum_k fraction_k z_k / breakaway_k over the bristles of a joint, which
     may return elastic energy; at joints without bristles, or if z is unknown, it is s(qd,
-    coulomb_smoothing_velocity). There is no exponential, so that a control loop takes a third of the
-    time. For large r the Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of
+    coulomb_smoothing_velocity). No exponential depends on the state, so that a control loop takes a third
+    of the time. For large r the Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of
     Machines with Friction, 1991); for small r, to the exponential of Bo and Pavelescu (Wear 82:277,
     1982), without its corner at rest.
 

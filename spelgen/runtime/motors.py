@@ -1,7 +1,5 @@
 """Motors: behind gears and couplings, and position servos, whose inputs are commanded positions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -43,7 +43,7 @@ class NetworkDynamics(PortHamiltonian):
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
 
     def prepare(self) -> dict[str, Parameters]:
-        """Return the parameter cache, by part."""
+        """Return the parameter caches of mass matrix, potential and friction."""
         # No offset: a constant of V has no effect on the motion. The product keeps dtype and device.
         potential = self.potential.prepare(self.scale, 0 * self.scale[0])
         return {"mass": self.mass.prepare(), "potential": potential, "friction": self.friction.prepare()}
@@ -111,7 +111,7 @@ class DenseInputDynamics(NetworkDynamics):
         self.input_network = input_network
 
     def prepare(self) -> dict[str, Parameters]:
-        """Return the parameter cache, by part."""
+        """Return the parameter caches of all networks: also of the input matrix."""
         return super().prepare() | {"input": self.input_network.prepare(self.moving, self.moving.sum(dim=1))}
 
     def _gains(self, cache: NetworkConfiguration) -> Tensor:

@@ -1,7 +1,5 @@
 """Networks whose outputs depend on their own joints only, and the encoding of positions that they depend on."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The interfaces between a model and its parts, and symmetric matrices from their lower triangle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 

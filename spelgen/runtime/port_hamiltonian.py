@@ -1,7 +1,5 @@
 """The equations of motion of an arm, for any model of its energies and friction."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Literal
 

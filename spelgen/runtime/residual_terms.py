@@ -1,7 +1,5 @@
 """Residual terms: functions of single joints, and networks of several joints, in addition to rigid bodies."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """A port-Hamiltonian model of rigid bodies, with the inertia of four points per body."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 

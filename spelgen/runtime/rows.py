@@ -1,7 +1,5 @@
 """The rows of an emitted module: joints, links, and the functions and constants of the mass matrix."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple

@@ -143,7 +143,7 @@ class Settings(Group):
 
     @model_validator(mode="after")
     def _drives(self) -> Settings:
-        # both define the last joint, and could contradict each other
+        # `tip` and `moving_joints` both determine the last joint, and could contradict each other
         if self.tip is not None and self.moving_joints is not None:
             raise ValueError("'tip' or 'moving_joints', not both")
         # a position servo commands a joint, and its logs have no torques

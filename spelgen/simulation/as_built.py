@@ -4,8 +4,6 @@ Inertials are perturbed; the drives have armature, viscous friction, Coulomb fri
 presliding hysteresis. The result is a URDF with a settings file: the ground truth of simulated logs.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +54,7 @@ def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
 
 
 def _settings(arm: Arm, seed: int) -> dict[str, object]:
-    """Return the settings of the arm as built, without drives: how it is mounted, wired and moved."""
+    """Return the settings of the arm as built, without drives: gravity, inputs, couplings and simulated motion."""
     nominal = arm.settings
     carried = nominal.model_dump(
         mode="json",
@@ -142,7 +140,7 @@ def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
         error: Relative standard deviation: 0.3 is 30 %.
         seed: Seed of the random factors; the same seed gives the same bytes.
     """
-    # Text of a file opens no other file.
+    # without entities and network: a malicious URDF cannot include other files
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     tree = etree.ElementTree(etree.fromstring(urdf_bytes(robot), parser))
     for element in list(tree.iter("dynamics", "visual", "collision")):

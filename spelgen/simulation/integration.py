@@ -5,8 +5,6 @@
 Joint limits are not enforced: there are no end stops.
 """
 
-from __future__ import annotations
-
 import warnings
 from itertools import pairwise
 

@@ -4,8 +4,6 @@ Prescribed motion needs no controller and no integration, so dry friction may ha
 bristles an integrator would resolve by microseconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path

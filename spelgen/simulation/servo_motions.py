@@ -1,7 +1,5 @@
 """Simulated logs of an arm under position servos: commands with sines, holds and steps; positions of encoders."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from spelgen.arm.actuation import Drives

@@ -1,7 +1,5 @@
 """Simulated logs of an arm in memory, by the protocol that its settings name, for example random torques."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

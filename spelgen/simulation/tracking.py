@@ -4,8 +4,6 @@ It replaces the recordings of the real arm in the paper (Wang, Chen, Ding, Sci R
 public. Values that the paper does not state are chosen here: gains, phases, encoders and the cutoff of the filter.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

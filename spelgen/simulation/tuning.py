@@ -1,7 +1,5 @@
 """Constants of simulated logs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 
@@ -78,7 +76,7 @@ class AsBuiltTuning:
     torque_noise: float = 0.02
     # Encoders of 19 bits [rad; m].
     resolution: float = 1.2e-5
-    # Recordings [s], [Hz].
+    # Duration [s] and sample rate [Hz] of a recording.
     duration: float = 15.0
     sample_rate: float = 200.0
 

@@ -218,7 +218,7 @@ def _fraction(element: int, value: float) -> Fraction:
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         candidate = Fraction(numerator, denominator)
-        # The float decides whether the short fraction is the number or a coincidence.
+        # A fraction that differs from the float is a coincidence of the reconstruction modulo PRIME.
         if abs(candidate - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
             return candidate
     return Fraction(value)

@@ -148,7 +148,7 @@ def _values(operand: Residues | int) -> np.ndarray | np.uint64:
 
 
 def _folded(values: np.ndarray) -> np.ndarray:
-    """Return numbers (...,) below 2^62 modulo the prime."""
+    """Return numbers (...,) modulo the prime 2^61 - 1; they must be below 2^62."""
     return np.where(values >= _P, values - _P, values)
 
 

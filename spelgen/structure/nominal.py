@@ -158,7 +158,7 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
 
 def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
     """Return the root mean square over q (S, n) of the gravity torque dV/dq, (n,) [Nm, N]."""
-    step = 1e-4  # [rad, m] central differences: relative errors of 1e-8 suffice for scales
+    step = 1e-4  # [rad, m] of central differences: their relative error of 1e-8 is small enough for scales
     shifts = step * np.eye(q.shape[1])[:, None]
     _, forward = float_energies(arm, q + shifts, inertias)
     _, backward = float_energies(arm, q - shifts, inertias)
@@ -193,12 +193,12 @@ def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
 
 
 def _rounded(values: np.ndarray, digits: int = 6, zero_below: float = 1e-12) -> tuple[float, ...]:
-    """Return values (n,) with n significant digits; see ``_round``."""
+    """Return values (n,) rounded to a number of significant digits by ``_round``."""
     return tuple(_round(value, digits, zero_below) for value in values.tolist())
 
 
 def _round(value: float, digits: int = 6, zero_below: float = 1e-12) -> float:
-    """Return a number with n significant digits, equal on every machine; 0 for a magnitude of at most ``zero_below``.
+    """Return a value rounded to significant digits, equal on every machine; 0 for magnitudes up to ``zero_below``.
 
     Scales are divisors, and may be small for an arm of 1e-12 kg: their ``zero_below`` is 0.
     """

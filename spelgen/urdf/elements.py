@@ -20,7 +20,7 @@ def read_name(notes: Notes, xml: etree._Element) -> str | None:
 
 
 def read_link(notes: Notes, xml: etree._Element) -> UrdfLink | None:
-    """Return the link, with its first <inertial>."""
+    """Return the link of a <link> element, with its first <inertial>; None, with an error, if it has no name."""
     name = read_name(notes, xml)
     if name is None:
         return None

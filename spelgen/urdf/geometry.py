@@ -43,7 +43,7 @@ class LinkShape:
 
 
 class LinkShapes(NamedTuple):
-    """The shapes of links that were read, and the unread ones: name of the link -> names of files, or kind."""
+    """The shapes that were read. unread: link -> the other shapes, each a mesh file or the kind of a shape."""
 
     shapes: tuple[LinkShape, ...]
     unread: dict[str, tuple[str, ...]]

@@ -2,11 +2,9 @@
 
 The derivatives of the errors do not distinguish a dead zone from dry friction at a joint without gravity load: both
 hold the joint off its command. The motion at starts, stops and reversals does. So each joint is fitted twice, from
-initial parameters with and without a dead zone, under the load and the delay of the last fit, which make joints
-independent. A dead zone is kept if it lowers the joint's negative log posterior by more than significance^2 / 2.
+initial parameters with and without a dead zone. Load, delay and likelihood are fixed at the last fit, so that joints
+are independent. A dead zone is kept if it lowers the joint's negative log posterior by more than significance^2 / 2.
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 
@@ -60,7 +58,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         candidate_errors = problem.residual(candidate)
         candidate_costs = problem.joint_costs(candidate, candidate_errors)
         better = active & (candidate_costs < costs)
-        # a joint ends after a small decrease, or if no step with a damping below one lowers its cost
+        # a joint ends after a small decrease, or if a step with a damping of at least one does not lower its cost
         active &= torch.where(better, costs - candidate_costs >= TUNING.min_decrease, damping < 1.0)
         x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
         errors = torch.where(better, candidate_errors, errors)
@@ -75,7 +73,7 @@ def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) 
     """Return parameters in which all joints have a dead zone, and all parameters are active.
 
     The half dead zone is `fraction` of the static error, dry friction / kp, and Coulomb friction is reduced by this
-    fraction, so that the static error remains about the same.
+    fraction, so that the static error remains about the same (exactly, if there is only Coulomb friction).
     """
     rollouts, row, joints = problem.rollouts, problem.parameters.row, x.joints.clone()
     model = rollouts.model

@@ -5,8 +5,6 @@ kp (u - q) = kd qd + M qdd + gravity + friction. Divided by kp, the command erro
 and its coefficient for the gravity torque of the URDF's masses is 1 / kp.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -5,8 +5,6 @@ the error of predicted windows (`problem`): each recomputes the load of the bodi
 scale of the errors. Dead zones are selected after the first iteration (`laws`); the last one uses all windows.
 """
 
-from __future__ import annotations
-
 import copy
 import time
 from collections.abc import Callable

@@ -65,7 +65,7 @@ class Likelihood:
 class ServoProblem:
     """Negative log posterior of `ServoParameters` for a given load and likelihood: a `LeastSquaresProblem`.
 
-    noise: (n,) lower bound of the errors' scale [rad, m].
+    noise: (n,) lower bound of the scale of the position errors [rad, m].
     """
 
     rollouts: ServoRollouts

@@ -4,8 +4,6 @@ Errors are correlated within a motion, and by the form of the model even over a 
 a jackknife (see `jackknife_covariance`). A parameter that the logs do not determine keeps the interval of its prior.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Constants of fits of position servos."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

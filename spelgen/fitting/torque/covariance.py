@@ -1,7 +1,5 @@
 """Errors of a torque fit: covariance of its parameters, and torque residual of samples that were not fitted."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 
@@ -53,8 +51,8 @@ def parameter_covariance(estimate: TorqueEstimate) -> torch.Tensor:
 def held_out_nmse(estimate: TorqueEstimate, samples: TorqueSamples) -> torch.Tensor:
     """Return the mean squared error (n,) of held-out segments, divided by the variance of the torque.
 
-    A fit to all other segments has the residual (1 - H)^-1 r on a segment, with its residual r and its block H of the
-    hat matrix of all joints, to first order in the change of the parameters.
+    To first order in the parameters, a fit without a segment has the residual (1 - H)^-1 r on this segment: r is the
+    residual of the fit to all segments, and H the block of the hat matrix of the segment, of all joints together.
     """
     segments, size = estimate.on_segments(samples), samples.segment_length(TUNING.segment)
     jacobian, x, noise = segments.problem.jacobian, segments.state.x, segments.problem.noise

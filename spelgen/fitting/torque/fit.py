@@ -5,8 +5,6 @@ initial fit -> choice of the friction state -> choice of friction effects -> res
 The first iterations use a subset of the samples; residual terms are selected on more of them; the final fit uses all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Torque residual of rigid bodies, drives and friction on samples, with its Jacobian and normal equations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import NamedTuple
@@ -61,9 +59,10 @@ class TorqueJacobian:
 
     The modelled joint torque is Y(q, qd, qdd) theta + C^T (friction + armature a), plus the torque of the residual
     terms, with the inertial parameters theta of B bodies, and the speeds C qd and accelerations a of the drives. The
-    residual is the measured minus the modelled torque. The residual terms of the model are constant: they are
-    evaluated when this object is created. `terms` are linear terms in addition, which are eliminated by variable
-    projection.
+    residual is the measured torque, G (tau - offset) plus friction compensation, minus the modelled torque. The
+    residual terms of the model are constant: they are evaluated when this object is created. `terms` are linear terms
+    in addition, which are eliminated by variable projection. Jacobians with respect to "theta (K,)" have the other
+    parameters as further columns (see `joint_rows`).
     """
 
     def __init__(
@@ -78,7 +77,7 @@ class TorqueJacobian:
         self._affects = self._motors != 0  # (n, n): whether a drive affects a joint's torque
         self._affected = self._affected_joints()
         self._colours = _colour(self._affects.double().mT @ self._affects.double() > 0)
-        # regressors do not depend on x: once per object, in blocks because of the copies of `_compressed_jacobian`
+        # regressors do not depend on x: computed once; blocks limit the memory of the copies in `_compressed_jacobian`
         self._blocks = [self._with_regressors(block) for block in samples.blocks(TUNING.block)]
 
     @cached_property
@@ -89,8 +88,9 @@ class TorqueJacobian:
     def squared_residual(self, x: torch.Tensor) -> torch.Tensor:
         """Return the sum of the squared torque residual per joint, (n,) [Nm^2, N^2].
 
-        If motor gains are trained, the residual is the one of the logged torque: joint torques are proportional to the
-        gains, so their residual would be smallest for gains of zero.
+        For a joint with eliminated terms it includes the penalty of their weights. If motor gains are trained, the
+        residual is the one of the logged torque: joint torques are proportional to the gains, so their residual would
+        be smallest for gains of zero.
         """
         parameters = self.rigid.unflatten(x)
         with torch.no_grad():
@@ -192,7 +192,7 @@ class TorqueJacobian:
         """
         change = self.theta_jacobian(x)
         covariance = change @ covariance @ change.mT
-        # in theta the torque is linear, so that the projection also holds for large torques
+        # theta, not x: the torque is linear in inertial parameters, so that the projection also holds for large torques
         rows = concatenate_blocks(self.joint_rows(x), len(noise))
         gains = []
         for joint, columns, _, _ in rows:
@@ -202,9 +202,9 @@ class TorqueJacobian:
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Return parameters (K,) after a step (K,) that is straight where the torque is linear.
 
-        Bodies are moved straight in their inertial parameters (see `step_in_inertial_parameters`). Coefficients c whose
-        logarithms are parameters are moved straight in c if they increase, log c + log(1 + step); a decrease stays
-        straight in log c, for c must remain positive.
+        Inertial parameters are updated along a straight line (see `step_in_inertial_parameters`). A coefficient c whose
+        logarithm is a parameter is updated to c (1 + step) if it increases, and to c exp(step) if it decreases, so that
+        c remains positive.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)

@@ -5,8 +5,6 @@ spring. Such features are therefore compared after orthogonalization against the
 regression (Frisch and Waugh, Econometrica 1:387, 1933).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -46,10 +44,10 @@ class JointFunction:
     features: (T, P), the columns after orthogonalization; the columns themselves if the term is a friction factor.
     direction: (n,) joint torques per torque of the term.
     groups: (P,) index of the weights' group, which has one prior precision.
-    friction: (T,) friction torque that the term multiplies; its weights are then the ones of the factor's logarithm,
-        and columns @ weights is its torque to first order. None: the term is a torque.
-    visit_length: number of samples per visit of a position: a new visit begins after a motion by the distance of two
-        splines.
+    friction: (T,) friction torque, with the current factor; the weights are then the ones of the factor's logarithm,
+        and columns @ weights is the torque linearized at the current factor. None: the term is a torque.
+    visit_length: mean number of samples per visit of a position: a new visit begins after a motion by the spacing of
+        the splines.
     """
 
     parameter: str
@@ -84,12 +82,12 @@ class JointFunction:
             terms.get_parameter(self.parameter)[self.joint] = entries / self.scale
 
     def torque(self, weights: torch.Tensor, rows: slice | torch.Tensor = ALL) -> torch.Tensor:
-        """Return the torque (T,) [Nm, N] of weights (P,) on the samples of these rows."""
+        """Return the torque (T,) [Nm, N] of weights (P,) on the samples of these rows; of a factor: its change."""
         features = self.features[rows]
         if self.friction is None:
             return features @ weights
         friction = self.friction[rows]
-        # columns are multiplied by friction, whose sign changes: zero divided by zero is no factor
+        # columns are splines times friction: at zero friction 0 / 0 is replaced by a log factor of zero
         log_factor = (features @ weights.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT)) / friction
         return friction * log_factor.nan_to_num().expm1()
 
@@ -104,13 +102,13 @@ class JointFunction:
     ) -> BayesianRidge:
         """Return the fit to a target (T,) on the samples of these rows: samples of one visit count as one error."""
         samples = append_target(self.features[rows], target[rows])
-        # errors of one visit of a position are equal for a function of position, however long they last
+        # a function of position has the same error during one visit of a position, however long the visit lasts
         length = max(correlation_length, self.visit_length)
         return bayesian_ridge(samples.mT @ samples, len(samples), self.groups, length)
 
 
 class ProjectedTerms(NamedTuple):
-    """Torques of position that a fit eliminates: linear terms per joint, and the candidates they consist of."""
+    """Position-dependent torques, eliminated in a fit: the linear terms per joint, and the candidates they join."""
 
     terms: dict[int, LinearTerms]
     candidates: tuple[JointFunction, ...]
@@ -133,8 +131,8 @@ def refit_terms(
 ) -> ProjectedTerms:
     """Refit the selected terms to the current torque residual, one after the other.
 
-    Friction factors are written to the model. Of torques of position only the penalty is kept: they are set to zero in
-    the model and returned as linear terms, to be eliminated in the next fit of the rigid-body parameters.
+    Friction factors are written to the model. Torques of position are set to zero in the model and returned as linear
+    terms with the fitted penalty: their weights are eliminated in the next fit of the rigid-body parameters.
 
     Args:
         model: model with residual terms.
@@ -183,7 +181,7 @@ def joint_functions(
     with torch.no_grad():
         splines, ripple = terms.splines(samples.q), terms.revolute * terms.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), terms.unit.flatten()
-    # number of visits: path length in units of two splines
+    # number of visits: path length divided by the spacing of the splines
     visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
     one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
     line = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1)

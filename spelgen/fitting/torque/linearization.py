@@ -1,7 +1,5 @@
 """Linearized torque per joint: rows of the Jacobian, normal equations, projections, and Bayesian ridge regression."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

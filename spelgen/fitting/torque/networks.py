@@ -1,7 +1,5 @@
 """Networks fitted to torques by L-BFGS: models of networks, and the networks of residual terms, which are selected."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator
 

@@ -1,7 +1,5 @@
 """Objective torque: fit inverse dynamics to the torques of all logs, then validate the model on windows."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

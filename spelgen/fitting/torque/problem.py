@@ -82,13 +82,16 @@ class NoiseEstimator:
             effective_parameters: number of parameters that each joint's torque determines, (n,): each reduces the
                 degrees of freedom of the residual by one independent error.
         """
-        # at least one error remains: equal shares can exceed the errors of a joint
+        # at least one error remains: gamma is divided equally (`updated`), a joint can have fewer errors than its share
         fraction = (self.errors - effective_parameters).clamp(min=1.0) / self.errors
         rms = (squared_residual / self.count / fraction).sqrt()
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] of an early iteration: a fraction of its residual (n,) [Nm^2, N^2]."""
+        """Return the noise (n,) [Nm, N] of an annealing iteration: a fraction of the rms of its residual.
+
+        squared_residual: (n,) [Nm^2, N^2], of all samples.
+        """
         return TUNING.annealing_fraction * (self.correlation_length * squared_residual / self.count).sqrt()
 
 
@@ -138,13 +141,13 @@ class TorqueProblem:
     def with_least_squares_noise(self, x: torch.Tensor) -> TorqueProblem:
         """Return the problem under the noise of unconstrained least squares, linearized at x (K,).
 
-        Unconstrained least squares fits the samples better than any physically consistent x: its residual is the lower
-        bound of the noise. An estimate from the residual of a poor initial guess would be too large, and the fit would
-        stop early.
+        Unconstrained least squares fits the samples better than any physically consistent x, up to the linearization of
+        friction: its residual is a lower bound of the noise. A noise from the residual of a poor initial guess would be
+        too large, and the fit would stop early.
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
-        # twice: the noise is the weight of the joints, whose torques have common parameters
+        # twice: joints have common parameters, so that the solution depends on their weights, and these on the noise
         for _ in range(2):
             noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
         return replace(self, noise=noise)
@@ -161,7 +164,7 @@ class TorqueProblem:
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
         """Return Gauss-Newton Hessian (k, k) and negative gradient (k,) with respect to the k free parameters."""
-        # of all parameters first: common factors of the prior couple free and fixed ones
+        # for all parameters first: the prior of common factors couples free and fixed parameters
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
@@ -173,7 +176,7 @@ class TorqueProblem:
         step: (k,) of the free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
-        # the first one is cheaper, and as good near the optimum; far from it bodies need the second
+        # the first is cheaper, and as good near the optimum; far from it the second may have a lower cost
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
@@ -213,8 +216,8 @@ class TorqueProblem:
 class TorqueEstimate:
     """MAP estimate: the problem with its noise and prior, and the solver's last state.
 
-    covariance: (K, K), posterior covariance of x. After `alternate` it is the one under the noise and prior before
-    their last update; `with_current_covariance` recomputes it. termination: of the last call of the solver.
+    covariance: (K, K), posterior covariance of x. After `alternate` it is the one of the last linearization,
+    under the noise and prior before their last update; `with_current_covariance` recomputes it.
     """
 
     problem: TorqueProblem
@@ -238,7 +241,7 @@ class TorqueEstimate:
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
-        # fewer samples per error have less noise each, so that an error keeps its weight
+        # the weight of an independent error, length / noise^2, is the same at the interval of the segments
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
@@ -288,8 +291,9 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     corrected for the fit (`RigidProjection.errors`): the residual itself is less correlated the more parameters are
     fitted to it. The estimate is averaged with its prior mean, weighted by the numbers of independent errors.
 
-    It is estimated once, after friction was chosen. In the outer iterations it would drive itself up: a joint with a
-    long correlation time has a small weight, and its residual grows. Friction without history has errors of its own.
+    It is estimated once, after the friction model was chosen, since the errors of a wrong friction model last longer.
+    Updates in the outer iterations would be unstable: a joint with a long correlation time has a small weight, so that
+    its residual grows, and with it the correlation time.
     """
     segments, problem, prior_mean = estimate.on_segments(samples), estimate.problem, TUNING.correlation_time
     residual, projection = segments.linearize()

@@ -1,7 +1,5 @@
 """Notes of a torque fit: prior width, selected residual terms, undetermined inertias."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from itertools import compress

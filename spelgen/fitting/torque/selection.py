@@ -9,8 +9,6 @@ are repeated with the held-out samples at positions within the range of the fitt
 extrapolate. Of the accepted candidates of a joint the one with the largest error reduction is selected.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -175,7 +173,8 @@ def _blocks(count: int) -> list[slice]:
 
 def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Yield masks (T,) of the held-out and of the fitted samples: of recordings (T,), or of blocks of one recording."""
-    # recordings differ more than blocks do: errors of a day, a load, a motion
+    # Whole recordings are held out: they differ in day, load and motion, and so their errors differ more than the
+    # errors of blocks of one recording.
     number = int(recordings.max()) + 1
     if number == 1:
         rows = torch.arange(len(recordings))

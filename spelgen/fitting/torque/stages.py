@@ -1,7 +1,5 @@
 """Stages of a torque fit: initial fit, choice of the friction state, of friction effects, and of residual terms."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Constants of fits to torques."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
