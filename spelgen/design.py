@@ -1,4 +1,4 @@
-"""Design: the form of each quantity of a model, as in the file of a preset; validated when it is created."""
+"""Design of a model: the form of each quantity of the equations of motion. Presets are designs in YAML files."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -116,7 +116,7 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
 
 
 def _conflicts(values: Mapping[str, object]) -> Iterator[tuple[str, str, str]]:
-    """Yield pairs of keys with contradicting values, and advice."""
+    """Yield each pair of keys whose values contradict each other, with advice."""
     # The rules have the order of the keys in a file, so that errors appear in the order of the file's lines.
     rigid = values["mass"] == "closed-form"
     if rigid != (values["potential"] == "closed-form"):

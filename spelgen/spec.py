@@ -26,7 +26,7 @@ SPEC_FORMAT = 9
 
 @dataclass(frozen=True)
 class Options:
-    """The options of `spelgen build`; with the URDF they determine the model."""
+    """The options of `spelgen build`; URDF and options determine the model."""
 
     preset: str = "hybrid"
     design: Design | None = None
@@ -95,7 +95,7 @@ class LinkSpec:
 
 @dataclass(frozen=True)
 class ServoSpec:
-    """The position servo of a joint; N and m instead of Nm and rad if it is prismatic."""
+    """The position servo of a joint. For a prismatic joint the units are N and m instead of Nm and rad."""
 
     kp: float
     """Initial value of the proportional gain: torque per position error [Nm/rad]."""
@@ -138,7 +138,7 @@ class InputSpec:
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """A model; indices are from 0. Raises ModuleError if indices and names contradict each other."""
+    """Specification of a model; indices are from 0. Raises ModuleError if indices and names contradict each other."""
 
     robot: str
     urdf: str

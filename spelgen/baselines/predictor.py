@@ -125,7 +125,7 @@ def _friction_slopes(
 
 @dataclass(frozen=True)
 class PredictorTuning:
-    """Integration of predictions by the Rosenbrock method."""
+    """Constants of the integration of predictions by the Rosenbrock method."""
 
     # [1] Largest number of integrator steps between two samples; a power of two.
     most_substeps: int = 16

@@ -25,7 +25,7 @@ OF_LOGS = PREPROCESSING | {"validation_fraction", "seed"}
 
 
 class UsageError(typer.BadParameter):
-    """An option that does not apply; the message names the option."""
+    """Usage error about an option that does not apply; the message names the option."""
 
     def format_message(self) -> str:
         """Return the message without the prefix that names a parameter."""

@@ -110,7 +110,7 @@ def simulated_figures(
     config = fit.config if isinstance(fit.config, Rollout) else Rollout()
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
-    # M must be positive definite at all positions within the limits; its error is measured at logged positions
+    # Positive definiteness of M is tested within the joint limits, the error of M is measured at logged positions.
     joints = fit.record.joints
     ranges = list(map(working_range, load_arm(truth, joints).chain.coordinates))
     low, high = torch.tensor(ranges, dtype=torch.float64).T

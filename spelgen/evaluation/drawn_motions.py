@@ -74,7 +74,7 @@ Drawn = TypeVar("Drawn", bound=DrawnMotion)
 
 
 def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
-    """Return the motion of median error, and the motion of largest error if there are several."""
+    """Return the motion of median error and, if there are several motions, the motion of largest error."""
     # Sorting keeps the order of motions with equal errors, so the same logs always give the same page.
     ordered = sorted(motions, key=lambda motion: math.inf if motion.error is None else motion.error)
     if not ordered:

@@ -136,7 +136,7 @@ class EvaluatedLogs:
 
     @property
     def longest(self) -> int:
-        """Number of steps of the longest piece."""
+        """Length of the longest piece [steps between samples]."""
         return max(map(len, self.pieces)) - 1
 
     def stride(self, span: int, window_count: int) -> int:

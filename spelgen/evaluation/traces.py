@@ -117,7 +117,7 @@ def motion_traces(
 
 
 def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
-    """Return the logs of median and of largest error of an arm under position servos."""
+    """Return the curves of an arm under position servos: the replayed logs of median and of largest error."""
     motions = [thinned(replayed_motion(log, error), TUNING.log_samples) for log, error in errors]
     return Traces(coverage([log for log, _ in errors]), trajectories=typical_and_worst(motions))
 

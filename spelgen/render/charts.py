@@ -171,7 +171,7 @@ Mark = Line | Band
 
 @dataclass(frozen=True)
 class LegendEntry:
-    """A line of a legend: CSS classes of the mark, and its label."""
+    """An entry of a legend: CSS classes of the mark, and the label of the mark."""
 
     style: str
     label: str

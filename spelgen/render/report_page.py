@@ -33,7 +33,7 @@ SCHEMA = 1
 def write_report(
     folder: Path | str, output: Path | str | None = None, robot: Path | str | None = None
 ) -> Path:
-    """Write the page about a run; return its path.
+    """Write the page about a run; return the path of the page.
 
     Args:
         folder: Run folder.

@@ -38,7 +38,8 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
         raise SpelgenError(
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
-    arm_dynamics(arm.chain, arm.settings)  # reports missing inertials with the name of the user's file
+    # Called only for its check: the error of a missing inertial contains the path of the user's file.
+    arm_dynamics(arm.chain, arm.settings)
     settings = _settings(arm, seed)
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
     # Friction and armature are scaled by the torques and M of the perturbed bodies, computed without drives.

@@ -1,11 +1,11 @@
-"""Constants of simulated logs."""
+"""Constants of the simulation of logs."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class SimulationTuning:
-    """Accuracy of simulated motion, and controllers of simulated arms."""
+    """Constants of the integration of motion, and of the controllers of simulated arms."""
 
     # [1] Relative tolerance of the integration, close to the limit of double precision.
     rtol: float = 1e-13
@@ -26,7 +26,7 @@ class SimulationTuning:
 
     # Arms under position servos.
 
-    # [s] Largest step of the integration.
+    # [s] Largest integrator step of an arm under position servos.
     servo_step: float = 1e-3
     # [1] Gauss-Seidel iterations over the joints for the impulses of dry friction.
     friction_sweeps: int = 4
@@ -34,7 +34,7 @@ class SimulationTuning:
     encoder_counts: int = 4096
     # [Nm] Torque limit of a servo whose URDF joint states no effort limit.
     servo_effort: float = 5.0
-    # [s] Ratio kd / kp of an unspecified servo.
+    # [s] Ratio kd / kp of all simulated servos.
     servo_lag: float = 0.05
     # [rad, m] Largest amplitude of a command about the middle of a joint's range.
     command_amplitude: float = 0.6
@@ -54,7 +54,8 @@ class AsBuiltTuning:
     inertial_error: float = 0.3
     # Links of at most this mass [kg] are placeholders and stay unchanged.
     massless: float = 1e-9
-    # Lower bound of the principal second moments of mass, relative to the largest one; smaller ones are clipped to it.
+    # If a body has a negative principal second moment of mass, its moments are clipped to at least this fraction of
+    # the largest one.
     min_spread: float = 0.01
     # Coulomb friction, divided by the rigid-body torque of moderate motion.
     coulomb: tuple[float, float] = (0.04, 0.12)
