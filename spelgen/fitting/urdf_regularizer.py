@@ -1,6 +1,6 @@
 """Regularizer towards the mass matrix and gravity torque of a URDF, for parameters that the logs do not determine.
 
-The variation of M with q is compared instead of M: rotors that the URDF does not specify add constants to M.
+The variation of M with q is compared, not its mean: rotors and loads that the URDF does not specify add constants to M.
 """
 
 from __future__ import annotations
