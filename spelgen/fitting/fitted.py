@@ -86,7 +86,7 @@ class Fit:
 
     @property
     def torque_nmse(self) -> dict[str, float]:
-        """Joint name -> mean squared torque error divided by the torque's variance; no joints with constant torque."""
+        """Joint name -> mean squared torque error / variance of the torque; joints with constant torque are omitted."""
         by_joint = zip(self.model.joint_names, self.checkpoint.torque_nmse, strict=False)
         return {joint: nmse for joint, nmse in by_joint if math.isfinite(nmse)}
 
@@ -134,8 +134,8 @@ class Fit:
     def predict(self, trajectory: Trajectory, *, std: bool = False) -> np.ndarray | Uncertain:
         """Return joint torques (T, n) [Nm, N] of the model's inverse dynamics at the samples of a trajectory.
 
-        The velocity is filtered as in the fit, and differentiated. The torque is NaN at a sample between two gaps,
-        where there is no acceleration.
+        The velocity is filtered as in the fit, and differentiated. The torque is NaN at a single sample between two
+        gaps in the sample times, since such a sample has no acceleration.
 
         Args:
             trajectory: trajectory of the arm.

@@ -1,4 +1,4 @@
-"""The objective momentum: a fit of the weak form of the equations of motion. It is also the first stage of rollout."""
+"""The objective momentum: fit the weak form of the equations of motion, also as a stage of the objective rollout."""
 
 import copy
 import math

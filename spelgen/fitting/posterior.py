@@ -52,7 +52,7 @@ class Uncertain(NamedTuple):
 class Propagated(NamedTuple):
     """Value of a function of the model, (...), and its derivative times R, (..., k).
 
-    The norm of the second over k is the standard deviation of the value.
+    The norm of ``root`` over k is the standard deviation of the value.
     """
 
     value: Tensor

@@ -73,7 +73,7 @@ def termination_as_interrupt() -> Iterator[None]:
 
 @contextmanager
 def locked(folder: Path | None) -> Iterator[None]:
-    """Create the folder and lock it against other processes of this machine; None: no effect.
+    """Create the folder and lock it against other processes of this machine, within a context; None: no effect.
 
     Raises RunError with the process that has locked the folder. The kernel releases the lock when this process ends for
     any reason, so a remaining lock file has no effect.

@@ -1,4 +1,4 @@
-"""Typed contents of a run folder's files. They are checked when they are read: others may have written the folder."""
+"""Typed contents of a run folder's files, checked when they are read, since the folder may come from another person."""
 
 from __future__ import annotations
 

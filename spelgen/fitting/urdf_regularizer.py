@@ -68,7 +68,7 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
     Args:
         urdf: URDF file.
         model: model before the fit; the mean of its M is the unit of M.
-        windows: windows whose positions (W, K, n) [rad, m] have the range.
+        windows: windows with the positions (W, K, n) [rad, m] of the logs.
 
     Raises:
         ImportError: if Pinocchio is not installed. Errors of Pinocchio are raised, too.

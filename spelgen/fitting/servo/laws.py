@@ -32,7 +32,7 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
 
 
 def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return the parameters without dead zones below `TUNING.min_dead_zone`, the resolution of encoders."""
+    """Return the parameters without dead zones below `TUNING.min_dead_zone`, about the resolution of encoders."""
     row, joints, active = problem.parameters.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
     active[row] &= joints[row] > TUNING.min_dead_zone
     joints[row] *= active[row]

@@ -1,8 +1,8 @@
 """Least-squares fits to windows: the initial guess of a servo fit, and the baseline of linear second-order servos.
 
 The initial guess is the linear least-squares solution for the command error u - q. At a joint with a position servo,
-kp (u - q) = kd qd + M qdd + gravity + friction. After division by kp, the command error is linear in the unknown
-parameters; the coefficient of the gravity torque, computed with the URDF's masses, is 1 / kp.
+kp (u - q) = kd qd + M qdd + gravity + friction. The command error is therefore linear in the ratios of the parameters
+to kp. The gravity torque is computed with the URDF's masses: its coefficient is 1 / kp.
 """
 
 from functools import lru_cache

@@ -1,9 +1,9 @@
 """The objective servo: fit the position servos, friction and gravity load of an arm to commands and measured positions.
 
 The initial guess is the least-squares solution for the command error (`least_squares`). Three outer iterations then
-minimize the error of predicted windows (`problem`). Each outer iteration first recomputes the load of the bodies along
-the predicted motion, and the scale of the errors. Dead zones are selected after the first outer iteration (`laws`). The
-last outer iteration uses all windows.
+minimize the error of predicted windows (`problem`). Each iteration first computes the scale of the errors and the load
+of the bodies, along the measured motion in the first iteration and along the predicted motion in the others. Dead zones
+are selected after the first iteration (`laws`). The last iteration uses all windows.
 """
 
 import copy
@@ -35,8 +35,8 @@ from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
-# The first uses few windows with half the integration steps; the second, few windows with the selected dead zones; the
-# third, all windows.
+# The first iteration uses few windows with half the integration steps; the second, few windows with the selected dead
+# zones; the third, all windows.
 OUTER_ITERATIONS = 3
 
 
@@ -44,7 +44,7 @@ class ServoObjective(Objective):
     """A fit to all logs, without validation logs; it can be resumed at the start of each outer iteration.
 
     The load and the scale of the errors in an outer iteration are functions of the parameters at the start of this and
-    of all earlier outer iterations. A checkpoint therefore contains these parameters only.
+    of all earlier outer iterations. A checkpoint therefore contains only these parameters and the initial weights.
     """
 
     name: ClassVar[str] = "servo"
@@ -94,7 +94,7 @@ class ServoObjective(Objective):
         """See `Objective`."""
         while len(self._iterates) < OUTER_ITERATIONS:
             x = self._minimized(progress)
-            # Dead zones are selected after the first fit of the gains: wrong gains would dominate the errors.
+            # Dead zones are selected after the first iteration: with the initial gains, gain errors would dominate.
             select = select_dead_zones if len(self._iterates) == 1 else without_small_dead_zones
             self._begin_iteration(select(self._problem, x))
             save()

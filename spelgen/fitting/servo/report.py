@@ -31,7 +31,7 @@ RATIOS = {
     "static_error": ("static error", "rad, m"),
     "dead_zone": ("half dead zone", "rad, m"),
 }
-"""Label and unit of each ratio to kp. lag: kd / kp plus the delay. dry: mean dry friction in motion, divided by kp.
+"""Label and unit of each ratio to kp. lag: kd / kp plus the delay. dry: ratio of mean dry friction in motion to kp.
 static_error: the sum of dry and half the dead zone."""
 ABOUT = (
     "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "

@@ -64,10 +64,10 @@ class ServoRollouts:
         """Return the derivatives of the residual with respect to joint parameters and to shared parameters.
 
         Returns:
-            (p, W, K', n), with respect to the p parameters of the same joint; zero for parameters that no joint has.
+            (p, W, K', n), with respect to the p parameters of the same joint; zero for parameters that are not fitted.
             (r + 1, W, K', n), with respect to the r coordinates of the bodies and to the delay.
         """
-        rows = x.active.any(dim=1).nonzero().squeeze(-1)  # parameters that at least one joint has
+        rows = x.active.any(dim=1).nonzero().squeeze(-1)  # parameters that are fitted at one joint or more
         p, r, step = len(rows), len(x.bodies), self.difference_step
         # the batch: no parameter changed; then each joint parameter, each body coordinate, and the delay changed
         joints = x.joints.expand(p + r + 2, -1, -1).clone()
@@ -127,7 +127,7 @@ class ServoRollouts:
             current = Load(inertia[:, :, k], bias[:, :, k], load.gravity[:, k], coupled=False)
             if (
                 state is None
-            ):  # an assumption: the friction state is not measured; errors decay during the burn-in
+            ):  # assumed balanced, since friction is not measured; the error decays in the burn-in
                 state = balanced(drives, q, qd, commands[:, :, k, 0], current)
             for u in commands[:, :, k].unbind(2):
                 state = advanced(drives, state, u, current, h[:, k])
