@@ -268,7 +268,7 @@ def _turned(pose: _Pose, vector: Vector) -> Vector:
 
 
 def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
-    """Return the inertia about an origin displaced by -p, with p = ``offset``: h + m p and the parallel-axis theorem."""
+    """Return the inertia about an origin displaced by -p, p = ``offset``, by h + m p and the parallel-axis theorem."""
     if not offset:
         return inertia
     moment: list[Element] = list(inertia.moment)
