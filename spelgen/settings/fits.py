@@ -33,7 +33,7 @@ class WindowFitDefaults:
     adamw_decay: float = 0.2
     # [1] Windows per step of AdamW.
     batch: int = 256
-    # [1] Largest learning rate of AdamW: the default value in the publication of the optimizer Adam.
+    # [1] Largest learning rate of AdamW: the default value of the authors of this optimizer.
     learning_rate: float = 1e-3
 
 

@@ -79,7 +79,7 @@ def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
 
 def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
     elements = root.findall("link")
-    # The number of links is bounded, because the time of all later steps increases with it. Robots have at most a tenth
+    # The number of links is bounded, because the time of all later steps increases with it. Arms have at most a tenth
     # of the bound.
     if len(elements) > MAX_LINKS:
         notes.error(root.sourceline, "<robot>", f"{len(elements)} links", f"at most {MAX_LINKS}")
