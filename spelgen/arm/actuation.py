@@ -1,7 +1,7 @@
 """Input matrix G of M qdd + ... = G tau, from the transmissions of the URDF and the settings.
 
-tau are the logged torques. These are joint torques, or motor torques if the settings specify ``torque: motor``; in the
-second case G contains the gear ratios and the couplings of motors that drive several joints, as in many wrists.
+tau are the logged torques: joint torques, or motor torques if the settings specify ``torque: motor``. In the second
+case G contains the gear ratios and the couplings of motors that drive several joints, as in many wrists.
 """
 
 from collections.abc import Iterator, Sequence

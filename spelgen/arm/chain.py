@@ -81,7 +81,7 @@ def leaders(robot: Robot) -> dict[str, Leader]:
             followers.append((leader.name, leader.mimic))
             leader = robot.joint[leader.mimic.joint]
         follow = result.setdefault(leader.name, Leader(leader, Fraction(1), Fraction(0)))
-        # From the leader outwards, because each multiplier and offset depends on those of the joint before.
+        # From the leader outwards, because the multiplier and offset of a joint depend on its leader's.
         for name, mimic in reversed(followers):
             multiplier = exact(mimic.multiplier)
             offset = multiplier * follow.offset + exact(mimic.offset)

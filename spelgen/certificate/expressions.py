@@ -2,8 +2,8 @@
 
 Products of cosines and sines of the angles of consecutive joints with parallel axes become cosines and sines of sums of
 these angles. Other forms (powers of single angles, common factors of several terms) shorten long formulas by 20 %, but
-not those that are short enough to be read. Printed decimals have at most twelve digits; Python for SymPy has exact
-fractions. Before lines are wrapped, blanks at which a line must not be broken are replaced by no-break spaces.
+not the formulas that are short enough to be read. Printed decimals have at most twelve digits; Python for SymPy has
+exact fractions. Before lines are wrapped, blanks at which a line must not be broken are replaced by no-break spaces.
 """
 
 import re

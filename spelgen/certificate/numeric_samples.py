@@ -34,9 +34,9 @@ TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 class NumericSamples:
     """Samples of M and of the gravity torque.
 
-    mass: lower triangles of M divided by ``scale``, (1 + n, S, n(n+1)/2); the positions of block 1 + k differ from
-    those of block 0 in coordinate k only (k from 0). scale: geometric mean of the mean diagonal entries of row and
-    column, (n(n+1)/2,). gravity: gravity torque dV/dq divided by its largest magnitude, (S, n).
+    mass: lower triangles of M divided by ``scale``, (1 + n, S, n(n+1)/2); block 1 + k has the positions of block 0,
+    except for coordinate k (k from 0). scale: geometric mean of the mean diagonal entries of row and column,
+    (n(n+1)/2,). gravity: gravity torque dV/dq divided by its largest magnitude, (S, n).
     """
 
     mass: np.ndarray
@@ -53,7 +53,7 @@ class NumericSamples:
 def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:
     """Return samples at ``count`` random configurations.
 
-    random_inertials: whether each sample has other random inertial parameters; otherwise all have those of the URDF.
+    random_inertials: whether each sample has other random inertial parameters; otherwise they are from the URDF.
     """
     n = len(arm.coordinates)
     rows, columns = np.tril_indices(n)
@@ -78,7 +78,7 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
 
 def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
     """Return the torque regressors at m random states q, qd, qdd, (m n, 10 B) for n coordinates and B bodies."""
-    # The regressor does not depend on inertial parameters, but Pinocchio needs some: these are random.
+    # The regressor does not depend on inertial parameters. Random ones are used, because Pinocchio needs some values.
     dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
     n, bodies = len(arm.coordinates), len(arm.bodies)
     rows = []

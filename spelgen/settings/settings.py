@@ -147,7 +147,7 @@ class Settings(Group):
         # Both keys determine the last joint, and could contradict each other.
         if self.tip is not None and self.moving_joints is not None:
             raise ValueError("'tip' or 'moving_joints', not both")
-        # Logs of position servos have no torques, for which alone these keys are defined.
+        # These keys are defined for logged torques, which logs of position servos do not have.
         if self.input == "position" and (self.torque == "motor" or self.couplings):
             raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
         # A joint in two couplings would be driven by two different sets of motors.

@@ -137,7 +137,7 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
-    """Yield sets of those joints on which M depends: sets close to the tip first, small sets before large ones."""
+    """Yield sets of the joints on which M depends: sets close to the tip first, small sets before large ones."""
     # An arm of more than eight joints has too many subsets: only sets of consecutive joints are tried.
     all_subsets_up_to = 8
     active = [k for k in range(spans.n) if len(spans.change_bases[k])]

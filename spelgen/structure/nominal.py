@@ -89,7 +89,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
 def working_range(coordinate: Coordinate) -> tuple[float, float]:
     """Return the lower and upper end of the range of a coordinate [rad, m].
 
-    These are its limits, cut at +-2 pi for a revolute joint; without usable limits, one revolution or 1 m about zero.
+    The range is given by its limits, cut at +-2 pi for a revolute joint; without usable limits, one revolution or 1 m about zero.
     """
     lower, upper = coordinate.lower, coordinate.upper
     is_revolute = coordinate.joint_type == "revolute"
@@ -210,8 +210,8 @@ def _rounded(values: np.ndarray, digits: int = 6, zero_below: float = 1e-12) -> 
 def _round(value: float, digits: int = 6, zero_below: float = 1e-12) -> float:
     """Return a value rounded to ``digits`` significant digits, so that it is equal on every machine.
 
-    Magnitudes up to ``zero_below`` become 0. For scales ``zero_below`` is 0: they are divisors, and those of an arm of
-    1e-12 kg are small.
+    Magnitudes up to ``zero_below`` become 0. For scales ``zero_below`` is 0, because scales are divisors, and are small
+    for an arm of 1e-12 kg.
     """
     if abs(value) <= zero_below:
         return 0.0

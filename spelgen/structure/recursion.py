@@ -247,7 +247,7 @@ def _moved_inertia(motion: _Pose, inertia: _Inertia) -> _Inertia:
 def _posed_inertia(pose: _Pose, inertia: _Inertia) -> _Inertia:
     xx, xy, xz, yy, yz, zz = inertia.tensor
     columns = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-    # R I R^T row by row: the rows of R are sparse, because most axes of arms are at right angles.
+    # Rows of R are multiplied one at a time: they are sparse, because most axes of arms are at right angles.
     half = [[_dot(row, column) for column in columns] for row in pose.rotation]
     tensor = tuple(_dot(pose.rotation[j], half[i]) for i, j in TENSOR)
     return _translated(pose.translation, _Inertia(inertia.mass, _turned(pose, inertia.moment), tensor))

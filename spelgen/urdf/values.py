@@ -150,7 +150,7 @@ class Element:
             self.error(f"{len(words)} numbers ({excerpt!r})", expected, key=key)
             return []
         for word in words:
-            # A longer word is a sign of a damaged file: no exporter writes so many digits.
+            # A longer word is a sign of a damaged file: no exporter writes such long numbers.
             if len(word) > longest:
                 self.error(f"a number of {len(word)} characters", f"at most {longest}", key=key)
                 return []
