@@ -55,8 +55,8 @@ def rounded_angle(angle: float, tolerance: float) -> float:
     """
     if tolerance == 0.0:
         return angle
-    # The divisors of pi give the special angles on the CAD drawings of 189 arms. The tolerance of pi/12, pi/8 and pi/5 is small,
-    # because 0.26, 0.39 and 0.63 rad also occur as exact values.
+    # The divisors of pi give the special angles on the CAD drawings of 189 arms. The tolerance of pi/12, pi/8 and pi/5
+    # is small, because 0.26, 0.39 and 0.63 rad also occur as exact values.
     limits = {2: tolerance, 12: 2e-5, 8: 2e-5, 5: 2e-5}
     for divisor, limit in limits.items():
         step = pi / divisor

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -13,6 +14,7 @@ from spelgen.cli.console import FAILED, answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
 from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
+from spelgen.listing import WIDTH
 
 if TYPE_CHECKING:
     from spelgen.comparison.arms import Comparison
@@ -173,7 +175,7 @@ def report(
         listing = summary(Results.from_dict(folder.read_json(folder.evaluation)))
     if listing is not None:
         say(listing.text() + "\n")
-    say(f"wrote {path}: the report, for any browser")
+    say(f"wrote {path}: the report, for any browser" if path.suffix == ".html" else f"wrote {path}")
 
 
 Jobs = Annotated[
@@ -249,7 +251,7 @@ def compare(
         sections = arm_sections(study)
         # the tables are printed as well, since a page cannot be read in a terminal
         for section in sections:
-            say(f"{section.name}: {section.sentence}\n")
+            say(fill(f"{section.name}: {section.sentence}", WIDTH, break_on_hyphens=False) + "\n")
             for table in section.tables:
                 say(f"{table.text()}\n")
         say(f"wrote {write_comparison(study, sections)}")

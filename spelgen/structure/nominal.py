@@ -89,7 +89,8 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
 def working_range(coordinate: Coordinate) -> tuple[float, float]:
     """Return the lower and upper end of the range of a coordinate [rad, m].
 
-    The range is given by its limits, cut at +-2 pi for a revolute joint; without usable limits, one revolution or 1 m about zero.
+    The range is given by the limits, cut at +-2 pi for a revolute joint. Without usable limits it is one revolution, or
+    1 m, about zero.
     """
     lower, upper = coordinate.lower, coordinate.upper
     is_revolute = coordinate.joint_type == "revolute"

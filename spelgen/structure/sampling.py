@@ -58,8 +58,8 @@ def regressor_rows(arm: Chain, points: int) -> np.ndarray:
     """Return m rows of the energy regressor at each of ``points`` random positions, in the prime field.
 
     The result is (m points, 10 B) for B bodies, with m = n(n+1)/2 + 1 rows for the entries of M(q) and V(q) - V(q0).
-    The entries are linear in the inertial parameters and determine the torque: the rank of the rows is the number of base
-    parameters (Gautier and Khalil 1990).
+    The entries are linear in the inertial parameters and determine the torque: the rank of the rows is the number of
+    base parameters (Gautier and Khalil 1990).
     """
     rng = np.random.default_rng(1)
     parameters = 10 * len(arm.bodies)
