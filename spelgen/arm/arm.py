@@ -162,7 +162,7 @@ def make_arm(
 
 def _require_small(robot: Robot, chain: ChainChoice) -> None:
     """Raise ArmError for an arm whose structure would take more than some seconds to derive."""
-    # The time increases with about the fifth power of the number of joints.
+    # The time of the derivation increases with about the fifth power of the number of joints.
     moving, largest, most_followers = len(chain.joints), 16, 48
     if moving > largest:
         do = "choose fewer with --joints or --tip"
@@ -197,7 +197,7 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
     following = leaders(robot)
     poses = []
     locked: list[UrdfJoint] = []
-    # This is the order of the bodies: parents first, and joints of the chain before mimic joints on other branches.
+    # The bodies are ordered with parents first, and joints of the chain before mimic joints on other branches.
     path = robot.path_to(chain.joints[-1].child)
     for joint in dict.fromkeys([*path, *robot.joints_from_root]):
         followed = following[joint.name]
@@ -270,7 +270,7 @@ def _moved_remarks(moved: Sequence[MovingJoint], following: Mapping[str, Leader]
 
 
 def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
-    # One remark lists all these joints, because a humanoid robot has thirty of them.
+    # One remark lists all locked joints, because a humanoid robot has thirty of them.
     outside = [joint for joint in locked if joint.moves and joint.mimic is None]
     if outside:
         names = ", ".join(repr(joint.name) for joint in outside)

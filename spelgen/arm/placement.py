@@ -102,7 +102,7 @@ class AngleRounding:
 
     def position(self, vector: np.ndarray) -> np.ndarray:
         """Return a position (3,) [m] with components below 1 nm, which are rounding errors of rotations, set to 0."""
-        noise = 1e-9 if self.tolerance else 0.0  # [m]
+        noise = 1e-9 if self.tolerance else 0.0  # [m] rounding errors of composed rotations
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
 
     def _note(self, code: str, where: str, line: int, message: str) -> None:

@@ -13,7 +13,7 @@ Matrix = tuple[Vector, ...]
 
 @dataclass(frozen=True)
 class GeometryTuning:
-    """Tolerances for the exact values that rounded numbers of a URDF represent."""
+    """Tolerances with which rounded numbers of a URDF are replaced by the exact values that they represent."""
 
     # [rad, 1] A change of an angle, or of a component of a unit axis, by at most this number is not reported.
     notable: float = 1e-9
@@ -137,7 +137,7 @@ def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
     SciPy's Rotation is not used, because its checks of the input take 0.2 ms per call.
     """
     trace = float(np.trace(rotation))
-    squares = np.empty((4, 4))  # 4 q q^T
+    squares = np.empty((4, 4))  # 4 q q^T of the unit quaternion q
     squares[0, 0] = 1.0 + trace
     squares[1:, 1:] = rotation + rotation.T + (1.0 - trace) * np.eye(3)
     antisymmetric = rotation - rotation.T

@@ -52,7 +52,7 @@ def text(formulas: Formulas, width: int = 80) -> str:
 
 
 def to_dict(formulas: Formulas) -> dict[str, object]:
-    """Return the formulas as a JSON object. Rows and columns are counted from 1; too long expressions are null."""
+    """Return the formulas as a JSON object. Rows and columns are counted from 1; an omitted expression is null."""
     base, values, entries = [], formulas.values, []
     for symbol, definition in formulas.base_parameters.items():
         # JSON has no fractions: exact values are rounded to floats.

@@ -39,7 +39,7 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
     stated = parse_spec(text, module)
     path = Path(urdf) if urdf is not None else find_urdf(module, stated.urdf)
     arm = arm_of_spec(stated, path)
-    # The path of the URDF is not compared, because the file may have been moved since the build: its digest is.
+    # The digest of the URDF is compared and not its path, because the file may have been moved since the build.
     spec = replace(derive_spec(arm, stated.options), urdf=stated.urdf)
     reasons = []
     if spec.urdf_sha256 != stated.urdf_sha256:
@@ -49,7 +49,8 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
     # The text is compared with both forms of the module, standalone or not, because it does not state its form.
     if text not in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         reasons.append("the text of the module differs from that of `spelgen build`")
-    # The comparison cannot detect an error of the derivation, which would be in both texts: Pinocchio can.
+    # The comparison cannot detect an error of the derivation, which would be in both texts. The verification by
+    # Pinocchio is independent of the derivation.
     proof = verify(arm.robot, arm.chain, derive(arm.chain, stated.options.assume))
     reasons += [str(difference) for difference in proof.differences]
     return CheckResult(path, not reasons, tuple(reasons), proof)

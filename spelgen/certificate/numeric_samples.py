@@ -141,7 +141,8 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
     differences = []
     for quantity, values in written.items():
         # Differences are relative to the magnitude of each number, so that errors of light bodies are detected. A
-        # thousandth of the largest magnitude is added, so that rounding errors of numbers close to zero are not.
+        # thousandth of the largest magnitude is added, so that rounding errors of numbers close to zero are not
+        # reported as differences.
         scale = np.abs(values).max(axis=0) + (1e-3 * np.abs(values).max() or 1.0)
         pair = (np.abs(samples[quantity] - values) / scale for samples in (theirs, ours))
         differences.append(ReadingDifference(quantity, *(float(apart.max()) for apart in pair)))

@@ -109,7 +109,7 @@ class _DerivedFact:
     fact: str
     derived: str
     magnitudes: list[Magnitude]
-    # [1] Numbers up to this fraction of their scale are regarded as zero with rounding errors.
+    # [1] Numbers up to this fraction of their scale are regarded as zero: they are rounding errors.
     rounding: float = 1e-12
 
     def check(self, is_fine: bool) -> FactCheck:

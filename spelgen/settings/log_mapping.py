@@ -33,7 +33,7 @@ ONLY = {  # joint type: units that such a joint cannot have
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", *LENGTHS, *SPEEDS} - {"mm", "mm/s"},
 }
 
-LONGEST_DELAY = 1.0  # s
+LONGEST_DELAY = 1.0  # [s] largest magnitude of `torque_delay`
 
 Accepted = Literal[
     "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",

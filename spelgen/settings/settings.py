@@ -1,6 +1,6 @@
 """Read the settings of a robot, `rpr.yaml` for `rpr.urdf`, and check them key by key.
 
-Some groups of keys, such as `training`, are used by one command only. An error in such a group is raised only when the
+Some groups of keys, such as `training`, are used by one step only. An error in such a group is raised only when the
 group is used.
 """
 
@@ -144,7 +144,7 @@ class Settings(Group):
 
     @model_validator(mode="after")
     def _drives(self) -> Settings:
-        # Both keys determine the last joint, and could contradict each other.
+        # `tip` and `moving_joints` both determine the last joint, and could contradict each other.
         if self.tip is not None and self.moving_joints is not None:
             raise ValueError("'tip' or 'moving_joints', not both")
         # These keys are defined for logged torques, which logs of position servos do not have.

@@ -52,7 +52,7 @@ def base_parameter_count(arm: Chain) -> int:
         points *= 2
 
 
-@lru_cache(maxsize=16)  # least squares, checks of logs and closed forms use the same arm
+@lru_cache(maxsize=16)  # cached, since least squares, checks of logs and closed forms use the same arm
 def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     """Return the base parameters of ``arm``, in the order of the bodies from the root."""
     indices = [INERTIAL_PARAMETERS.index(name) for name in BASE_ORDER]

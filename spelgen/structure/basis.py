@@ -228,7 +228,7 @@ def _fraction(element: int, value: float) -> Fraction:
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         candidate = Fraction(numerator, denominator)
-        # A short fraction always exists modulo PRIME. If it differs from the float, it is not the number.
+        # A short fraction always exists modulo PRIME. If it differs from `value`, the number has no short fraction.
         if abs(candidate - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
             return candidate
     return Fraction(value)

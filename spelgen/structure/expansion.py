@@ -79,7 +79,10 @@ class Budget:
 
 
 class Expansion:
-    """The recorded recursion of ``arm`` over the variables s1, c1, q1, s2, ..., three per coordinate."""
+    """The recorded recursion of ``arm`` for polynomials in s1, c1, q1, s2, ...
+
+    s, c and q are sine, cosine and position of a coordinate (``Position``).
+    """
 
     def __init__(self, arm: Chain):
         n = len(arm.coordinates)

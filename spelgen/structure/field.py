@@ -60,7 +60,7 @@ class Residues:
 
 
 def residue(number: Fraction) -> int:
-    """Return the field element of a rational number."""
+    """Return the element of the prime field that represents a rational number."""
     return number.numerator * pow(number.denominator, -1, PRIME) % PRIME
 
 

@@ -43,7 +43,7 @@ def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray,
         moved = [Residues(_one_moved(x, index, 1 + n)) for x in (c, s, value)]
         positions.append(Position(*moved))
     if assume == "kinematics":
-        # Structure for all values of the inertial parameters: a rank or zero at random values is generic.
+        # A rank or zero at random inertial parameters is valid for all values of the parameters.
         inertias: list[Ten] = [list(map(Residues, random_residues(rng, (10, samples)))) for _ in arm.bodies]
     else:
         inertias = [list(map(residue, body.inertia or (Fraction(0),) * 10)) for body in arm.bodies]
@@ -150,7 +150,7 @@ class Spans:
 
     @cached_property
     def entry_joints(self) -> list[frozenset[int]]:
-        """The joints that each entry of M depends on."""
+        """Set of the joints on which an entry of M depends, for each entry of the lower triangle."""
         depends = np.array([change.any(axis=0) for change in self.changes])  # (n, entries)
         return [frozenset(np.flatnonzero(column).tolist()) for column in depends.T]
 

@@ -30,7 +30,7 @@ class ServoRank(NamedTuple):
 
 
 def servo_rank(arm: Chain) -> ServoRank:
-    """Return the identifiable ratios, computed for random states, inertial parameters and drive parameters."""
+    """Return the identifiable ratios of an arm, computed for random states, inertial and drive parameters."""
     random, n = np.random.default_rng(0), len(arm.coordinates)
     # Twice as many equations as unknowns, so that the rank is not limited by the samples.
     samples = 2 * (10 * len(arm.bodies) // n + len(PARAMETERS)) + 20

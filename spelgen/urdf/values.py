@@ -93,7 +93,7 @@ class Element:
         return text
 
     def name(self) -> str | None:
-        """Return the name of the element; None if it is absent or unusable, which is an error."""
+        """Return the name of the element; add an error and return None if it has no usable name."""
         name = self.text("name")
         if not name or not name.strip():
             self.error("no name" if name is None else "an empty name", "a name", 'add name="..."')
@@ -105,19 +105,22 @@ class Element:
         return None
 
     def triple(self, key: str, default: Vector = (0.0, 0.0, 0.0)) -> Vector:
-        """Return three numbers; the default if the attribute is absent, or unusable, which is an error."""
+        """Return the three numbers in an attribute, or the default if it is absent.
+
+        For an unusable text, add an error and return the default.
+        """
         values = self._numbers(self.text(key), key, 3)
         return (values[0], values[1], values[2]) if values else default
 
     def number(self, key: str) -> float | None:
-        """Return a number; None if the attribute is absent, or unusable, which is an error."""
+        """Return the number in an attribute, or None if it is absent; for an unusable text, add an error too."""
         values = self._numbers(self.text(key), key)
         return values[0] if values else None
 
     def limit(self, key: str) -> float | None:
         """Return a limit of a joint; None if it is absent, inf, nan, or at least the magnitude in ``UNLIMITED``.
 
-        An unusable text is an error, with the result None.
+        For an unusable text, add an error and return None.
         """
         text = self.text(key)
         if text and text.strip().lower().lstrip("+-") in ("inf", "infinity", "nan"):
@@ -126,7 +129,10 @@ class Element:
         return values[0] if values and abs(values[0]) < UNLIMITED[key] else None
 
     def number_in_text(self, tag: str) -> float | None:
-        """Return the number in the text of a child element; None if it is absent, or unusable, which is an error."""
+        """Return the number in the text of a child element, or None if it is absent.
+
+        For an unusable text, add an error and return None.
+        """
         child = None if self.xml is None else self.xml.find(tag)
         text = "" if child is None else child.text or ""
         values = Element(self.notes, child, self.where)._numbers(text if text.strip() else None, tag)
@@ -135,9 +141,9 @@ class Element:
     def _numbers(self, text: str | None, key: str, count: int = 1, bounded: bool = True) -> list[float]:
         """Return the ``count`` finite numbers in a text.
 
-        The list is empty if the text is None, or if it is anything else than such numbers, which is an error. bounded:
-        whether magnitudes above MAX_MAGNITUDE are errors; they are not for limits of joints, where a huge number means
-        "unlimited".
+        The list is empty if the text is None. If the text does not consist of such numbers, add an error and return an
+        empty list. bounded: whether magnitudes above MAX_MAGNITUDE are errors; for limits of joints they are not,
+        because a huge limit means "unlimited".
         """
         if text is None or self._is_unexpanded(text, key):
             return []
