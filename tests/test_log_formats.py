@@ -713,6 +713,14 @@ def test_no_column_of_another_joint_is_offered(tmp_path):
         assert "rename the column '" not in str(caught.value)
 
 
+def test_accelerations_are_not_offered_as_torques(tmp_path):
+    names = [f"{quantity}_{joint}" for quantity in ("q", "qd", "qdd") for joint in JOINTS]
+    path = parquet(tmp_path / "x.parquet", {"t": T} | {name: T for name in names})
+    with pytest.raises(LogError, match="missing columns tau_shoulder, tau_elbow") as caught:
+        read_logs(path, JOINTS)
+    assert "rename the column '" not in str(caught.value)
+
+
 def joint_states(order=("b", "a")):
     """Lines as `ros2 topic echo --csv` writes them, at 100 Hz."""
     lines = []

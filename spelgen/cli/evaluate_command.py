@@ -190,6 +190,7 @@ def compare(
     target: Annotated[
         Path, argument("TARGET", "URDF of an arm, or YAML file that lists arms and their logs.")
     ],
+    extra_logs: options.MoreData = None,
     data: options.Data = None,
     mapping: options.MappingFile = None,
     output: Annotated[
@@ -227,6 +228,7 @@ def compare(
 
     if ablation and presets is not None:
         raise UsageError("--ablation: names the presets itself, omit --presets")
+    paths = options.logs(data, extra_logs) if data or extra_logs else []
     names = options.names(presets)
     values = {
         "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
@@ -234,8 +236,8 @@ def compare(
     }  # fmt: skip
     # options of the command line take precedence over the file
     changes = {name: value for name, value in values.items() if value is not None}
-    comparison = _comparison(target, data, mapping).model_copy(update=changes)
-    name = target.stem + ("-logs" if data else "") + ("-ablation" if ablation else "")
+    comparison = _comparison(target, paths, mapping).model_copy(update=changes)
+    name = target.stem + ("-logs" if paths else "") + ("-ablation" if ablation else "")
     # the working folders of workers differ, so paths must be absolute
     folder = (output or Path("comparisons") / name).absolute()
     # all cores: a comparison takes hours on one
@@ -260,14 +262,14 @@ def compare(
         raise typer.Exit(FAILED)
 
 
-def _comparison(target: Path, data: list[Path] | None, mapping: Path | None) -> Comparison:
+def _comparison(target: Path, logs: list[Path], mapping: Path | None) -> Comparison:
     """Return the comparison of a URDF with these logs, or the comparison in a YAML file."""
     from spelgen.comparison.arms import YAML, ComparedArm, Comparison, load_comparison
 
     if target.suffix not in YAML:
-        paths = tuple(path.absolute() for path in data or ())
-        arm = ComparedArm(urdf=target.absolute(), data=paths, mapping=mapping and mapping.absolute())
+        data = tuple(path.absolute() for path in logs)
+        arm = ComparedArm(urdf=target.absolute(), data=data, mapping=mapping and mapping.absolute())
         return Comparison.model_construct(arms={target.stem: arm})
-    if data or mapping:
+    if logs or mapping:
         raise UsageError("--data and --mapping: belong to a URDF; in a YAML file each arm has its own")
     return load_comparison(target.absolute())
