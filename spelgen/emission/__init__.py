@@ -1,1 +1,1 @@
-"""Structure -> specification of a model -> model in memory, or the source of a module."""
+"""Specification of a model from the structure of an arm; model in memory, or source of a module, from a specification."""

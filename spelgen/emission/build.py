@@ -24,8 +24,9 @@ def build(
         arm: the result of ``load_arm``, or the path of a URDF.
         preset: name of a preset, path of a YAML file with a design, or a ``Design``.
         width, depth: units of the hidden layers of networks, and their number.
-        assume: ``kinematics``: structure for any inertial parameters; ``inertials``: for the parameters of the URDF.
-        seed: of the initial weights of networks.
+        assume: ``kinematics``: the structure is valid for any inertial parameters; ``inertials``: for those of the
+            URDF.
+        seed: seed of the random initial weights of networks.
 
     Raises the errors of ``load_arm``, and SettingsError for an inconsistent design.
     """
