@@ -1,1 +1,1 @@
-"""Specification of a model from the structure of an arm; model in memory, or source of a module, from a specification."""
+"""Specification of a model from an arm's structure; model in memory, or source of a module, from a specification."""
