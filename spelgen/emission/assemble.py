@@ -50,7 +50,7 @@ class ArmModel(PortHamiltonian):
 
 
 def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
-    """Return the model that ``spec`` describes, with the initial weights of ``seed``.
+    """Return the model that ``spec`` describes; seed: seed of the random initial weights of networks.
 
     Raises ModuleError if the specification has values that no model can have, such as a mass that is not positive.
     """
@@ -75,7 +75,7 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
 
 
 def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
-    """Return the model of a module that `spelgen build` wrote, with the initial weights of ``seed``.
+    """Return the model of a module that `spelgen build` wrote; seed: seed of the initial weights of networks.
 
     module: path of the module, or its text. Raises ModuleError if the module was edited, or is not from `spelgen
     build`.

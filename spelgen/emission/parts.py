@@ -86,7 +86,8 @@ def _unless(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
 def _joint(joint: JointSpec) -> Call:
     typical, limits = (joint.center, joint.half_range), None
     if joint.lower is not None and joint.upper is not None:
-        # `runtime.rows.Joint` rounds center and half range in the same way, so equal values can be left out.
+        # `runtime.rows.Joint` rounds center and half range in the same way, so equal values can be
+        # omitted.
         limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
     fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
     fields |= {"armature": joint.armature, "gear": joint.gear}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 WIDTH = 110
 _STEP = 4  # blanks per level of indentation
-SKIP = "  # fmt: skip"  # for ruff: numbers are read row by row
+SKIP = "  # fmt: skip"  # ruff keeps the rows of numbers
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,7 @@ def _rows(spec: ModelSpec, assembly: ModelParts) -> list[str]:
 
 
 def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
-    """Return by term name the entries of M that a function or constant contributes to, and the first entry's unit."""
+    """Return a text per term name: entries of M that the term contributes to, and the unit of the first entry."""
     descriptions = {}
     bases = [x.basis for x in spec.outputs] + [x.basis for x in spec.constants]
     for name, basis in zip(term_names(spec), bases, strict=True):

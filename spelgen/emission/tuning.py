@@ -1,4 +1,4 @@
-"""Constants of models: initial values without data in the URDF, and sizes of networks."""
+"""Constants of untrained models: initial values that the URDF does not contain, and sizes of networks."""
 
 from dataclasses import dataclass
 
@@ -46,7 +46,7 @@ class ModelTuning:
     friction_units: int = 8
     # [1] Smallest number of hidden units per group of outputs that depend on the same joints.
     min_units: int = 4
-    # [1] Smallest number of hidden units per such group of outputs in Kolmogorov-Arnold networks.
+    # [1] The same number for Kolmogorov-Arnold networks, whose units have a learned function per edge.
     min_kan_units: int = 2
     # [1] Units of Kolmogorov-Arnold networks, divided by the width in the options: each edge has a grid of
     # weights.

@@ -58,7 +58,7 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     load_momentum, load_gradient = payload.momentum(qd)
     moment = ca.cross(rotation @ load[1:4], constant(model.arm.gravity))
     # The payload's gravity torque is J^T times its weight. Newton-Euler has larger rounding errors: the log
-    # odds then differ 40 times as much from those of the Python estimator.
+    # odds then differ 40 times as much from the Python estimator's.
     load_gradient += jacobian.T @ ca.vertcat(weight, moment)
     at_point = jacobian[:3, :] - ca.skew(rotation @ levels.point) @ jacobian[3:, :]
     outputs = {

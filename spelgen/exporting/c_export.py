@@ -44,8 +44,7 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
     if levels is not None:
         functions += estimator_c_functions(model, levels)
         texts = estimator_texts(model, levels)
-    # The parity check compiles exactly the bytes that the user gets, not text that is generated a second
-    # time.
+    # The parity check compiles exactly the bytes that the user gets.
     with tempfile.TemporaryDirectory() as folder:
         write_c(model, functions, Path(folder))
         for name, text in texts.items():
@@ -65,7 +64,7 @@ def compiler() -> str | None:
 
 
 def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -> Path:
-    """Compile C files to a shared library. Raises RunError with the messages of the compiler."""
+    """Compile C files to a shared library and return its path. Raises RunError with the compiler's messages."""
     sources = [sources] if isinstance(sources, Path) else sources
     library = sources[0].with_suffix(".so")
     command = [program, *_FLAGS, *flags, *map(str, sources), "-o", str(library), "-lm"]

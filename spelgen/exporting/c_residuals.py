@@ -1,7 +1,8 @@
 """Residual terms of a model in C: networks as loops over tables, and functions of single joints.
 
-Splines are tables of polynomials, one per interval; harmonics are powers of a phasor. An entry point calls the
-functions that compute the symbols of its expressions (see `residual_expressions`).
+Splines are tables with a polynomial per interval; harmonics are powers of a phasor exp(i f q). The C
+code of an entry point first calls functions that compute its residual terms (see
+`residual_expressions`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,7 @@ from spelgen.exporting.model_expressions import RESIDUAL
 from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.templates import render
 
-_WIDTH = 112  # characters of a line
+_WIDTH = 112  # maximum length of a line
 
 _CALLS = (
     (("first", "second"), "mass_jets(q", ("mass", "first", "second")),
@@ -46,7 +47,7 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
             variables.append(f"{RESIDUAL}{name}[{symbols[name].numel()}]")
             arguments.append(RESIDUAL + name)
         calls.append(f"{call}, {', '.join(arguments)});")
-    # The networks of M and V have the same inputs cos q and sin q, so these are computed once.
+    # The networks of M and V have the same inputs, so cos q and sin q are computed once.
     if "(encoded" in "".join(calls):
         variables.insert(0, "encoded[ENCODED]")
         calls.insert(0, "encode(q, encoded);")

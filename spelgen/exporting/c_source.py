@@ -13,7 +13,7 @@ from spelgen.exporting.description import EntryPoint, TrainedModel
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.templates import render
 
-_WIDTH = 118  # characters of a line
+_WIDTH = 118  # maximum length of a line
 FRICTION_STATES = ("z", "z_next", "z_start", "low", "high")
 """Inputs and outputs that are friction states, of type double; all others are of type ``real``."""
 # tanh, unlike SIN and COS, has no float version, because only functions of the friction state call it, in

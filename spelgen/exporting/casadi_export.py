@@ -42,8 +42,8 @@ def export_casadi(trained: Trained) -> Exported:
 
 def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
     """Return CasADi functions by name, with SX expressions of bodies and friction, and MX of residual terms."""
-    # Without residual terms all expressions are scalar: one SX function is then faster than MX with calls of
-    # it.
+    # Without residual terms all expressions are scalar, and SX is faster than MX with calls of SX
+    # functions.
     if not model.residuals:
         return expression_functions(model, entries)
     # The function that is differentiated includes the residual terms as functions of q. In the SX function
@@ -117,9 +117,9 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
             values["kinetic"] = ca.jtimes(mass, q, in_kinetic_energy(model, qd), True)
     if residuals.potential is not None:
         values["energy"] = _network(residuals.potential, encoded)
-        # reverse mode: takes about the time of the network
+        # Reverse mode takes about the time of one evaluation of the network.
         values["gravity"] = ca.gradient(values["energy"], q)
-    # its derivative is the torque: both stay consistent
+    # The torque is computed as the derivative of this energy, so that both are consistent.
     if residuals.has_torque:
         values["torque_energy"] = _torque_energy(residuals, q)
         values["torque"] = ca.gradient(values["torque_energy"], q)
@@ -130,10 +130,10 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
 
 
 def _network(network: SigmoidNetwork, encoded: ca.MX) -> ca.MX:
-    """Return the outputs, (outputs, 1), for inputs (3 n, 1)."""
+    """Return the outputs of a network, (outputs, 1), for the inputs cos q, sin q and q, (3 n, 1)."""
     layer = encoded
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
-        # the sigmoid, which CasADi does not have
+        # CasADi has no sigmoid function.
         layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))
     return constant(network.weights[-1]) @ layer + network.biases[-1]
 
@@ -152,8 +152,8 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
 
 
 def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
-    """Return the value at q, (1, 1); outside of the knots it is constant."""
+    """Return the value of a spline at q, (1, 1); outside of the knots the value is constant."""
     knots, degree = spline.t, spline.k
-    # bspline extrapolates its last polynomial, the model does not
+    # CasADi's bspline extrapolates the last polynomial, but the model's splines are constant there.
     inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])
     return ca.bspline(inside, ca.DM(spline.c), [knots.tolist()], [degree], 1, {})

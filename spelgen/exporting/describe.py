@@ -49,7 +49,8 @@ class Trained:
     entries: names of the functions to export, for formats that consist of functions; empty: all except derivatives.
     intervals: tables of the fitted parameters with 95 % intervals, for the README.
     float32: whether ONNX and torch programs compute in float32; otherwise in float64.
-    levels: noise levels of the estimator of payload and contact; None: no estimator is exported.
+    levels: noise levels of the estimator of payload and external torques; None: no estimator is
+    exported.
     """
 
     model: ArmModel
@@ -180,7 +181,8 @@ def _residuals(model: ArmModel) -> Residuals:
     """Return the residual terms of a model, without the terms that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
-    # Entries of the lower triangle of M without a contribution of any function are left out: they are zero.
+    # Entries of the lower triangle of M without a contribution of any function are zero, and are
+    # omitted.
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:

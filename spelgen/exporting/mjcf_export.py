@@ -80,7 +80,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
     random = random_inputs(arm.coordinates, states)
     controls = torques = random["tau"]
     if servos is not None:
-        # The dead zone is left out, since MuJoCo's position actuators have none.
+        # The dead zone is omitted, since MuJoCo's position actuators have none.
         controls = random["u"]
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
@@ -144,7 +144,7 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         values["mass_matrix"].append(jacobian.T @ full @ jacobian)
         values["bias"].append(jacobian.T @ data.qfrc_bias)
         values["forward_dynamics"].append(jacobian.T @ data.qacc)
-    # MuJoCo's mimic joints are soft constraints, so its accelerations differ from those of exact mimic
+    # MuJoCo's mimic joints are soft constraints, so its accelerations are not those with exact mimic
     # joints.
     if model.nv > len(arm.coordinates):
         del values["forward_dynamics"]

@@ -66,7 +66,7 @@ def _expressions(
     - compensation, (n, 1).
 
     Args:
-        model: description.
+        model: the model as plain numbers.
         inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1).
         residuals: symbols of the residual terms, see ``residual_symbols``.
         derivatives: whether the symbol ``first`` replaces ``rate`` and ``kinetic``, for derivatives with respect to q.
@@ -135,7 +135,7 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
     """Return the friction torque of the motors, (n, 1) [Nm, N], by the formulas of ``runtime.friction_laws``.
 
     Args:
-        model: description.
+        model: the model as plain numbers.
         qd: velocities of the motors, (n, 1) [rad/s, m/s].
         gravity: gravity torques of the motors, (n, 1) [Nm, N].
         z: friction state, (n K, 1), the K elements of the first joint first.
@@ -202,9 +202,10 @@ def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
 
 
 def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Outputs:
-    """Return Jacobians, (n, n) each: inverse dynamics w.r.t. q, qd, forward dynamics w.r.t. q, qd, tau.
+    """Return Jacobians, (n, n) each, of inverse dynamics (by q, qd) and forward dynamics (by q, qd, tau).
 
-    Those of the forward dynamics are dqdd/dx = -M^-1 dforce/dx at the computed qdd (Carpentier and Mansard, RSS 2018).
+    Forward dynamics have dqdd/dx = -M^-1 dforce/dx at the computed qdd (Carpentier and Mansard, RSS
+    2018).
     """
     expressions = _expressions(model, inputs, residuals, derivatives=True)
     (force,), (mass,) = expressions["force"], expressions["mass_matrix"]

@@ -39,7 +39,7 @@ _CONTROLLER_PATHS = {
 def export_ros2(trained: Trained) -> Exported:
     """Return the colcon package. Raises RunError if results of the C code differ from the model's."""
     model, missing = trained.described, _missing_part(trained)
-    # The inverse_dynamics_solver plugin is part of each package; controller and estimator may be left out.
+    # The inverse_dynamics_solver plugin is part of each package; controller and estimator are optional.
     controller, estimator = missing is None or missing[0] != "controller", missing is None
     entries = (*_CALLED, "tip_pose") if estimator else _CALLED
     levels = trained.levels if estimator else None

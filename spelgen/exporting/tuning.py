@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ExportTuning:
-    """Parity checks of exports, and the projection onto the nearest rigid bodies."""
+    """Constants of parity checks, of the projection onto the nearest rigid bodies, and of MJCF files."""
 
     # [1] Number of random states of a parity check.
     states: int = 200

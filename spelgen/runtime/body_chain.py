@@ -18,7 +18,7 @@ class ChainConfiguration(NamedTuple):
     place: Tensor  # positions [m] times square roots of the masses, (..., 3, bodies, 4)
     mass: Tensor  # square roots of the masses, (..., 1, bodies, 4)
     axes: Tensor  # twist of a body per rate of its own joint, (..., 6, bodies)
-    jacobian: Tensor  # Jacobian of the points by body displacement, (..., bodies, 12 bodies)
+    jacobian: Tensor  # d(points) / d(displacement of a body's own joint), (..., bodies, 12 bodies)
     weight: Tensor  # -gravity times square roots of the masses, (..., 12 bodies)
 
 
@@ -28,7 +28,8 @@ class BodyChain(nn.Module):
     Twists are (angular, linear) in the base frame (Featherstone, Rigid Body Dynamics Algorithms, 2008);
     frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). Each body is represented by four
     point masses with the same inertia: the columns (position, 1) * sqrt(mass) of a matrix root of the
-    body's pseudo-inertia. Only the frames are computed body by body. Sums over carrying or carried
+    body's pseudo-inertia. Only the frames are computed one body after the other. Sums over carrying or
+    carried
     bodies are products with a mask, because for small arms the time is proportional to the number of
     tensor operations.
     """
@@ -191,7 +192,7 @@ class InertialParameters(nn.Module):
 
     def __init__(self, links: Sequence[Link]) -> None:
         super().__init__()
-        # Linear map from the entries of an upper triangle, row by row, to the matrix.
+        # Linear map from the entries of an upper triangle, rows in sequence, to the matrix.
         row, column = torch.triu_indices(4, 4)
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
         pseudo = torch.stack([pseudo_inertia(link) for link in links])

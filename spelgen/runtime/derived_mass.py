@@ -199,7 +199,7 @@ class DenseMass(nn.Module):
         self.nominal = nn.Buffer(factor)
         self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])
         row, column = torch.tril_indices(self.size, self.size, -1)
-        # Indices of the entries below the diagonal in the flattened matrix U, row by row.
+        # Indices of the entries below the diagonal in the flattened matrix U, rows in sequence.
         self.below = nn.Buffer(row * self.size + column)
         # At zero outputs of the network U is the identity, and e = softplus(log(exp(1) - 1)) = 1.
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
@@ -222,7 +222,7 @@ class DenseMass(nn.Module):
         return self._lower(entries), F.softplus(scale)
 
     def _lower(self, entries: Tensor) -> Tensor:
-        """Return a matrix, (..., 3 n, 3 n), with these entries below the diagonal, row by row, else zero."""
+        """Return a matrix, (..., 3 n, 3 n), with entries below the diagonal, rows in sequence, else zero."""
         rows = entries.new_zeros(*entries.shape[:-1], self.size * self.size)
         rows = rows.index_copy(-1, self.below, entries)
         return rows.reshape(*entries.shape[:-1], self.size, self.size)

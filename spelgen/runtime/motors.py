@@ -21,7 +21,7 @@ class MotorInputs(nn.Module):
 
     parameter_groups = (("raw_gains", "gains", "1"),)
 
-    raw_gains: nn.Parameter | None  # logarithms of gains / initial gains
+    raw_gains: nn.Parameter | None  # log(gain / initial gain)
 
     def __init__(self, gains: Rows, trained: Rows | None = None) -> None:
         super().__init__()
@@ -72,8 +72,8 @@ class ServoConstants(NamedTuple):
 class PositionServo(nn.Module):
     """Position servos: tau = clip(kp d(u - q) - kd qd, -limit, limit), u commanded ``delay`` seconds earlier.
 
-    d(x) is zero within a dead zone and is reduced by half the width of the zone outside of it. The
-    cause is play of the gears or the controller. A servo is a spring and a damper. The spring stores
+    d(x) reduces |x| by half the width of a dead zone and is zero within the zone, which is due to play
+    of gears or to the controller. A servo is a spring and a damper. The spring stores
     the energy 1/2 kp d(q - u)^2, so that the arm with the input u is port-Hamiltonian. The trained
     parameters are logarithms of the constants; a known kp is not trained.
     """

@@ -206,8 +206,8 @@ class DenseFriction(NetworkFriction):
         super().__init__(joints, network)
         rows = axes * len(joints)
         row, column = torch.tril_indices(rows, rows)
-        # Linear map from the entries of a lower triangle, row by row, to the matrix: (rows, rows,
-        # entries).
+        # Linear map, (rows, rows, entries), from the entries of a lower triangle, rows in sequence, to
+        # the matrix.
         spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
         # The initial L is diagonal, in units of the square root of typical friction / typical speed.

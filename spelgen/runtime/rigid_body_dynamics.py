@@ -39,7 +39,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
     The friction state z, (..., n, K) [rad, m], has the displacements of the bristles, whose energy is
     part of H. Without z, dry friction depends on velocity. motor_speeds: rows of C, for motors that
-    rotate at C qd; friction, z and armature are then those of the motors. None: every motor drives its
+    rotate at C qd; friction, z and armature then belong to the motors. None: every motor drives its
     own joint. servo: position servos; None: inputs are torques.
     """
 
