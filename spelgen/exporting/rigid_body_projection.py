@@ -51,8 +51,7 @@ class RigidBodyProjection:
 
     inertias: inertial parameters in the frames of the joints, (bodies, 10), as in ``Body``. armature: rotor inertia of
     the motors, (n,) [kg m^2, kg]. motors: C, (n, n), motor velocities per joint velocities. inputs: G at q = 0, (n, n).
-    exact: whether the rigid bodies are the trained model's own, not the nearest ones. mass_error,
-    gravity_error:
+    exact: whether the rigid bodies are the trained model's own, not the nearest ones. mass_error, gravity_error:
     relative root mean square difference between the rigid bodies and the trained model, of M and of the gravity torque.
     bodies: float64 model that consists of the rigid bodies only.
     """

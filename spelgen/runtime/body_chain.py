@@ -29,9 +29,8 @@ class BodyChain(nn.Module):
     frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). Each body is represented by four
     point masses with the same inertia: the columns (position, 1) * sqrt(mass) of a matrix root of the
     body's pseudo-inertia. Only the frames are computed one body after the other. Sums over carrying or
-    carried
-    bodies are products with a mask, because for small arms the time is proportional to the number of
-    tensor operations.
+    carried bodies are products with a mask, because for small arms the time is proportional to the
+    number of tensor operations.
     """
 
     def __init__(
