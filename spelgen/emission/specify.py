@@ -72,7 +72,7 @@ def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> Arm:
 
 
 def find_urdf(module: Path, name: str) -> Path:
-    """Return the path of the URDF ``name``, see ``folders`` for the searched folders. Raises ModuleError if absent."""
+    """Return the URDF ``name`` in the module's folder, the current one, or robots/ of either. Raises ModuleError."""
     # The folder of the module is searched first, since most projects have the URDF there.
     folders = [module.parent, Path(), Path("robots"), module.parent / "robots"]
     for folder in folders:

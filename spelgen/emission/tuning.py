@@ -39,8 +39,8 @@ class ModelTuning:
     servo_lag: float = 0.05
     # [1] Armature of a drive without data, divided by the joint's diagonal entry of the nominal M.
     min_armature: float = 0.01
-    # [1] Factor on the encoded positions that are inputs of friction networks; the inputs for velocity have
-    # size one.
+    # [1] Factor on the encoded positions that are inputs of friction networks; velocity inputs are of the
+    # order of one.
     position_sensitivity: float = 0.1
     # [1] Number of hidden units per joint of the friction networks.
     friction_units: int = 8

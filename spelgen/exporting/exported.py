@@ -76,8 +76,7 @@ class Exported:
         require_fitting(self.to, path)
         is_folder = not EXPORTERS[self.to].suffix
         paths = [path / name if is_folder else path.with_name(path.stem + name) for name in self.files]
-        # A format that is a folder is not written into an existing folder: its files could be mixed with
-        # other files.
+        # Without `force`, a folder must not exist: the files could be mixed with other files.
         for output in [path] if is_folder else paths:
             if output.exists() and not force:
                 raise RunError("this output exists already", file=output, do="force replaces it")
