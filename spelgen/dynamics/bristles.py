@@ -16,8 +16,8 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class BristleReach:
     """Break-away displacements of the K bristles of each drive.
 
-    values: (n, K) [rad, m]; K is 0 without bristles. motors: matrix C, (n, n): the velocities of the drives are C qd (see
-    ``Actuation.motor_speeds``); None: each drive moves its own joint. smoothing_velocity: width of the tanh of dry
+    values: (n, K) [rad, m]; K is 0 without bristles. motors: matrix C, (n, n): the velocities of the drives are C qd
+    (see ``Actuation.motor_speeds``); None: each drive moves its own joint. smoothing_velocity: width of the tanh of dry
     friction without bristles, (n,) [rad/s, m/s]; None: unknown.
     """
 

@@ -19,8 +19,8 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 class MotionEquations:
     """Equations of motion of W rollouts at fixed positions (W, n).
 
-    mass: mass matrix M, (W, n, n). force: function of (qd, tau, z) that returns M qdd, (W, n) [Nm, N]. friction: function
-    of (qd, z) that returns the friction torque, (W, n) [Nm, N].
+    mass: mass matrix M, (W, n, n). force: function of (qd, tau, z) that returns M qdd, (W, n) [Nm, N]. friction:
+    function of (qd, z) that returns the friction torque, (W, n) [Nm, N].
     """
 
     mass: Tensor

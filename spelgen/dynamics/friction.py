@@ -26,8 +26,8 @@ class DriveFriction:
     """Friction of n drives; arrays are (n,), in Nm and rad/s, or N and m/s for prismatic joints.
 
     forward: Coulomb torque for velocities > 0, not negative. backward: Coulomb torque for velocities < 0, not positive.
-    smoothing_velocity: width of the tanh that replaces the sign of the velocity. speeds: matrix C, (n, n): the velocities
-    of the drives are C qd (see `motor_speeds`); None: each drive moves its own joint.
+    smoothing_velocity: width of the tanh that replaces the sign of the velocity. speeds: matrix C, (n, n): the
+    velocities of the drives are C qd (see `motor_speeds`); None: each drive moves its own joint.
     """
 
     viscous: np.ndarray
@@ -52,8 +52,8 @@ class DriveFriction:
     def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the joint friction torque (..., n) [Nm, N] at joint velocities qd (..., n).
 
-        direction: direction of dry friction per drive, (..., n) in [-1, 1]: tanh(v / smoothing_velocity), or a function of
-        the friction state.
+        direction: direction of dry friction per drive, (..., n) in [-1, 1]: tanh(v / smoothing_velocity), or a function
+        of the friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
         # s (f - b) / 2 + s^2 (f + b) / 2 is f at s = 1, b at s = -1, and has no jump between them.
@@ -95,10 +95,10 @@ BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolu
 class FrictionModel:
     """Columns of the regressor for armature, viscous and Coulomb friction, torque offset, and optional effects.
 
-    coulomb_smoothing_velocity: width of the tanh that replaces the sign of the velocity [rad/s, m/s]. stribeck: adds dry
-    friction at low velocity (Gaussian, Armstrong-Helouvry 1991). polynomial: adds qd |qd| and qd^3. memory: dry friction
-    is a function of the deflection of bristles (see ``runtime.friction_laws``), with one column per bristle, instead of
-    the tanh.
+    coulomb_smoothing_velocity: width of the tanh that replaces the sign of the velocity [rad/s, m/s]. stribeck: adds
+    dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991). polynomial: adds qd |qd| and qd^3. memory: dry
+    friction is a function of the deflection of bristles (see ``runtime.friction_laws``), with one column per bristle,
+    instead of the tanh.
     """
 
     coulomb_smoothing_velocity: float = 0.01
@@ -139,7 +139,7 @@ class FrictionModel:
     def torque(
         self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None, motors: np.ndarray
     ) -> np.ndarray:
-        """Return the joint torque of all effects except the armature, (..., n) [Nm, N], for ``constants`` (effects, n)."""
+        """Return the joint torque of all effects but the armature, (..., n) [Nm, N], for ``constants`` (effects, n)."""
         speed = qd @ motors.T
         torque: np.ndarray = (self._effects(speed, np.zeros_like(speed), bent) * constants).sum(
             axis=-2

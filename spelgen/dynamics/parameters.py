@@ -19,11 +19,11 @@ from spelgen.runtime.residual_terms import ResidualDynamics
 class ParameterInfo:
     """The group and the unit of a parameter.
 
-    kind: the group: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of friction), effects (friction that
-    varies with velocity), velocities, load_dependence, fractions (of bristles), torque_splines, torque_ripple,
-    friction_splines, mass_constants, mass_residuals, stiffness, damping, dead_zone, delay, or network. unit: unit of the
-    physical quantity that the parameter represents, for revolute and for prismatic joints. Most parameters are the
-    logarithm of this quantity divided by a nominal value.
+    kind: the group: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of friction), effects
+    (friction that varies with velocity), velocities, load_dependence, fractions (of bristles), torque_splines,
+    torque_ripple, friction_splines, mass_constants, mass_residuals, stiffness, damping, dead_zone, delay, or network.
+    unit: unit of the physical quantity that the parameter represents, for revolute and for prismatic joints. Most
+    parameters are the logarithm of this quantity divided by a nominal value.
     """
 
     kind: str

@@ -45,9 +45,9 @@ def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
 class PinocchioDynamics:
     """Dynamics of an arm of n coordinates (see ``RigidDynamics``).
 
-    model: Pinocchio model of b joints, with the rotor inertia as armature. constraint: mimic joints; joints of the model
-    that it does not name are locked. friction: function of the velocity (..., n) that returns the torque (..., n); None:
-    no friction. inputs: input matrix G, (n, n); None: each input is the torque of its joint.
+    model: Pinocchio model of b joints, with the rotor inertia as armature. constraint: mimic joints; joints of the
+    model that it does not name are locked. friction: function of the velocity (..., n) that returns the torque (...,
+    n); None: no friction. inputs: input matrix G, (n, n); None: each input is the torque of its joint.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class PinocchioDynamics:
         return configuration
 
     def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
-        """Call an algorithm of Pinocchio for each state of a batch (..., nq), (..., nv), ...; return the stacked results."""
+        """Call an algorithm of Pinocchio for each state of a batch (..., nq), (..., nv), ...; return a batch."""
         batch = states[0].shape[:-1]
         if not batch:
             return algorithm(self.model, self.data, *states)

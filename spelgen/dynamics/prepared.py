@@ -63,7 +63,7 @@ class PreparedModel:
         return self._model.friction_torque(self._at(q, qd), qd, *known_past(self._model, z))
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return the friction state z, (..., n, K) [rad, m], of joints that have moved at qd for a long time: zero at rest."""
+        """Return the friction state z, (..., n, K), of joints that have moved at qd for a long time: zero at rest."""
         return sliding_memory(self._model, qd)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
@@ -93,8 +93,8 @@ class PreparedModel:
     ) -> State:
         """Return q, qd and z after dt [s] under a constant input tau.
 
-        The result is of ``substeps`` steps of the classical Runge-Kutta method. q, qd, tau: (..., n). z: friction state,
-        (..., n, K), by default ``memory(qd)``; its update is exact for a given displacement.
+        The result is of ``substeps`` steps of the classical Runge-Kutta method. q, qd, tau: (..., n). z: friction
+        state, (..., n, K), by default ``memory(qd)``; its update is exact for a given displacement.
         """
         z = self.memory(qd) if z is None else z
 
@@ -169,7 +169,7 @@ class PreparedModel:
         return result
 
     def _at(self, q: Tensor, *others: Tensor) -> object:
-        """Return the configuration cache of the model at q, after a check of the shapes of q and of the other vectors."""
+        """Return the configuration cache of the model at q, after a check of the shapes of all arguments."""
         return self._model.at(q, *others, prepared=self._weights)
 
     def _kinematics(self) -> TipKinematics:

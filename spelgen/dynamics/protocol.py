@@ -105,8 +105,8 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
     """Return the last arguments of each method, which describe the history of friction: z and the direction.
 
-    z is omitted if friction has no state. direction: direction in [-1, 1] of dry friction without bristles, (..., n). It
-    is required if tau was filtered, and must have passed the same filter.
+    z is omitted if friction has no state. direction: direction in [-1, 1] of dry friction without bristles, (..., n).
+    It is required if tau was filtered, and must have passed the same filter.
     """
     if z is None or not is_stateful(dynamics):
         return ()

@@ -50,8 +50,8 @@ class RegressorDynamics:
 
     parameters: inertial parameters, (10 B,), in the order of ``regressor``. armature: armature of the drives, (n,)
     [kg m^2, kg]. friction: function of velocities (T, n), and of the friction state z (T, n, K) or None, that returns
-    torques (T, n) [Nm, N]. bristle_reach: break-away displacements, (n, K) [rad, m]; None: friction has no state. drives:
-    None: each input is the torque of its joint.
+    torques (T, n) [Nm, N]. bristle_reach: break-away displacements, (n, K) [rad, m]; None: friction has no state.
+    drives: None: each input is the torque of its joint.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class RegressorDynamics:
         return MotionEquations(mass, force, partial(self.friction_torque, q))
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return the friction state z, (..., n, K), of drives that have moved for a long time at joint velocities qd."""
+        """Return the friction state z, (..., n, K), of drives that have moved for a long time at velocities qd."""
         return (qd @ self.motors.mT.to(qd)).sign().unsqueeze(-1) * self.bristle_reach
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:

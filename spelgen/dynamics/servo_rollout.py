@@ -2,10 +2,10 @@
 
 The springs of the servos and dry friction are stiff, so both are integrated implicitly. Springs are linearised at the
 start of a step (Rosenbrock; Hairer and Wanner, Solving ODEs II, IV.7, with the weights of the theta method). A few
-steps between samples are then stable for any gain. Theta is fitted exponentially, so that decaying motion decays at its true rate to third
-order (Liniger and Willoughby, SIAM J. Numerical Analysis 7:47, 1970): 1/2 for slow motion, without numerical damping,
-and towards 1 for motion that is too fast for a step. The update of the friction state is exact for a given
-displacement.
+steps between samples are then stable for any gain. Theta is fitted exponentially, so that decaying motion decays at its
+true rate to third order (Liniger and Willoughby, SIAM J. Numerical Analysis 7:47, 1970): 1/2 for slow motion, without
+numerical damping, and towards 1 for motion that is too fast for a step. The update of the friction state is exact for a
+given displacement.
 """
 
 from typing import NamedTuple
@@ -44,8 +44,8 @@ class ServoState(NamedTuple):
 class Load(NamedTuple):
     """Load of the drives in a step.
 
-    inertia: mass matrix M, (..., n, n), or the diagonal of M, (..., n), if not ``coupled``. bias: Coriolis, centrifugal and gravity
-    torque, (..., n). gravity: gravity torque, (..., n).
+    inertia: mass matrix M, (..., n, n), or the diagonal of M, (..., n), if not ``coupled``. bias: Coriolis, centrifugal
+    and gravity torque, (..., n). gravity: gravity torque, (..., n).
     """
 
     inertia: Tensor
@@ -69,8 +69,8 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
     """Return the state whose bristles balance the other torques as far as their break-away torque allows.
 
-    It is the state at rest, or of steady motion. q, u: positions and commands, (..., n) [rad, m]. qd: velocities, (..., n)
-    [rad/s, m/s].
+    It is the state at rest, or of steady motion. q, u: positions and commands, (..., n) [rad, m]. qd: velocities, (...,
+    n) [rad/s, m/s].
     """
     servo = drives.servo
     torque = servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd
@@ -121,8 +121,8 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
     """Return the displacement x, (..., n), that solves slope x + sum_k strength_k (z_k(x) - z_k) = push, (..., n).
 
     strength, z, reach: (K, ..., n), the shortest break-away displacement first. Bristles that are deflected in the same
-    direction begin to slide in this order. With k sliding bristles the equation is a straight line; x is the largest zero
-    of these K + 1 lines.
+    direction begin to slide in this order. With k sliding bristles the equation is a straight line; x is the largest
+    zero of these K + 1 lines.
     """
     direction, stiffness = push.sign(), slope + strength.sum(dim=0)
     # Cumulative sums give the remaining push and the stiffness for each number k of sliding bristles.
@@ -134,8 +134,8 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
 def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:
     """Return the positions (W, K, n) [rad, m] after each of K intervals, for W windows.
 
-    q, qd: initial positions and velocities, (W, n). commands: delayed commands, (W, K, S, n), with S steps per interval.
-    dt: durations of the intervals, (W, K) [s]. M and the gravity torque are evaluated once per interval.
+    q, qd: initial positions and velocities, (W, n). commands: delayed commands, (W, K, S, n), with S steps per
+    interval. dt: durations of the intervals, (W, K) [s]. M and the gravity torque are evaluated once per interval.
     """
     with torch.no_grad():
         drives, prepared, positions = servo_drives(model), model.prepare(), []

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class TipKinematics:
     """Pose and Jacobian of a link in the frame of the root link, as functions of q (..., n) [rad, m].
 
-    Mimic joints are included; joints that are neither coordinates nor mimic joints are at zero. Angles of the URDF are not
-    rounded. Results have the dtype of q.
+    Mimic joints are included; joints that are neither coordinates nor mimic joints are at zero. Angles of the URDF are
+    not rounded. Results have the dtype of q.
     """
 
     def __init__(self, robot: Robot, joints: Sequence[str], link: str) -> None:
@@ -64,7 +64,8 @@ class TipKinematics:
 def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> SerialChain:
     """Return the chain of pytorch-kinematics for a path of joints from the root link.
 
-    The frames are built from spelgen's values of the URDF, since the URDF parser of pytorch-kinematics rounds to float32.
+    The frames are built from spelgen's values of the URDF, since the URDF parser of pytorch-kinematics rounds to
+    float32.
     """
     import pytorch_kinematics as pk  # imported here: it imports matplotlib, which takes long
     from pytorch_kinematics.frame import Frame, Joint, Link
