@@ -34,7 +34,8 @@ class BristleReach:
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
     """Return typical break-away displacements, (n, K) [rad, m].
 
-    kinds: type of each joint (revolute or prismatic). motors: see `BristleReach`."""
+    kinds: type of each joint (revolute or prismatic). motors: see `BristleReach`.
+    """
     return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
 
 
@@ -112,7 +113,8 @@ def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:
     """Return the direction in [-1, 1] of dry friction without bristles, (T, n), at velocities qd (T, n).
 
-    The result is None if the smoothing velocity is unknown."""
+    The result is None if the smoothing velocity is unknown.
+    """
     if bristles.smoothing_velocity is None:
         return None
     # This smooth sign must be the one of `runtime.friction_laws`: any difference is an error of the friction torque.

@@ -23,7 +23,8 @@ class Constraint:
 def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
     """Return the constraint of all joints of ``robot``.
 
-    coordinates: names of the joints that are coordinates. All other joints are mimic joints, or locked at zero."""
+    coordinates: names of the joints that are coordinates. All other joints are mimic joints, or locked at zero.
+    """
     columns = {name: k for k, name in enumerate(coordinates)}
     moving = [joint.name for joint in robot.joints if joint.moves]
     jacobian, offset = np.zeros((len(moving), len(columns))), np.zeros(len(moving))

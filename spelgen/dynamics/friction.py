@@ -149,7 +149,8 @@ class FrictionModel:
     def _effects(self, speed: np.ndarray, rise: np.ndarray, bent: np.ndarray | None) -> np.ndarray:
         """Return the factor of each constant, (..., effects, n).
 
-        speed, rise: velocities and accelerations of the drives, (..., n)."""
+        speed, rise: velocities and accelerations of the drives, (..., n).
+        """
         sign = np.tanh(speed / self.coulomb_smoothing_velocity)
         dry = [sign]
         if self.memory:

@@ -76,7 +76,8 @@ def motors_of(model: Any) -> Tensor:
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
     """Return the friction state z, (..., n, K), of joints that have moved at qd for a long time.
 
-    K is 0 for friction without a state."""
+    K is 0 for friction without a state.
+    """
     if not is_stateful(dynamics):
         return qd.unsqueeze(-1)[..., :0]
     return dynamics.memory(qd)

@@ -27,7 +27,8 @@ class MotionBounds:
 
     low, high: lowest and highest position [rad, m]. speed: largest speed [rad/s, m/s]. acceleration: largest
     acceleration
-    [rad/s^2, m/s^2]; None: unlimited."""
+    [rad/s^2, m/s^2]; None: unlimited.
+    """
 
     low: np.ndarray
     high: np.ndarray

@@ -151,7 +151,8 @@ class Collisions:
     def _distance_gradient(self, pair: int) -> np.ndarray:
         """Return the derivative of the distance of a pair with respect to q, (n,).
 
-        ``distances`` and the joint Jacobians must have been computed at q."""
+        ``distances`` and the joint Jacobians must have been computed at q.
+        """
         result, objects = self._found.distanceResults[pair], self._geometry.collisionPairs[pair]
         gradient = np.zeros(self._model.nv)
         for index, point, sign in (

@@ -1,6 +1,7 @@
 """Design of exciting motions: L-BFGS improves the best of several random motions.
 
-If the result has a contact, the design is repeated with another seed and a smaller position range."""
+If the result has a contact, the design is repeated with another seed and a smaller position range.
+"""
 
 from __future__ import annotations
 

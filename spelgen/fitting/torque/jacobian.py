@@ -104,11 +104,11 @@ class TorqueJacobian:
         return squared_residual
 
     def logged_scale(self, x: torch.Tensor) -> torch.Tensor:
-        """Return initial gain / gain (n,), which converts joint torques to the scale of logged torques; 1 for fixed gains."""
+        """Return initial gain / gain (n,), which scales joint torques as logged torques; 1 for fixed gains."""
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 
     def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
-        """Return `logged_scale`, (..., n), differentiable; parameters: one set of parameters, or a batch (...) of sets."""
+        """Return `logged_scale`, (..., n), differentiable; parameters: one set, or a batch (...) of sets."""
         ones = torch.ones(self.model.n).double()
         for name in self.rigid.names("gains"):  # logarithms of the gains, joint torque / logged torque
             change = parameters[name] - self.rigid.initial[name]
@@ -203,7 +203,7 @@ class TorqueJacobian:
         return RigidProjection(tuple(of_joint.jacobian for of_joint in rows), tuple(gains))
 
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Return parameters (K,) after a step (K,) that is a straight line in the quantities in which the torque is linear.
+        """Return parameters (K,) after a step (K,), straight in the quantities in which the torque is linear.
 
         Inertial parameters are updated along a straight line (see `step_in_inertial_parameters`). A coefficient c whose
         logarithm is a parameter is updated to c (1 + step) for a positive step, and to c exp(step) for a negative one,
@@ -241,7 +241,7 @@ class TorqueJacobian:
             )
 
     def _affected_joints(self) -> torch.Tensor:
-        """Return a mask (K', n): whether the torque of a joint depends on each of the K' parameters that are not of bodies."""
+        """Return a mask (K', n): whether a joint's torque depends on each of the K' parameters except the bodies'."""
         masks = []
         for name, tensor in self.rigid.initial.items():
             if name == self.rigid.bodies:
@@ -311,7 +311,7 @@ class TorqueJacobian:
 
 
 def _colour(coupled: torch.Tensor) -> list[int]:
-    """Return a colour per joint, different for any two coupled joints, by the greedy algorithm; coupled: mask (n, n)."""
+    """Return a colour per joint, different for coupled joints, by the greedy algorithm; coupled: mask (n, n)."""
     colours: list[int] = []
     for row in coupled.tolist():
         used = {colour for colour, shared in zip(colours, row, strict=False) if shared}

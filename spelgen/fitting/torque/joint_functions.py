@@ -29,9 +29,7 @@ TermKey = tuple[str, int | None]
 
 ALL = slice(None)
 TORQUE, FRICTION, RIPPLE = "raw_torque_splines", "raw_friction_splines", "raw_torque_ripple"
-LOG_FACTOR_LIMIT = (
-    0.99 * LARGEST
-)  # limit of the log friction factor, since LARGEST needs an infinite parameter
+LOG_FACTOR_LIMIT = 0.99 * LARGEST  # limit of the log friction factor: LARGEST needs an infinite parameter
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +85,7 @@ class JointFunction:
             terms.get_parameter(self.parameter)[self.joint] = entries / self.scale
 
     def torque(self, weights: torch.Tensor, rows: slice | torch.Tensor = ALL) -> torch.Tensor:
-        """Return the torque (T,) [Nm, N] for weights (P,) at the samples `rows`; for a friction factor, the torque change."""
+        """Return the torque (T,) [Nm, N] for weights (P,) at the samples `rows`; for a friction factor, its change."""
         features = self.features[rows]
         if self.friction is None:
             return features @ weights
@@ -105,7 +103,7 @@ class JointFunction:
     def fit(
         self, target: torch.Tensor, correlation_length: float, rows: slice | torch.Tensor = ALL
     ) -> BayesianRidge:
-        """Return the fit to a target (T,) at the samples `rows`; samples of one visit count as one independent error."""
+        """Return the fit to a target (T,) at the samples `rows`; samples of one visit count as one error."""
         samples = append_target(self.features[rows], target[rows])
         # The error of a function of position is constant during a visit of a position, however long the visit lasts.
         length = max(correlation_length, self.visit_length)
@@ -115,7 +113,8 @@ class JointFunction:
 class ProjectedTerms(NamedTuple):
     """Position-dependent torques that are eliminated in a fit.
 
-    terms: linear terms per joint. candidates: the residual terms whose columns the linear terms concatenate."""
+    terms: linear terms per joint. candidates: the residual terms whose columns the linear terms concatenate.
+    """
 
     terms: dict[int, LinearTerms]
     candidates: tuple[JointFunction, ...]
