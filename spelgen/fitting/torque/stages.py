@@ -150,10 +150,10 @@ def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
 
 
 def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> torch.Tensor:
-    """Return twice the log likelihood ratio of `estimate` to `other` per joint (n,), each at its maximum-likelihood noise."""
+    """Return twice the log likelihood ratio of `estimate` to `other` per joint, (n,), with maximized noise."""
     samples = estimate.problem.jacobian.samples
-    # At the maximum-likelihood noise the ratio is the number of independent errors times the log of the ratio of the
-    # squared residuals.
+    # At the maximum-likelihood noise of each estimate, the result is the number of independent errors times the log
+    # of the ratio of squared residuals.
     errors = samples.count * min(1.0, samples.interval / TUNING.reversal_correlation_time)
     return errors * (other.state.residual / estimate.state.residual).log()
 
@@ -216,7 +216,7 @@ def fit_residual_terms(
 def _refit(
     estimate: TorqueEstimate, samples: TorqueSamples, selected: Sequence[SelectedTerm]
 ) -> TorqueEstimate:
-    """Refit the selected single-joint terms, then the rigid-body parameters with position-dependent torques eliminated."""
+    """Refit the selected single-joint terms, then rigid-body parameters and position-dependent torques together."""
     model, correlation_length = estimate.problem.jacobian.model, estimate.problem.correlation_length
     projected = refit_terms(model, *estimate.linearize(), _keys(selected), correlation_length)
     estimate = refine(estimate, samples, projected.terms)

@@ -46,8 +46,8 @@ class TorqueTuning:
     initial_steps: int = 60
     # [1] Largest number of iterations of noise annealing, which lowers the noise to the least-squares noise.
     annealing_iterations: int = 12
-    # [1] Noise in the iterations of noise annealing, as a fraction of the rms torque residual. For a low_cost_robot with
-    # placeholder inertials, annealing reduces the error of M(q) from 0.44 to 0.005.
+    # [1] Noise in the iterations of noise annealing, as a fraction of the rms torque residual. For a low_cost_robot
+    # with placeholder inertials, annealing reduces the error of M(q) from 0.44 to 0.005.
     annealing_fraction: float = 0.03
     # [1] The noise has converged if its ratio to the noise of the previous iteration exceeds this value.
     noise_converged: float = 0.98
@@ -69,12 +69,13 @@ class TorqueTuning:
     min_noise: float = 1e-4
     # [1] Number of standard deviations by which the slope of a friction compensation must differ from zero.
     min_significance: float = 4.0
-    # [1] Smallest standard deviation of a friction compensation, as a fraction of the torque's standard deviation. Delays
-    # of milliseconds have a similar but smaller effect.
+    # [1] Smallest standard deviation of a friction compensation, as a fraction of the torque's standard deviation.
+    # Delays of milliseconds have a similar but smaller effect.
     min_compensation: float = 0.05
     # [1] Number of samples per block: a block and its derivatives need some 100 MB of memory for seven joints.
     block: int = 2**13
-    # [B] Memory of the regressors, which limits the number of samples: 70,000 for six joints. Larger logs are subsampled.
+    # [B] Memory of the regressors, which limits the number of samples to 70,000 for six joints. Larger logs are
+    # subsampled.
     regressor_bytes: float = 4e8
     # [1] Largest step of a body's inertial parameters, as a fraction of the step to physically inconsistent parameters.
     body_step: float = 0.3
@@ -90,11 +91,12 @@ class TorqueTuning:
     # [1] A warning names joints whose torque residual divided by the inertial torque exceeds this value: the predicted
     # motion is then unreliable.
     weak_acceleration: float = 2.0
-    # [1] Prior standard deviations of an adapted fit, for each value of the option `adapt`; the prior mean is the source
-    # fit. load: the mass is known to a factor of twenty. With a width of 10 in place of 3, a fit to half a second of
-    # motion of a UR10e had an error of 27 times the variance of the torque. friction: temperature changes the common
-    # factor of all joints by tens of per cent, the deviations of single joints by less (Bittencourt and Gunnarsson,
-    # J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: units of one arm model also differ in mass, by a few per cent.
+    # [1] Prior standard deviations of an adapted fit, for each value of the option `adapt`; the prior mean is the
+    # source fit. load: the mass is known to a factor of twenty. With a width of 10 in place of 3, a fit to half a
+    # second of motion of a UR10e has an error of 27 times the variance of the torque. friction: temperature changes
+    # the common factor of all joints by tens of per cent, the deviations of single joints by less (Bittencourt and
+    # Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: units of one arm model also differ in mass, by a
+    # few per cent.
     priors: Mapping[Adaptation, GaussianPrior] = field(
         default_factory=lambda: {
             "load": GaussianPrior(bodies=3.0),
