@@ -81,8 +81,8 @@ def constants_regressor(chain: BodyChain, motors: Tensor, q: Tensor, qd: Tensor,
         motors: matrix C, (n, n): the velocities of the drives are C qd.
         q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (T, n).
 
-        Returns:
-            Derivative (T, n, 10 B + n): the inertial parameters first, then the armatures.
+    Returns:
+        Derivative (T, n, 10 B + n): columns of the inertial parameters, then of the armatures.
     """
     rotors = (qdd @ motors.mT).unsqueeze(-2) * motors.mT
     return torch.cat([regressor_of(chain, q, qd, qdd), rotors], dim=-1)
@@ -110,7 +110,7 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     is_base = remainder > 1e-8 * columns[:, order].norm(dim=0).clamp(min=1.0)
     base = torch.tensor(order)[is_base]
     combination = torch.linalg.lstsq(columns[:, base], columns).solution
-    # smaller coefficients are rounding errors
+    # coefficients below the threshold are rounding errors
     combination[combination.abs() < 1e-9] = 0.0
     names = []
     for index, row in zip(base.tolist(), combination, strict=True):

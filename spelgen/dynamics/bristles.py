@@ -45,13 +45,13 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
     tensors = (model.friction.reach, motors_of(model), width)
-    # The functions below compute with NumPy in double precision, whatever the device and precision of the model.
+    # Paths are computed by NumPy in double precision, for models on any device.
     arrays = [x.detach().cpu().double().numpy() for x in tensors]
     return BristleReach(*arrays)
 
 
 def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-    """Return the exact deflections of the bristles after a monotonic displacement of the drives, (..., n, K).
+    """Return the exact deflections, (..., n, K), of bristles after a monotonic displacement of the drives.
 
     Args:
         z: (..., n, K) deflections of the bristles [rad, m].
@@ -145,6 +145,6 @@ def encoder_step(q: np.ndarray) -> np.ndarray:
     for joint, values in enumerate(q.T):
         # Positions of an encoder repeat exactly; positions that are not quantised do not.
         levels = np.unique(values)
-        if len(levels) > 1 and len(levels) < len(values) / 4:  # repeated values
+        if len(levels) > 1 and len(levels) < len(values) / 4:  # many values are repeated
             steps[joint] = np.diff(levels).min()
     return steps

@@ -72,7 +72,7 @@ def idle_residuals(model: object) -> list[str]:
     terms = residual_terms(model)
     if terms is None:
         return []
-    # of single joints; hidden layers of networks are never zero
+    # Only parameters of single joints are tested for zeros here, since hidden layers of networks are never zero.
     idle = [name for name, weights in terms.named_parameters(recurse=False) if not weights.any()]
     for prefix, network in (("mass", terms.mass), ("potential", terms.potential)):
         if _is_idle(network):
@@ -96,7 +96,7 @@ def without_residuals(model: Model) -> Model:
 
 def without_idle_residuals(model: Model) -> Model:
     """Return a copy of the model without residual terms that are zero; the copy must not be trained."""
-    # The caller's model may be trained further.
+    # Copy the model, since the caller may train it further.
     reduced = copy.deepcopy(model)
     if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:
         terms = reduced.residuals
@@ -104,14 +104,14 @@ def without_idle_residuals(model: Model) -> Model:
             terms.mass = None
         if _is_idle(terms.potential):
             terms.potential = None
-        # without any term, the factor on friction is one and needs no evaluation either
+        # Without any residual term the factor on friction is one: remove its evaluation, too.
         if not any(bool(weights.any()) for weights in terms.parameters()):
             reduced.residuals = None
     return reduced
 
 
 def _is_idle(network: MaskedNetwork | None) -> bool:
-    """Return True if a network is zero for all inputs; a network that does not exist is."""
+    """Return True if the output of a network is zero for all inputs, or if there is no network."""
     if not isinstance(network, MaskedMLP):
         return network is None
     # Only the last layer counts: hidden layers start at random weights.

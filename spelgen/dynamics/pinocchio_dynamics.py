@@ -86,7 +86,7 @@ class PinocchioDynamics:
 
     @_takes_tensors
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """Return dV/dq, (..., n) [Nm, N]."""
+        """Return the gravity torque dV/dq, (..., n) [Nm, N]."""
         return np.asarray(self.nonlinear_effects(q, np.zeros_like(q)))
 
     @_takes_tensors
@@ -96,7 +96,7 @@ class PinocchioDynamics:
 
     @_takes_tensors
     def forward_dynamics(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return qdd, (..., n), under the inputs tau (..., n)."""
+        """Return the accelerations qdd, (..., n), under the inputs tau (..., n)."""
         force = tau @ self.inputs.T - self.friction(qd)
         if self._same:  # Pinocchio overwrites its result in the next call: copy it
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))

@@ -55,7 +55,7 @@ class FrictionState(Protocol):
         """Return the friction state z, (..., n, elements), of joints that have moved at qd for a long time."""
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return z after a monotonic displacement of the joints, (..., n)."""
+        """Return the friction state z after a monotonic displacement of the joints, (..., n) [rad, m]."""
 
 
 def residual_terms(model: object) -> ResidualTerms | None:
@@ -84,7 +84,7 @@ def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
 
 
 def memory_after(dynamics: object, z: Tensor, displacement: Tensor) -> Tensor:
-    """Return z after a monotonic displacement of the joints, (..., n)."""
+    """Return the friction state z after a monotonic displacement of the joints, (..., n) [rad, m]."""
     if not z.shape[-1] or not is_stateful(dynamics):
         return z
     return dynamics.memory_after(z, displacement)

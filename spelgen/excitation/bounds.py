@@ -26,8 +26,7 @@ class MotionBounds:
     """Bounds of the motion of n joints, (n,) each.
 
     low, high: lowest and highest position [rad, m]. speed: largest speed [rad/s, m/s]. acceleration: largest
-    acceleration
-    [rad/s^2, m/s^2]; None: unlimited.
+    acceleration [rad/s^2, m/s^2]; None: unlimited.
     """
 
     low: np.ndarray

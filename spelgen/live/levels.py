@@ -39,7 +39,7 @@ from spelgen.settings.fits import TorqueFit
 
 
 def noise_levels(fit: Fit) -> NoiseLevels:
-    """Return the stored or estimated noise levels of a fit. Raises RunError if they can be neither read nor estimated."""
+    """Return the stored or estimated noise levels of a fit. Raises RunError if they cannot be read or estimated."""
     levels = stored_levels(fit)
     if levels is not None:
         return levels

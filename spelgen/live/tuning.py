@@ -27,9 +27,9 @@ class LiveTuning:
 
     # Constants of the filters (`live.filters`).
 
-    # [kg], [kg m], [kg m^2] The next three constants are the filter's prior standard deviations of a payload's mass,
-    # first moments and inertia, as of a payload of 10 kg. The estimate of the payload removes this prior, so that wider
-    # priors would only add rounding errors.
+    # [kg], [kg m], [kg m^2] The next three constants are prior standard deviations of the mass, the first moments and
+    # the inertia of a payload (as of 10 kg) in the payload filter. The final estimate removes this prior, so that a
+    # wider prior would only add rounding errors.
     load_mass: float = 10.0
     load_moment: float = 2.0
     load_inertia: float = 0.4
@@ -42,19 +42,20 @@ class LiveTuning:
     # [1] Residuals beyond this number of standard deviations are treated as outliers, with a larger noise variance
     # (Huber, Robust Statistics, 1981).
     outlier: float = 3.0
-    # [1] Variance of friction with an unknown friction state, divided by the squared half width of the possible friction
-    # torques. A uniform distribution would have 1/3; the value is larger, since the error is correlated over a block.
+    # [1] Variance of friction with an unknown friction state, divided by the squared half width of the possible
+    # friction torques. A uniform distribution has 1/3. The value is larger, since the error is correlated over a
+    # block.
     uncertainty: float = 3.0
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
 
-    # [1] The hypothesis of a changed load starts if the sum of the squared residuals of a block exceeds its mean by this
-    # number of standard deviations.
+    # [1] The hypothesis of a changed load starts if the sum of the squared residuals of a block exceeds its mean by
+    # this number of standard deviations.
     surprise: float = 3.0
     # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
     contact_disturbance: float = 8.0
-    # A changed load is accepted if the log likelihood ratio exceeds `changed` [1], but not before `changed_after` [s] of
-    # motion.
+    # A changed load is accepted if the log likelihood ratio exceeds `changed` [1], but not before `changed_after` [s]
+    # of motion.
     changed: float = 15.0
     changed_after: float = 1.0
     # The hypotheses are dropped after `dropped_after` [s] of motion, or already after `changed_after` if the log
@@ -66,11 +67,11 @@ class LiveTuning:
 
     # [1/s] Bandwidth of the momentum observer.
     bandwidth: float = 20.0
-    # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so that
-    # logs without noise give positive thresholds.
+    # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so
+    # that logs without noise give positive thresholds.
     min_observer_noise: float = 1e-3
-    # [s] Time constant with which the estimated disturbance is subtracted from the external torque. Contacts are detected
-    # in less time, so that the disturbance does not absorb them.
+    # [s] Time constant with which the estimated disturbance is subtracted from the external torque. Contacts are
+    # detected in less time, so that the disturbance does not absorb them.
     baseline: float = 0.3
     # [1] Factor on the thresholds: errors of a model are larger on later days than between training logs.
     other_days: float = 1.22
@@ -111,14 +112,14 @@ class LiveTuning:
     folds: int = 3
     min_samples: int = 300
     max_samples: int = 2**11
-    # The grid of the noise: time constants of the disturbance [s], and standard deviations of the disturbance divided by
-    # the standard deviation of white noise [1].
+    # The grid of the noise: time constants of the disturbance [s], and standard deviations of the disturbance divided
+    # by the standard deviation of white noise [1].
     time_constants: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
     disturbance_ratios: tuple[float, ...] = (0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5)
     # [1] Lengths of the trials of the payload filter, as numbers of blocks: 5 and 10 s.
     trial_blocks: tuple[int, ...] = (25, 50)
-    # [1] Prior value of the factor on the covariance of payloads, which has the weight of `prior_trials` trials: logs of
-    # an arm often have too few trials for an estimate.
+    # [1] Prior value of the factor on the covariance of payloads, which has the weight of `prior_trials` trials: logs
+    # of an arm often have too few trials for an estimate.
     prior_variance: float = 2.25
     prior_trials: int = 4
     # [1] The grid of the noise near standstill: speeds below which the noise increases, relative to the largest speed,
@@ -138,7 +139,7 @@ class LiveTuning:
 
     @property
     def evidence(self) -> float:
-        """Constant terms of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of Laplace's method."""
+        """Constant terms of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of the Gaussian."""
         wishart = 2 * self.degrees * math.log(2) + float(multigammaln(self.degrees / 2, 4))
         return 5 * math.log(2 * math.pi) - math.log(2) - wishart
 
