@@ -42,9 +42,10 @@ class TorqueSolution:
 
     rms_residual: root mean square torque residual, (n,) [Nm, N]. steps: number of steps of the solver. cost: final
     cost. prior: prior with the estimated standard deviations. covariance: covariance of the parameters x, (K, K).
-    torque_std: standard deviation of the torque, (n,) [Nm, N]. compensated: joints whose drives compensate friction,
-    (n,). correlation_time: correlation time of the torque errors, (n,) [s]. held_out_nmse: mean squared error of
-    held-out segments divided by the variance of the torque, (n,). selected_terms: the selected residual terms.
+    torque_std: root mean square torque error of held-out segments, (n,) [Nm, N]. compensated: joints whose drives
+    compensate friction, (n,). correlation_time: correlation time of the torque errors, (n,) [s]. held_out_nmse: mean
+    squared error of held-out segments divided by the variance of the torque, (n,). selected_terms: the selected
+    residual terms.
     """
 
     rms_residual: np.ndarray
@@ -112,8 +113,8 @@ def _run_stages(
         return refine(initial_fit(problem), samples), ()
     model = problem.jacobian.model
     if model.elements:
-        # The initial fit has rate-only friction: while the bodies are far from their values, bristle states would
-        # be fitted to their errors.
+        # The initial fit has rate-only friction: bristles delay the reversal of friction, which would be fitted to
+        # the errors of bodies that are still far off.
         model.friction.memoryless.fill_(1.0)
     estimate = initial_fit(problem)
     if model.elements:
