@@ -211,7 +211,7 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFac
         magnitudes.append((f"change of {name}", float(changes.max()), False))
     magnitudes.append(("remainder of M", float(np.abs(remainder).max(initial=0.0)), False))
     # long fractions are evaluated in double precision: rounding is larger than in the other facts
-    derived = f"{len(structure.outputs)} outputs and {len(structure.constants)} constants give M"
+    derived = f"outputs: {len(structure.outputs)}, constants: {len(structure.constants)}, which give M"
     return _DerivedFact("smallest form", derived, magnitudes, rounding=1e-6)
 
 

@@ -164,7 +164,7 @@ def _letters_and_digits(text: str) -> str:
 
 def array(value: Tensor) -> np.ndarray:
     """Return a copy of a tensor (...,) as a float64 array of the same shape."""
-    return np.array(value.detach().double().cpu())
+    return np.array(value.detach().double().cpu().numpy())
 
 
 def servos_of(model: ArmModel) -> Servos | None:

@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline
 
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.tip_frame import Tip
-from spelgen.errors import RunError, suggestion
+from spelgen.errors import RunError
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +198,6 @@ def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
     for name in names:
         if name not in options:
             expected = f"one of {', '.join(options)}"
-            raise RunError(f"the function {name!r}", expected=expected, do=suggestion(name, options))
+            raise RunError(f"the function {name!r}", expected=expected)
     # in a fixed order: the same names give the same files
     return [name for name in options if name in names or not names]

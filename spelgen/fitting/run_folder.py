@@ -102,7 +102,7 @@ class RunFolder:
 
     def _no_run(self, missing: Path) -> RunError:
         expected = f"a folder with {missing.name}"
-        return RunError("no such run", file=self.path, expected=expected, do="spelgen train")
+        return RunError("no such run", file=self.path, expected=expected, do="make one with `spelgen train`")
 
     def read_record(self) -> Record:
         """Return config.json. Raises RunError if it is absent, broken, or has a key absent or of another type."""
@@ -121,7 +121,9 @@ class RunFolder:
     def load_state(self, path: Path) -> Content:
         """Return the content of checkpoint.pt or model.pt, on the CPU; only tensors and plain values are unpickled."""
         if not path.exists():
-            raise RunError(f"no {path.name}", file=self.path, expected="a run folder", do="spelgen train")
+            raise RunError(
+                f"no {path.name}", file=self.path, expected="a run folder", do="make one with `spelgen train`"
+            )
         require_regular_file(path, RunError)
         expected = "a file of `spelgen train`"
         try:

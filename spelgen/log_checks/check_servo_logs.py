@@ -12,7 +12,7 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.listing import Listing, number
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
-from spelgen.logs.checks import Findings, run_checks
+from spelgen.logs.checks import Check, Findings, run_checks
 from spelgen.logs.filtering import derivative
 from spelgen.logs.joint_signals import is_factor, mapping_line
 from spelgen.logs.trajectory import Trajectory, delayed_commands, require_commands, split_at_gaps
@@ -28,6 +28,34 @@ DELAYS = np.linspace(-0.1, 0.4, 51).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # shortest piece that the polynomial of the derivative fits into
 FOLLOWS = SIGNALS.agreement
+# Positions of bus servos are words of 10 to 14 bits per turn: in degrees, all joints have steps of 360/2**k (LeRobot:
+# 360/(2**k - 1)), and LeRobot's normalised positions steps of 200 divided by the counts of a joint's calibrated range.
+NORMALISED_RANGE, NORMALISED_STEPS = 100.001, (0.04, 0.25)  # 800 to 5000 counts
+SAME_STEP, ENCODER_STEP = 1e-3, 4e-3  # relative differences
+
+
+def find_normalised(joints: Sequence[JointReport]) -> str | None:
+    """Find LeRobot's normalised positions that were declared as degrees, by the quantisation steps of the joints."""
+    if max(joint.largest("q") for joint in joints) > np.radians(NORMALISED_RANGE):
+        return None
+    found = {joint.name: float(np.degrees(joint.steps["q"])) for joint in joints if joint.steps["q"]}
+    steps = np.array(list(found.values()))
+    low, high = NORMALISED_STEPS
+    if len(steps) < 2 or steps.min() < low or steps.max() > high or np.ptp(steps) < SAME_STEP * steps.max():
+        return None
+    turns = 360 / steps
+    is_encoder = np.abs(turns / 2 ** np.round(np.log2(turns)) - 1) < ENCODER_STEP
+    if is_encoder.mean() > 0.5:
+        return None
+    values = ", ".join(f"{name} {step:.4f}" for name, step in found.items())
+    return f"degrees of another step for each joint ({values}), as LeRobot's normalised positions have"
+
+
+NORMALISED = Check(
+    "normalised", "error", find_normalised, expected="degrees, with the step of the encoders (4096 counts: 0.0879)",
+    do="write 'units: {q: normalised}' and 'calibration:' with the content of LeRobot's calibration file under 'logs' "
+    "in the robot's YAML",
+)  # fmt: skip
 
 
 class Following(NamedTuple):
@@ -125,6 +153,10 @@ class ServoLogs:
             kp = self._arm.settings.joint(coordinate.name).kp
             if coordinate.effort and kp:
                 saturation[k] = coordinate.effort / kp
+        mapping = self._logs[0].mapping
+        if all(mapping.unit("q", name) == "deg" for name in names):
+            for normalised, found in run_checks([NORMALISED], reports, self._logs[0].accepted):
+                summary.add(normalised, found.message, "all joints")
         following = measure_following(self._logs, saturation)
         if following is None:
             message = f"no {FILTER_SAMPLES} samples without a gap: no servo is determined"
@@ -136,7 +168,7 @@ class ServoLogs:
                 report = replace(report, following=following.joints[k])
                 # some loggers write measured positions in place of commands
                 is_copy = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in self._logs)
-                odd = _odd_command(k, names, report, following, is_copy, self._logs[0].mapping)
+                odd = _odd_command(k, names, report, following, is_copy, mapping)
             completed.append(report)
             if isinstance(odd, LogError):
                 summary.errors.append(odd)
@@ -173,16 +205,16 @@ def _odd_command(
             "commands-are-positions",
             "u is q, to the last bit: are the commands those that were sent?",
         )
-    # a constant command does not determine the servo
-    elif not following.moves[k]:
-        width = report.high["u"] - report.low["u"]
-        code, message = "idle-command", f"its command moves by {width:.3g} alone: its servo is not determined"
     # the amplitudes of command and motion are equal within a fifth, unless one of them is in degrees
     elif correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         units = {"q": "deg", "u": "rad"} if gain > 1 else {"q": "rad", "u": "deg"}
         do = mapping_line({"joints": {joints[k]: {"units": units}}})
         return LogError(got, element=where, expected="both in radians", do=do)
+    # a constant command does not determine the servo
+    elif not following.moves[k]:
+        width = report.high["u"] - report.low["u"]
+        code, message = "idle-command", f"its command moves by only {width:.3g}: its servo is not determined"
     elif correlation < -FOLLOWS:
         got = f"positions that move against commands (correlation {correlation:.2g})"
         return LogError(got, element=where, expected="one sense", do="check the signs of q and u")

@@ -46,7 +46,7 @@ ARM = """\
 #   {{protocol: tracking, trajectories: 4, duration: 8.0, sample_rate: 125.0, test_fraction: 0.25, seed: 0}}
 # tracking: {{control: computed-torque, paths: own, frequency: 0.125, control_rate: 125.0}}
 
-## Defaults of `spelgen train`: its options, with _ in place of -.
+## Defaults of `spelgen train`, which --set replaces: the keys of docs/cli_runs.md.
 # training: {{validation_fraction: 0.25, seed: 0}}
 """
 
