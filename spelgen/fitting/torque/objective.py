@@ -90,9 +90,7 @@ class TorqueObjective(Objective):
         loss = validation.loss(substeps)
         self._make_checkpoint(loss, time.monotonic() - self.request.began, substeps)
         self._checkpoint["torque_nmse"] = torque_nmse(model, samples)
-        if (
-            solution is not None and not self.config.adapt
-        ):  # parameters of an adapted model belong to two fits
+        if solution is not None and not self.config.adapt:  # an adapted model has parameters of two fits
             self._checkpoint["posterior"] = {
                 "covariance": solution.covariance,
                 "torque_std": solution.torque_std,
@@ -116,7 +114,7 @@ def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
 
 
 def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:
-    """Return the delay of the torques relative to the positions in the logs, from the regressor of the model's bodies."""
+    """Return the delay of the torques relative to the positions in the logs, from the regressor of a model."""
     with torch.no_grad():
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
     drives = Drives(inputs, motors_of(model).numpy())

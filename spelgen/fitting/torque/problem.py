@@ -158,7 +158,7 @@ class TorqueProblem:
         return self.jacobian.squared_residual(x)
 
     def cost(self, x: torch.Tensor, residual: torch.Tensor) -> float:
-        """Return the negative log posterior of x (K,) up to a constant; residual: squared residual, (n,) [Nm^2, N^2]."""
+        """Return the negative log posterior of x (K,) up to a constant; residual: squared one, (n,) [Nm^2, N^2]."""
         deviation = x - self.prior.mean
         penalty = deviation @ self.prior.precision @ deviation
         return float(((residual / self.noise.square()).sum() + penalty) / 2)

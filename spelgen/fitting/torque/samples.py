@@ -27,7 +27,7 @@ class SampleBlock(NamedTuple):
     direction: torch.Tensor | None = None
 
     def select(self, rows: slice) -> SampleBlock:
-        """Return the samples of the given rows (indices, mask or slice)."""
+        """Return the samples of a slice of rows."""
         return SampleBlock._make(None if column is None else column[rows].contiguous() for column in self)
 
 
@@ -90,7 +90,7 @@ class TorqueSamples:
         return replace(self.select(slice(None, None, step)), interval=step * self.interval)
 
     def select(self, rows: slice) -> TorqueSamples:
-        """Return the samples of the given rows (indices, mask or slice)."""
+        """Return the samples of a slice of rows."""
         return replace(self, columns=self.columns.select(rows), recordings=self.recordings[rows])
 
     def blocks(self, size: int) -> Iterator[SampleBlock]:
