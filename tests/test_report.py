@@ -275,7 +275,8 @@ def test_a_constant_entry_of_the_mass_matrix_has_the_value_in_the_table(run, rob
     model = build(robots / "rpr.urdf", "spel", width=8)
     write_model(run, model)
     entry = model.mass_matrix(torch.tensor([0.3, 0.2, 0.1]).double())[1, 1] - model.mass.armature()[1]
-    assert f'<th scope="row">M22</th><td>{entry.item():.4g}</td><td>kg</td>' in render_report(run)
+    row = rf'<th scope="row">M22</th><td[^>]*>{entry.item():.4g}</td><td[^>]*>kg</td>'
+    assert re.search(row, render_report(run))
 
 
 def test_the_report_is_available_as_json(run, robots):
