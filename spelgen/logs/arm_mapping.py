@@ -15,7 +15,7 @@ GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
 
 @runtime_checkable
 class JointNames(Protocol):
-    """Object that has the names and types of a log's joints: an arm or an emitted module.
+    """Object that has the names and types of a log's joints: an arm or a trained model.
 
     joint_types: "revolute" or "prismatic" for each joint.
     """

@@ -17,7 +17,7 @@ from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
 
 LogPaths = Path | str | Iterable[Path | str]
-"""Paths of log files and of folders with logs, or their internet addresses."""
+"""Paths of log files and of folders with logs, or their addresses (see `local`)."""
 
 UNPACK = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".xz": "unxz", ".bz2": "bunzip2"}
 FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
