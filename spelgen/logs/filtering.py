@@ -64,7 +64,9 @@ def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndar
     return np.ascontiguousarray(filtered)  # the filter returns a reversed view, which torch does not accept
 
 
-@lru_cache(maxsize=8)  # logs of a robot have few rates; a design takes as long as filtering one minute of a joint
+@lru_cache(
+    maxsize=8
+)  # logs of a robot have few rates; a design takes as long as filtering one minute of a joint
 def _sections(rate: float, cutoff: float) -> np.ndarray:
     """Return the second-order sections (S, 6) of the Butterworth filter for a sample rate and a cutoff [Hz]."""
     from scipy.signal import butter

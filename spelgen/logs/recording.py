@@ -124,7 +124,7 @@ def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> R
 def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau".
 
-    Velocities of exactly 0 are no lost samples, since drives round small velocities to 0.
+    Velocities of exactly 0 are no lost samples: a joint at rest has them.
     """
     rows = is_outlier(values, smooth=quantity == "q")
     return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
@@ -134,7 +134,7 @@ def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, 
     """Return a mask (T,) of the samples of "q", "qd" or "tau" that repeat an old value although the joint moves.
 
     A constant torque at its largest or smallest value is clipped, not stale. A constant torque at the end of a
-    recording is accepted, since the motor may have been switched off.
+    recording is accepted, since the motor may be at rest.
     """
     if quantity == "tau":
         stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
@@ -184,7 +184,7 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
     # Many rows with equal times and different values show that the resolution of the clock is too low. Up to ten such
-    # rows, or 2 %, are ascribed to the logger.
+    # rows, or 2 %, count as accidental.
     if np.count_nonzero(differs) > max(10, 0.02 * len(data)):
         t, message = _reconstructed(data[:, 0], layout)
         return np.column_stack([t, data[:, 1:]]), (*repairs, message)

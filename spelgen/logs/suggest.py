@@ -45,7 +45,12 @@ UNITS = {
     "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
-BARE = {"s", "n", "a", "m"}  # letters that are units only in brackets: as the last letter of a name they are ambiguous
+BARE = {
+    "s",
+    "n",
+    "a",
+    "m",
+}  # letters that are units only in brackets: as the last letter of a name they are ambiguous
 CURRENT = {"current", "currents", "curr", "cur"}
 
 
@@ -157,8 +162,8 @@ def _by_quantity(
 ) -> dict[str, list[ColumnName]]:
     """Return the columns per quantity, which the words in a column's name determine, or else its unit.
 
-    commands: True for logs with commanded positions "u" instead of velocities and torques. joints: names of the joints,
-    which do not count as words.
+    commands: True for logs with commanded positions "u" instead of velocities and torques. joints: names of the joints;
+    a joint's name in a column's name does not count as a word for commands, even if it is one.
     """
     by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
     names = {joint.lower() for joint in joints}
@@ -182,7 +187,9 @@ def _units(
     units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
     for quantity, named in by_joint.items():
         for column in named.values():
-            stated = UNITS.get(quantity, {}).get(column.unit)  # none for commands, whose unit is that of positions
+            stated = UNITS.get(quantity, {}).get(
+                column.unit
+            )  # none for commands, whose unit is that of positions
             if stated is None and quantity == "qd":
                 stated = {"deg": "deg/s", "rad": "rad/s"}.get(units.get("q", ""))
             if stated is None and quantity == "tau" and column.words & CURRENT:
