@@ -45,7 +45,7 @@ class BaseParameters:
         return tuple(_sum(row, column, self.parameters) for row, column in rows)
 
     def identifiability(self) -> dict[str, str]:
-        """Return the identifiability per parameter name: ``alone``, only ``in combination`` with others, or ``never``."""
+        """Return the identifiability of each parameter: ``alone``, ``in combination`` with others, or ``never``."""
         used = self.combination != 0
         alone = set(self.columns[used.sum(axis=1) == 1].tolist())
         result = dict.fromkeys(self.parameters, "never")

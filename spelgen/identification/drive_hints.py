@@ -40,15 +40,15 @@ from spelgen.runtime.body_chain import BodyChain
 
 FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
 STEPS = max(HINTS.shifts)
-SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s] time shifts of the torque for which the residual is computed
+SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s] time shifts of the torque that are compared
 
 
 class DriveSamples(NamedTuple):
     """S samples of a moving arm with n joints, and time-shifted torques.
 
     q, qd, qdd: (S, n) [rad, m, s]. bent: (S, n, K) bristle deflections, divided by the break-away displacements.
-    direction: (S, n) direction of dry friction, see `DynamicsSamples`. torques: (S, n, D) [Nm, N] joint torques, shifted
-    in time by each of the D `SHIFTS`.
+    direction: (S, n) direction of dry friction, see `DynamicsSamples`. torques: (S, n, D) [Nm, N] joint torques,
+    shifted in time by each of the D `SHIFTS`.
     """
 
     q: np.ndarray
@@ -137,8 +137,8 @@ class DriveLog:
 class Coupling:
     """Coupling of two joints: the motor of `joint` also rotates when the joint `moved_by` moves.
 
-    The speed of the motor, divided by its gear ratio, is qd[joint] + ratio * qd[moved_by]. logged_at: "joints" if the
-    logged torques are joint torques, "motors" if they are motor torques in the units of the joints.
+    The speed of the motor, in units of the joint's speed, is qd[joint] + ratio * qd[moved_by]. logged_at: "joints" if
+    the logged torques are joint torques, "motors" if they are motor torques in the units of the joints.
     """
 
     joint: int
@@ -309,7 +309,7 @@ def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: in
     # relative differences are between -1 and 1, so that no single block dominates their mean
     gains = (logged - mended) / (logged + mended)
     standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
-    # The best of hundreds of candidates is always better by chance. The significance level of 1/400 is therefore divided
-    # by the number of candidates (Bonferroni correction).
+    # The best of hundreds of candidates is always better by chance. The significance level of 1/400 is therefore
+    # divided by the number of candidates (Bonferroni correction).
     needed = -float(stdtrit(len(gains) - 1, 1 / 400 / candidates))
     return bool(gains.mean() > needed * standard_error)

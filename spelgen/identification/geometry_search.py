@@ -45,7 +45,7 @@ ANGLES = {SCALES[unit]: unit for unit in ("turns", "deg")}
 
 
 def angle_scalings(arm: Chain) -> list[Scaling]:
-    """Return the candidates that all revolute joints were logged in revolutions, or in degrees; [] without such joints."""
+    """Return the candidates for angles of all revolute joints in revolutions, and in degrees; [] if there are none."""
     turning = np.array([x.joint_type == "revolute" for x in arm.coordinates])
     ones = np.ones(len(turning))
     return [Scaling("joint-unit", np.where(turning, size, ones), ones) for size in ANGLES if turning.any()]
@@ -73,10 +73,12 @@ def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ())
 
     scalings: candidates for wrong units.
     """
-    coarse = problem.thinned(200)  # the many hypotheses are compared on few samples, and the best ones on more below
+    # the many hypotheses are compared on few samples, and the best ones below on more
+    coarse = problem.thinned(200)
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
-    # At most three changes are combined, where an order of all joints is one change: more changes could explain any log.
+    # At most three changes are combined, where an order of all joints is one change: more changes could explain any
+    # log.
     for _ in range(3):
         best = min(fits, key=_rank)
         tried = single_changes(coarse, best, scalings)
@@ -109,10 +111,10 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
 def _rescaled(
     problem: GeometryProblem, unchanged: HypothesisFit, scalings: Sequence[Scaling]
 ) -> tuple[HypothesisFit, ...]:
-    """Return a tuple with the fit of the best candidate for a torque unit if its cost is lower than unchanged, else ().
+    """Return a tuple with the fit of the best torque unit if its cost is below that of the unchanged log, else ().
 
-    No significant cost decrease is required: light bodies can explain torques that are too small, so that the cost shows
-    little. The evidence for the factor is the magnitude of gravity, from which the candidates were computed.
+    No significant cost decrease is required: light bodies can explain torques that are too small, so that the cost
+    shows little. The evidence for the factor is the magnitude of gravity, from which the candidates were computed.
     """
     fits = [problem.fit(x) for x in _scaled(problem.unchanged, scalings) if "torque-unit" in x.codes]
     best = min(fits, key=_rank, default=unchanged)
@@ -142,7 +144,7 @@ def _changed(base: Hypothesis, code: str, **changes: object) -> Hypothesis:
 
 
 def _senses(base: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield the hypotheses with opposite signs: of all torques, and for each joint of its torque, its motion, or both."""
+    """Yield the hypotheses with opposite signs: of all torques, and of one joint's torque, motion, or both."""
     yield _changed(base, "torque-sense", torque_scale=-base.torque_scale)
     for sign in 1.0 - 2.0 * np.eye(len(base.offset)):
         torque = {"torque_scale": sign * base.torque_scale}
@@ -288,8 +290,8 @@ def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[Hypothe
         new *= standard / max(float(np.linalg.norm(new)), 1e-9)
         return None if np.linalg.norm(new - gravity) < 0.01 * standard else _falling(base, new)
 
-    # gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as for an
-    # arm with only a vertical prismatic joint
+    # gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as with a
+    # vertical prismatic joint
     starts = [problem.fit(_falling(base, standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
     lowest = min(fit.cost for fit in starts)
     starts = [next(fit for fit in starts if fit.cost < lowest + GEOMETRY.rare), *([base] if size else [])]

@@ -33,8 +33,8 @@ _WEIGHTED = {
 class LeastSquares:
     """Options of a linear identification.
 
-    weights: weights of the joints' squared torque residuals: ``equal``, ``range`` (inverse variance of a joint's torque)
-    or ``noise`` (inverse variance of a joint's residual, in a few iterations). friction: friction model;
+    weights: weights of the joints' squared torque residuals: ``equal``, ``range`` (inverse variance of a joint's
+    torque) or ``noise`` (inverse variance of a joint's residual, in a few iterations). friction: friction model;
     ``FrictionModel(memory=True)`` has dry friction with hysteresis.
     """
 

@@ -147,8 +147,8 @@ class _Equations:
     ) -> np.ndarray:
         """Return the standard deviations (r,) of linear combinations of the fitted parameters by a block jackknife.
 
-        weights: (n,) weights of the joints. combination: (r, k) coefficients of the k fitted parameters in each of the r
-        combinations. See `jackknife_covariance`.
+        weights: (n,) weights of the joints. combination: (r, k) coefficients of the k fitted parameters in each of
+        the r combinations. See `jackknife_covariance`.
         """
         columns, count = solution.columns, sum(len(block.q) for block in self._blocks)
         group = np.arange(count) * BLOCKS // count  # contiguous blocks of samples
@@ -164,7 +164,8 @@ class _Equations:
                 curvature[number] += jacobian.T @ jacobian
                 descent[number] += residual[samples].ravel() @ jacobian
             first += len(tau)
-        length = np.sqrt(curvature.sum(axis=0).diagonal())  # scaled to length one, since columns differ in units
+        # columns are scaled to length one, since they have different units
+        length = np.sqrt(curvature.sum(axis=0).diagonal())
         curvature /= np.outer(length, length)
         ridge = TUNING.negligible * np.eye(len(columns))
         _, covariance = jackknife_covariance(*map(torch.from_numpy, (curvature, descent / length, ridge)))

@@ -118,7 +118,7 @@ def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> t
 
 
 def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
-    """Return the covariance (k, k), enlarged so that no variance in any direction is below that of `lower_bound` (k, k).
+    """Return the covariance (k, k), enlarged so that its variance in any direction is at least that of `lower_bound`.
 
     In coordinates in which the lower bound is the identity, eigenvalues of the covariance below one become one. The
     lower bound must be positive definite.

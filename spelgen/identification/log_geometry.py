@@ -1,9 +1,9 @@
 """Costs of hypotheses about the geometry of a log: signs and order of joints, zero offsets, units, gravity.
 
-A hypothesis is a change of the log's signals or of the arm's gravity that settings can express. The cost of a hypothesis
-is the negative log posterior of the torques, minimised over inertial parameters, friction and the noise of each joint.
-Between hypotheses that explain the torques equally well, the following terms decide: the prior of the inertial
-parameters at the URDF, and penalties for negative rotor inertia and for friction with a positive power.
+A hypothesis is a change of the log's signals or of the arm's gravity that settings can express. The cost of a
+hypothesis is the negative log posterior of the torques, minimised over inertial parameters, friction and the noise of
+each joint. Between hypotheses that explain the torques equally well, the following terms decide: the prior of the
+inertial parameters at the URDF, and penalties for negative rotor inertia and for friction that drives the motion.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Vector3 = tuple[float, float, float]
 
 
 class MotionSamples(NamedTuple):
-    """S samples of the motion and the joint torques of n joints: q, qd, qdd [rad, s; m, s], tau [Nm; N], each (S, n)."""
+    """S samples of motion and joint torques of n joints: q, qd, qdd [rad, s; m, s] and tau [Nm; N], each (S, n)."""
 
     q: np.ndarray
     qd: np.ndarray
@@ -134,9 +134,9 @@ class GeometryProblem:
         self.arm, self.speeds = arm, speeds
         self.unchanged = unchanged or Hypothesis.unchanged(arm)
         self.samples = self.unchanged.logged(samples)
-        # Number of independent errors per joint. Torque residuals of recorded arms are correlated for about 0.2 s, so
-        # that each 0.2 s count as one error. The number is at most 150, since the errors of a rigid model are systematic
-        # and do not average out in long logs.
+        # Number of independent errors per joint. Torque residuals of recorded arms are correlated for about 0.2 s,
+        # so that each 0.2 s count as one error. The number is at most 150, since the errors of a rigid model are
+        # systematic and do not average out in long logs.
         self._count = float(np.clip(seconds / 0.2, 1.0, 150.0))
         mean, precision = inertial_prior(arm)
         self._bodies = len(mean)
@@ -171,12 +171,12 @@ class GeometryProblem:
         return other
 
     def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
-        """Return the standard deviation (S, n) [Nm, N] of the model's torques, due to the covariance of the parameters."""
+        """Return the standard deviation (S, n) [Nm, N] of the model's torques due to the parameters' covariance."""
         rows, _ = self.equations(fit.hypothesis)
         return np.asarray(np.sqrt(np.einsum("snk,kl,snl->sn", rows, fit.covariance, rows, optimize=True)))
 
     def drive_parameters(self, fit: HypothesisFit) -> np.ndarray:
-        """Return the friction parameters and rotor inertias of a fit, (effects, n): one row per effect of `FRICTION`."""
+        """Return the friction parameters and rotor inertias of a fit, (effects, n), in the order of `FRICTION`."""
         return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
     def torque(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
@@ -202,9 +202,9 @@ class GeometryProblem:
     def fit(self, hypothesis: Hypothesis) -> HypothesisFit:
         """Return the fit that minimises the cost under a hypothesis, by iteratively reweighted least squares.
 
-        The noise variance of each joint is marginalised: the joint's negative log likelihood is N / 2 log(sum of squared
-        residuals). The prior of the inertial parameters is a Student t distribution, for robustness: `scale` is its
-        weight in an iteration.
+        The noise variance of each joint is marginalised: the joint's negative log likelihood is N / 2 log(sum of
+        squared residuals). The prior of the inertial parameters is a Student t distribution: `scale` is its weight in
+        an iteration.
         """
         rows, normal = self.equations(hypothesis)
         tau = hypothesis.signals(self.samples).tau
@@ -250,9 +250,10 @@ class GeometryProblem:
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the penalty for negative rotor inertias, and for friction that drives the motion on average.
 
-        A violation adds half of its squared standard score to the cost, up to a bound. The bound is needed since a drive
-        may compensate friction, and since errors of the friction model may resemble inertia: fits of recorded arms have
-        friction that drives the motion (shanghai, joint 6) or a negative rotor inertia (airbot), but not both.
+        A violation adds half of its squared standard score to the cost, up to a bound. The bound is needed since a
+        drive may compensate friction, and since errors of the friction model may resemble inertia: fits of recorded
+        arms have friction that drives the motion (shanghai, joint 6) or a negative rotor inertia (airbot), but not
+        both.
 
         Args:
             x: (K,) parameters.
@@ -275,8 +276,8 @@ class GeometryProblem:
 def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Return the prior of the inertial parameters of B bodies: mean (10 B,) and precision (10 B, 10 B).
 
-    The mean is the URDF. Errors of masses, centres of mass and inertia tensors are independent. The prior of a body
-    without <inertial> in the URDF has mean 0 and is wide.
+    The mean has the values of the URDF. Errors of masses, centres of mass and inertia tensors are independent. The
+    prior of a body without <inertial> in the URDF has mean 0 and is wide.
     """
     masses = [float(body.inertia[0]) for body in arm.bodies if body.inertia and body.inertia[0] > 0]
     typical = float(np.median(masses)) if masses else 1.0
@@ -292,8 +293,8 @@ def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
 def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
     """Return a root R (10, 10) of the prior covariance R R^T of the inertial parameters (m, m c, I) of a body.
 
-    The columns of R are the derivatives of the inertial parameters with respect to the mass (at a fixed shape and density
-    distribution), the centre of mass, and the inertia tensor about the centre of mass, each times a standard deviation.
+    The columns of R are the derivatives of the inertial parameters with respect to the mass (at a fixed shape), the
+    centre of mass, and the inertia tensor about the centre of mass, each times a standard deviation.
 
     own: (10,) inertial parameters of the body in the URDF. length: largest distance from the body's origin to a joint
     that the body carries [m]. typical: mass assumed for a body without <inertial> [kg].

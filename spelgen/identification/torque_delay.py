@@ -95,7 +95,8 @@ def delay_of(problem: DriveProblem) -> TorqueDelay:
     late, coupling = _likely_delay(problem), find_coupling(problem)
     if coupling is None:
         return late
-    # A delay may look like a coupling. If no coupling is found after removal of the delay, the delay is the explanation.
+    # A delay may look like a coupling. If no coupling is found after removal of the delay, the delay is the
+    # explanation.
     moved = problem.of_torques(problem.samples.torques @ _spline(late.delay))
     if late.delay and find_coupling(moved) is None:
         return late
@@ -118,8 +119,8 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     for dry in (samples.bent, samples.direction[..., None]):
         friction = FRICTION.columns(samples.qd, samples.qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
-    # The model without a state is always used: its errors are symmetric in time, and do not resemble a delay. Errors of a
-    # friction state do.
+    # The model without a state is always used: its errors are symmetric in time, and do not resemble a delay.
+    # Errors of a friction state do.
     memory, direct = estimates
     likely = [direct]
     # on recorded arms the squared residual of the model with a state is 0.3 to 0.8 times that of the model without
@@ -151,8 +152,8 @@ def _estimate(rows: np.ndarray) -> _Estimate:
         squares = unexplained @ products.sum(axis=1) @ unexplained
         noise = np.sqrt(np.maximum(squares / len(rows), np.square(TUNING.least_noise * least)))
     spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
-    # The delay is unknown if it is near the largest shift, where the minimum may be outside. Equal estimates without each
-    # block mean too few samples.
+    # The delay is unknown if it is near the largest shift, where the minimum may be outside. Equal estimates
+    # without each block mean too few samples.
     unknown = abs(delay) > SHIFTS[-2] or spread == 0
     standard_error = np.inf if unknown else float(np.sqrt(spread))
     return _Estimate(delay, standard_error, float((squares / least**2).sum()))

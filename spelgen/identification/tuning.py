@@ -51,7 +51,8 @@ class LogGeometryTuning:
 
     # [1] Constant added to a joint's relative residual variance: errors of friction models are 2 % of the torque.
     error_floor: float = 4e-4
-    # Smallest cost decrease of an accepted hypothesis. On recorded arms the largest decrease of a wrong hypothesis is 16.
+    # Smallest cost decrease of an accepted hypothesis. On recorded arms the largest decrease of a wrong hypothesis
+    # is 16.
     needed: float = 20.0
     # Cost difference up to which two hypotheses count as equally good, and are both reported.
     ambiguous: float = 8.0

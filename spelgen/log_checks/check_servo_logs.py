@@ -27,7 +27,7 @@ MOVING = SAMPLES.moving
 # delays of low-cost servos are below 0.2 s.
 DELAYS = np.linspace(-0.1, 0.4, 51).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
-FILTER_SAMPLES = 12  # [1] fewest samples of a gap-free piece: shorter ones are too short for the smoothing polynomial
+FILTER_SAMPLES = 12  # [1] fewest samples of a gap-free piece, which the smoothing polynomial needs
 FOLLOWS = SIGNALS.agreement
 
 
@@ -108,7 +108,7 @@ def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
 
 
 def _midpoints(x: np.ndarray) -> np.ndarray:
-    """Return the means (T - 1, ...) of neighbouring samples of x (T, ...), to match commands averaged over each step."""
+    """Return the means (T - 1, ...) of neighbouring samples of x (T, ...), to match commands averaged over steps."""
     return np.asarray((x[1:] + x[:-1]) / 2)
 
 
@@ -127,7 +127,7 @@ class ServoLogs:
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports of the joints completed by their tracking, and tables; add the findings to the summary."""
+        """Return the reports of the joints completed by their tracking, and tables; add findings to the summary."""
         names = self._arm.chain.joint_names
         saturation = np.full(len(names), np.inf)
         for k, coordinate in enumerate(self._arm.chain.coordinates):
@@ -170,9 +170,10 @@ def _odd_command(
     is_copy: bool,
     mapping: LogMapping,
 ) -> LogError | Diagnostic | None:
-    """Return the finding about the command of joint k: an error if the column cannot be its command; None if sound.
+    """Return the finding about the command of joint k; None if there is none.
 
-    is_copy: True if the logged command equals the logged position in all samples.
+    It is an error if the logged command cannot be the command of this joint. is_copy: True if the logged command
+    equals the logged position in all samples.
     """
     where = f"joint {joints[k]!r}"
     # these are at the delay with the largest correlation, so that a slow servo is not reported as a fault

@@ -108,8 +108,8 @@ class JointEvidence(NamedTuple):
         Both are NaN for a joint whose gravity torque is too small.
         """
         fit = self.report.gravity
-        # The ratio is undetermined if gravity is small. In logs of a UR10e, gravity is visible if its standard deviation
-        # is at least a fifth of the torque's.
+        # The ratio is undetermined if gravity is small. In logs of a UR10e, gravity is visible if its standard
+        # deviation is at least a fifth of the torque's.
         if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < 0.2:
             return nan, nan  # every comparison with NaN is false
         return fit.factor, fit.correlation
@@ -165,9 +165,9 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
 
 
 def _rounded(factor: float) -> float:
-    """Return a factor rounded to 0.001 if it is near, else to one significant digit if this changes it by < 10 %, or two.
+    """Return a rounded factor: 0.001, from mNm to Nm, if it is close; else with one significant digit, or with two.
 
-    The factor 0.001 converts mNm to Nm.
+    One digit is enough if it changes the factor by less than 10 %.
     """
     if 1 / 1.5 < factor / 1e-3 < 1.5:
         return 1e-3  # a tolerance of 50 %, since the factor is only as exact as the masses of the URDF
@@ -188,7 +188,7 @@ def find_beyond_drive(joint: JointEvidence) -> str | None:
 def find_coarse(joint: JointEvidence) -> str | None:
     """Find signals whose quantisation step is a large fraction of the range of the signal."""
     for name in QUANTITIES:
-        # compared with the range, since a step of 0.01 Nm is negligible for a shoulder but may be a wrist's whole torque
+        # compared with the range: a step of 0.01 Nm is negligible for a shoulder but may be the whole torque of a wrist
         step, width = joint.report.steps[name], joint.report.high[name] - joint.report.low[name]
         if step is not None and has_few_levels(step, width):
             return (

@@ -88,7 +88,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
 
 
 def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
-    """Return a mapping as a LogMapping; keys that a file or a dict does not have are from the arm's settings, `stated`."""
+    """Return a mapping as a LogMapping; keys that a file or a dict does not have are from the settings, `stated`."""
     # a LogMapping is complete and replaces the mapping of the settings; a file or a dict overrides single keys
     if isinstance(mapping, LogMapping):
         return mapping

@@ -17,11 +17,8 @@ from spelgen.logs.tables import LogFormat, LogTable, table_layout
 from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
-STAMP = (
-    "sec",
-    "nanosec",
-    "frame_id",
-)  # first columns that `ros2 topic echo --csv` writes: the message's header
+# first columns that `ros2 topic echo --csv` writes: the header of the message
+STAMP = ("sec", "nanosec", "frame_id")
 
 
 class Beginning(NamedTuple):

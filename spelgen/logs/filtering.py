@@ -42,7 +42,10 @@ def low_passed(t: np.ndarray, signals: np.ndarray, cutoff: float) -> np.ndarray:
 
 
 def interpolated(t: np.ndarray, signals: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return signals, given as (T, ...) at times t (T,), at other `times`, by a cubic spline; unchanged at equal times."""
+    """Return signals (T, ...) at times t (T,), interpolated by a cubic spline at other `times`.
+
+    If both times are equal, the signals are returned unchanged.
+    """
     if len(t) == len(times) and np.abs(t - times).max() < 1e-6 / _mean_rate(t):
         return signals
     from scipy.interpolate import CubicSpline
@@ -55,7 +58,7 @@ def _mean_rate(t: np.ndarray) -> float:
 
 
 def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
-    """Return signals (T, ...) of a constant sample rate [Hz], filtered by the zero-phase low-pass with a cutoff [Hz]."""
+    """Return signals (T, ...) of a constant rate [Hz], filtered by the zero-phase low-pass with a cutoff [Hz]."""
     from scipy.signal import sosfiltfilt
 
     # signals are extended at both ends by three periods of the cutoff, which reduces the transients of the filter
@@ -64,9 +67,8 @@ def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndar
     return np.ascontiguousarray(filtered)  # the filter returns a reversed view, which torch does not accept
 
 
-@lru_cache(
-    maxsize=8
-)  # logs of a robot have few rates; a design takes as long as filtering one minute of a joint
+# cached: a design takes as long as filtering one minute of a joint, and the logs of a robot have few rates
+@lru_cache(maxsize=8)
 def _sections(rate: float, cutoff: float) -> np.ndarray:
     """Return the second-order sections (S, 6) of the Butterworth filter for a sample rate and a cutoff [Hz]."""
     from scipy.signal import butter

@@ -49,9 +49,10 @@ def mapping_line(keys: Mapping[str, object]) -> str:
 
 
 def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str]) -> dict[str, object]:
-    """Return the settings of joints as settings of the group `logs`; units that all joints share become the log's units.
+    """Return the settings of joints as settings of the group `logs`.
 
-    entries: settings per joint. joints: names of all joints.
+    If all joints have the same unit as their only setting, it becomes the unit of the log. entries: settings per
+    joint. joints: names of all joints.
     """
     first = next(iter(entries.values()))
     if first.keys() == {"units"} and all(entries.get(joint) == first for joint in joints):
@@ -133,7 +134,7 @@ def is_factor(value: float, unit: float) -> bool:
 
 
 def find_frozen(signals: JointSignals) -> str | Advice | None:
-    """Find frozen signals: a constant q while qd shows motion, a constant qd while q changes, and repeated old values."""
+    """Find frozen signals: a constant q while qd shows motion, a constant qd while q changes, or repeated values."""
     from scipy.integrate import cumulative_trapezoid
 
     # [rad, m] motion of 0.05 in one of q and qd proves that the other one, if constant, is frozen

@@ -1,7 +1,7 @@
 """Detection of jumps of logged signals: lost samples, outliers, wrapped angles, register words, repeated rows.
 
-The functions apply to one signal (T,) or to the columns of a log (T, C), for logs of any format and any robot. A step is
-the difference between neighbouring samples; the typical step is the median magnitude of the nonzero steps.
+The functions apply to one signal (T,) or to the columns of a log (T, C), for logs of any format and any robot. A step
+is the difference between neighbouring samples; the typical step is the median magnitude of the nonzero steps.
 """
 
 from itertools import pairwise

@@ -13,9 +13,7 @@ from spelgen.logs.tables import LogFormat, LogTable, missing_columns, stored_col
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-JOINT_NAMES = (
-    "joints"  # name of an optional array that contains the joints' names, in the order of matrix columns
-)
+JOINT_NAMES = "joints"  # name of an optional array with the names of the joints in the columns of matrices
 TRAJECTORY = "{trajectory}"
 
 

@@ -52,7 +52,7 @@ class LogSegments:
         self._bytes = self._recordings = self._count = 0
 
     def add(self, layout: Layout, table: pa.Table) -> None:
-        """Add the recordings of a table. Raises LogError if it has no rows, and for kept values that are not numbers."""
+        """Add the recordings of a table. Raises LogError if it is empty, and for kept values that are not numbers."""
         if not table.num_rows:
             raise LogError("no rows", file=layout.file, expected="at least one window of samples")
         start, pieces = clock_start(table, layout), []

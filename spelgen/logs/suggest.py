@@ -45,12 +45,7 @@ UNITS = {
     "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
-BARE = {
-    "s",
-    "n",
-    "a",
-    "m",
-}  # letters that are units only in brackets: as the last letter of a name they are ambiguous
+BARE = {"s", "n", "a", "m"}  # letters that are units only in brackets, since they are ambiguous otherwise
 CURRENT = {"current", "currents", "curr", "cur"}
 
 
@@ -94,7 +89,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     # the order of the joints in the log is read from cells with names: loggers differ, and ROS often sorts by name
     order = _order_in_cells(table, joints)
     by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in columns_of.items()}
-    # if a joint has no velocity, all velocities are differentiated, since a mapping has velocities of all joints or none
+    # a mapping has velocities of all joints or none: if one is missing, all velocities are differentiated
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)
@@ -187,9 +182,8 @@ def _units(
     units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
     for quantity, named in by_joint.items():
         for column in named.values():
-            stated = UNITS.get(quantity, {}).get(
-                column.unit
-            )  # none for commands, whose unit is that of positions
+            # commands have no unit of their own: the unit of positions applies to them
+            stated = UNITS.get(quantity, {}).get(column.unit)
             if stated is None and quantity == "qd":
                 stated = {"deg": "deg/s", "rad": "rad/s"}.get(units.get("q", ""))
             if stated is None and quantity == "tau" and column.words & CURRENT:

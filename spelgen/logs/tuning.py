@@ -73,7 +73,7 @@ FAST = 1.002
 
 
 def shows_accelerations(rate: float) -> bool:
-    """Return True if accelerations can be computed from logs of this sample rate [Hz]: three samples per filter period."""
+    """Return True if accelerations can be computed from logs of this sample rate [Hz]: 24 Hz by default or more."""
     return rate * FAST >= SLOWEST
 
 

@@ -129,7 +129,7 @@ class Split(NamedTuple):
 
 
 def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: int) -> Split:
-    """Split trajectories into training and validation: a random `fraction` of the trajectories, at least one, validates.
+    """Split trajectories into training and validation: a random `fraction` of them, at least one, is for validation.
 
     A single trajectory is cut in time; its last part, a `fraction` of its duration, is used for validation.
     """
@@ -145,7 +145,7 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
         note = Diagnostic("info", "validation-split", "logs", None, message)
         last = replace(trajectory[cut:], name=trajectory.name + LAST_PART)
         return Split((trajectory[:cut],), (last,), note)
-    # trajectories are not cut, since windows on both sides of a cut have nearly the same states
+    # whole trajectories are set aside, since neighbouring windows of a trajectory have common samples
     count = min(max(1, round(fraction * total)), total - 1)
     training, validation = set_aside(trajectories, np.random.default_rng(seed).permutation(total)[:count])
     names = ", ".join(x.name for x in validation) if count <= 3 else f"{count} of {total} trajectories"
