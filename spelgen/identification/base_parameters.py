@@ -19,7 +19,7 @@ from spelgen.structure.base_parameters import base_parameters as body_base_param
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """The r base parameters of a model with K parameters: ten per body, then those of friction and drives.
+    """The r base parameters of a model with K parameters: ten per body, then friction and drives.
 
     Attributes:
         names: names of the r base parameters.
@@ -27,7 +27,7 @@ class BaseParameters:
             independent.
         combination: (r, K) matrix with base parameters = combination @ parameters; row k is 1 in column `columns[k]`.
         parameters: names of the K parameters.
-        bodies: number of base parameters of bodies, which precede those of friction and drives.
+        bodies: number of base parameters of bodies; they precede the base parameters of friction and drives.
     """
 
     names: tuple[str, ...]

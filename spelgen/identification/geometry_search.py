@@ -111,7 +111,7 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
 def _rescaled(
     problem: GeometryProblem, unchanged: HypothesisFit, scalings: Sequence[Scaling]
 ) -> tuple[HypothesisFit, ...]:
-    """Return a tuple with the fit of the best torque unit if its cost is below that of the unchanged log, else ().
+    """Return a tuple with the fit of the best torque unit if its cost is below the unchanged log's cost, else ().
 
     No significant cost decrease is required: light bodies can explain torques that are too small, so that the cost
     shows little. The evidence for the factor is the magnitude of gravity, from which the candidates were computed.

@@ -193,7 +193,7 @@ class _Equations:
         squares = triangles.squares(solution.parameters) / triangles.count
         combination = base.combination[:, base.columns]
         std = solution.deviations(triangles, used**2 * noise, combination)
-        # no jackknife if the samples leave some parameters undetermined: fits without a block would be singular
+        # no jackknife if some parameters are undetermined: fits without a block would be singular
         if solution.rank == len(base) and triangles.count >= BLOCKS * MIN_BLOCK:
             std = np.maximum(
                 std, student_scale(BLOCKS) * self._jackknife(method.friction, solution, used, combination)

@@ -99,7 +99,7 @@ def student_scale(blocks: int) -> float:
 def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     """Return the block-jackknife covariance of a MAP estimate of k parameters, and the jackknife's steps.
 
-    The first value (B, k) is the Newton step of the estimate when each of the B blocks is left out. The second value
+    The first value (B, k) has the Newton step of the estimate for the removal of each of the B blocks. The second value
     (k, k) is the covariance J + S^-1 P S^-1, with the jackknife covariance J of these steps and the Hessian S of all
     blocks and the prior. Errors of samples may be correlated within blocks, and their variance may differ between
     blocks (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
@@ -118,7 +118,7 @@ def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> t
 
 
 def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
-    """Return the covariance (k, k), enlarged so that its variance in any direction is at least that of `lower_bound`.
+    """Return the covariance (k, k), enlarged so that its variance in each direction is not below `lower_bound`.
 
     In coordinates in which the lower bound is the identity, eigenvalues of the covariance below one become one. The
     lower bound must be positive definite.

@@ -67,7 +67,7 @@ def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
 def normal_solution(products: np.ndarray, targets: int) -> np.ndarray:
     """Return the least-squares parameters (..., K, D) for D target columns from Gram matrices (..., K + D, K + D).
 
-    The Gram matrices are those of K regressor columns followed by the D = `targets` target columns.
+    The Gram matrices belong to K regressor columns, followed by the D = `targets` target columns.
     """
     # Columns are scaled to length one: they have different units (kg, kg m^2), and the Gram matrix squares the
     # condition number.
@@ -83,7 +83,7 @@ class Solution:
     """Solution of weighted linear least squares for r of K parameters.
 
     Attributes:
-        parameters: (K,) all parameters; those that are not fitted are zero.
+        parameters: (K,) all parameters; zero for parameters that are not fitted.
         columns: (r,) indices of the fitted parameters.
         covariance: (r, r) covariance of the fitted parameters if the errors are independent and the weights are the
             inverse standard deviations of the errors.

@@ -123,7 +123,7 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     # Errors of a friction state do.
     memory, direct = estimates
     likely = [direct]
-    # on recorded arms the squared residual of the model with a state is 0.3 to 0.8 times that of the model without
+    # on recorded arms the squared residual with a friction state is 0.3 to 0.8 times the squared residual without
     if memory.squares <= 2.0 * direct.squares:
         likely.append(memory)
     best = min(likely, key=lambda x: x.squares)

@@ -176,7 +176,7 @@ def _odd_command(
     equals the logged position in all samples.
     """
     where = f"joint {joints[k]!r}"
-    # these are at the delay with the largest correlation, so that a slow servo is not reported as a fault
+    # correlation and gain at the delay with the largest correlation, so that a slow servo is not reported as a fault
     correlation, gain = following.correlation[k, k], following.gain[k]
     if is_copy:
         code, message = (

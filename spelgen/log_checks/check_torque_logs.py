@@ -216,7 +216,8 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointEvidence]) 
     confirmed = []
     for k in suspicious:
         cost = problem.without_gravity(k).fit(problem.unchanged).cost
-        # also if the fit with gravity leaves a tenth of the torque's variance as residual: it is no model of this joint
+        # also confirmed if the residual with gravity has a tenth of the torque's variance: then the URDF's gravity is
+        # not in this torque
         if fit.errors[k] > 0.1 or cost < fit.cost:
             confirmed.append(joints[k])
     return confirmed

@@ -30,8 +30,8 @@ class GravityFit:
             None if gravity never loads the joint, if the torque is constant, or if there are too few samples.
         factor: least-squares ratio of the torque to the gravity torque of the URDF.
         correlation: correlation of the torque with the gravity torque of the URDF.
-        relative_deviation: standard deviation of the URDF's gravity torque, divided by that of the torque, both
-            without the removal.
+        relative_deviation: standard deviation of the URDF's gravity torque, divided by the standard deviation of the
+            torque, both before the removal.
     """
 
     explained: float | None = None

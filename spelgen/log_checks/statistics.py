@@ -76,8 +76,8 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the standard deviation (n,) of the white noise on smooth signals `values` (T, n) at times t (T,) [s].
 
     The noise is computed from third divided differences, which are small for smooth motion and valid for uneven time
-    steps. They are normalised, so that their standard deviation is that of the noise, and the median of their
-    magnitudes is robust against outliers.
+    steps. They are normalised, so that white noise has the same standard deviation in them as in the signal. The median
+    of their magnitudes is robust against outliers.
     """
     times = sliding_window_view(t, 4)  # (T - 3, 4)
     distances = times[:, :, None] - times[:, None, :] + np.eye(4)

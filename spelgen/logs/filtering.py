@@ -110,6 +110,6 @@ def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
     samples = q.shape[-2]
     # the span of 0.18 s was chosen on logs of an SO-101: shorter spans are noisier, longer ones smooth the motion
     width = 2 * round(0.18 * rate / 2) + 1
-    # the filter needs an odd width of at least five samples for a cubic, and at most the number of samples
+    # the filter needs an uneven width of at least five samples for a cubic, and at most the number of samples
     width = min(max(5, width), samples - 1 + samples % 2)
     return np.asarray(savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2))

@@ -56,7 +56,7 @@ class Preprocessing:
 
     @property
     def acceleration_cutoff(self) -> float | None:
-        """Cutoff [Hz] of the low-pass for samples with accelerations; None: no filter."""
+        """Cutoff [Hz] of the low-pass filter for samples with accelerations; None: no filter."""
         if self.cutoff is None:
             return TUNING.automatic_cutoff
         return self.cutoff or None

@@ -253,7 +253,7 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
     """
     samples = trajectory.t[rows]
     earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)
-    # the first row is that of the command that was held at the earliest delayed time
+    # the first row has the command that was held at the earliest delayed time
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
     previous = np.concatenate([u[:1], u[:-1]])  # the command held until each sample

@@ -74,7 +74,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
 
 
 def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float, dict[str, Any]]]:
-    """Yield a distance and the settings of the joint, for all combinations of units that its mapping leaves open.
+    """Yield a distance and the settings of the joint, for all combinations of units that its mapping does not state.
 
     The distance is |log r|, where r is the ratio of dq/dt to qd with these units, plus a penalty for units other than
     SI. is_far: True if the range of q is more than two turns.
@@ -178,7 +178,7 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
 
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Find velocities without sign: qd is |dq/dt|."""
-    # share: a signal counts as one without sign if its velocities of one sign are below 5 % of those of the other sign
+    # share: qd has no sign if its extreme velocity of one sign is below 5 % of its extreme velocity of the other sign
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
     lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
     # velocities of both signs are not magnitudes, and differentiated ones cannot lack their sign

@@ -83,8 +83,8 @@ def cut_windows(
         stride: number of samples of a piece from the start of a window to the start of the next window.
         decimation: number of samples of a piece from one sample of a window to the next.
         measured: False: tau[k] is constant from t[k] to t[k+1], as in a simulation with zero-order hold. True: tau[k]
-            was measured at t[k], and the torque between two samples is the mean of both; tau[k] alone would be delayed
-            by half a sample.
+            was measured at t[k], and the torque between two samples is the mean of both; without this mean
+            torques would be delayed by half a sample.
         reach: (n, B) break-away displacements of the bristles whose states z are computed, starting from zero at the
             start of each piece; None: z is not computed.
 
