@@ -1,8 +1,8 @@
 """Detection of signals at a limit: clipped torques, and positions at a mechanical stop.
 
-At a limit a signal is constant at its largest or smallest value: it has a flat top. But a flat top is no proof of a limit,
-since torques are also constant at rest and during uniform acceleration. It is a limit if, in addition, the torque
-contradicts the least-squares model of all samples outside flat tops.
+At a limit a signal is constant at its largest or smallest value: it has a flat top. But a flat top is no proof of a
+limit, since torques are also constant at rest and during uniform acceleration. It is a limit if, in addition, the
+torque contradicts the least-squares model of all samples outside flat tops.
 """
 
 from __future__ import annotations

@@ -61,7 +61,8 @@ def read_bounded_logs(
 ) -> BoundedLogs:
     """Return the logs like `read_logs`, reduced to evenly spread segments if they exceed `LogTuning.kept_bytes`.
 
-    Files are read and reduced one at a time, so that only the largest file and the kept samples need to fit into memory. A reduced recording has gaps between its segments. The selection is deterministic. Raises the errors of
+    Files are read and reduced one at a time, so that only the largest file and the kept samples need to fit into
+    memory. A reduced recording has gaps between its segments. The selection is deterministic. Raises the errors of
     `read_logs`, but only for rows that are kept.
     """
     segments = LogSegments(TUNING.kept_bytes)
@@ -110,9 +111,9 @@ def _read(
 def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: LoggedArm) -> Path:
     """Write trajectories to one Parquet or CSV file, as the suffix of the path states; return the path.
 
-    The file is complete, or not written if an error occurs. The column `trajectory` contains the names of the trajectories. `read_logs`
-    returns the same numbers from both formats. arm: see `read_logs`. Raises LogError for another suffix, if there are
-    no trajectories, and for trajectories whose number of joints differs from the arm's.
+    The file is complete, or not written if an error occurs. The column `trajectory` contains the names of the
+    trajectories. `read_logs` returns the same numbers from both formats. arm: see `read_logs`. Raises LogError for
+    another suffix, if there are no trajectories, and for trajectories whose number of joints differs from the arm's.
     """
     path, joints = Path(path), log_source(arm).joints
     if path.suffix not in (".parquet", ".csv"):
