@@ -78,7 +78,7 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
         for k, weight in parameter.weights:
             combination[row, k] = float(weight)
     drives = np.linalg.lstsq(columns[:, chosen], columns[:, inertial:], rcond=None)[0]
-    drives[np.abs(drives) < 1e-8 * np.abs(drives).max(initial=1.0)] = 0.0  # rounding
+    drives[np.abs(drives) < 1e-8 * np.abs(drives).max(initial=1.0)] = 0.0  # rounding errors
     combination[:, inertial:] = drives
     base_names = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :].tolist()]
     return BaseParameters(tuple(base_names), chosen, combination, tuple(names), len(exact))

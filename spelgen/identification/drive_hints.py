@@ -64,7 +64,7 @@ class DriveSamples(NamedTuple):
         return self.torques[..., STEPS]
 
     def thinned(self, stride: int) -> DriveSamples:
-        """Return every `stride`-th sample."""
+        """Return a subset that contains every `stride`-th sample."""
         return DriveSamples(*(column[::stride] for column in self))
 
 

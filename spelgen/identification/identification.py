@@ -50,7 +50,7 @@ class Identification:
         arm: the arm with its URDF parameters.
         method: options of the identification.
         base: base parameters of the arm.
-        parameters: (K,) parameters with the fitted torques; those outside the base columns are zero.
+        parameters: (K,) fitted parameters; parameters outside the base columns are zero.
         values: (r,) values of the base parameters.
         deviations: (r,) standard deviations of the base parameters.
         condition: condition number of the regressor, with columns of length one and weighted joints.
@@ -176,7 +176,7 @@ class Identification:
         )
 
     def quality(self) -> str:
-        """Return two sentences: the condition number, and the numbers of parameters that are firm, fair, weak, ...."""
+        """Return two sentences: the condition number, and the number of parameters in each class of precision."""
         conditioned = f"Condition number {self.condition:.3g} (columns of length one): "
         if self.unseen:
             conditioned = (
@@ -197,7 +197,7 @@ class Identification:
 def identified_dynamics(
     arm: Chain, friction: FrictionModel, parameters: np.ndarray, drives: Drives
 ) -> RegressorDynamics:
-    """Return the dynamics of an arm with other parameters (K,): inertial parameters of the bodies, then friction."""
+    """Return the dynamics of an arm with these parameters (K,): bodies, then friction and rotor inertias."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)
     reach = reach_of(arm.joint_types).values if friction.memory else None

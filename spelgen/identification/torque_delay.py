@@ -43,7 +43,7 @@ class TorqueDelay:
 
     @property
     def notes(self) -> list[Diagnostic]:
-        """Message about the delay, or about a coupling that prevents the estimation of the delay; [] without both."""
+        """Message about the delay, or about a coupling that prevents the estimation of the delay; [] if there is neither."""
         if self.coupling is not None:
             joint, other = (number + 1 for number in self.coupling[0].pair)
             message = (
@@ -119,7 +119,7 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     for dry in (samples.bent, samples.direction[..., None]):
         friction = FRICTION.columns(samples.qd, samples.qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
-    # The model without a state is always used: its errors are symmetric in time, and do not resemble a delay.
+    # The model without a state is always used: its errors are symmetric and do not resemble a delay.
     # Errors of a friction state do.
     memory, direct = estimates
     likely = [direct]
@@ -185,5 +185,5 @@ _cardinal = CubicSpline(SHIFTS, np.eye(len(SHIFTS)))
 
 
 def _spline(delay: float) -> np.ndarray:
-    """Return the weights (D,) of the shifted torques, whose sum is the torque shifted by a delay [s]."""
+    """Return the spline weights (D,): the weighted sum of the D shifted torques is the torque shifted by `delay` [s]."""
     return np.asarray(_cardinal(delay))

@@ -59,7 +59,7 @@ class JointFollowing:
 
 @dataclass(frozen=True)
 class JointReport:
-    """Statistics of one joint over all trajectories, in SI units; None for unknown ones.
+    """Statistics of one joint over all trajectories, in SI units; unknown ones are None.
 
     The dicts have the keys "q", "qd" and "tau" or, for logs of commands, "q", "qd" and "u".
 

@@ -69,7 +69,7 @@ def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
     is_rounding = lengths <= TUNING.dependent * np.linalg.norm(signals, axis=0)
     largest = max(1.0, float(np.abs(signals[:, 2:]).max(initial=0.0)))
     is_seen = lengths[2:] > TUNING.dependent * largest * np.sqrt(len(signals))
-    # nothing can be fitted for a motor that is off, with a constant torque, or about a vertical axis, without gravity
+    # gravity cannot be fitted to a constant torque, as of a motor that is off, and does not load a vertical axis
     if is_rounding[0] or not is_seen.any():
         return GravityFit()
     torque, load = remainders[:, 0], remainders[:, 1]

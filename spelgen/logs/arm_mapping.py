@@ -1,4 +1,4 @@
-"""The joints of logs and the mapping of their columns, from an arm, a model, or names of joints."""
+"""Joints of logs and mapping of the logs' columns, determined from an arm, a model, or a list of joint names."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,7 +28,10 @@ class JointNames(Protocol):
 
 @runtime_checkable
 class DescribedArm(Protocol):
-    """Loaded arm with the settings of its logs. turning_joints: names of revolute joints without position limits."""
+    """Loaded arm with settings that describe the arm's logs.
+
+    turning_joints: names of revolute joints without position limits.
+    """
 
     @property
     def chain(self) -> JointNames: ...

@@ -1,4 +1,4 @@
-"""Checks of logs that need no robot: frozen columns, inconsistent velocities, degrees, gaps. Nothing is repaired.
+"""Checks of logs that need no robot: frozen columns, wrong velocities, degrees, gaps. The logs are not changed.
 
 A check consists of a code, a severity and a function of the checked object, and is registered in CHECKS. Trajectories
 are checked one at a time, so that only one of them need be in memory. The checks that need the robot are in the package
@@ -130,14 +130,14 @@ def find_constant_torque(signals: JointSignals) -> str | None:
 
 
 def find_rest(signals: JointSignals) -> str | None:
-    """Find joints that do not move."""
+    """Find a joint whose position never changes in a trajectory."""
     if np.ptp(signals.q) > 0:
         return None
     return "does not move: the logs do not excite its dynamics"
 
 
 def find_gaps(trajectory: Trajectory) -> str | None:
-    """Find gaps in the sample times."""
+    """Find gaps in the sample times: time steps that are much longer than the median step."""
     gaps = len(gap_ends(trajectory.t)) - 2
     if not gaps:
         return None

@@ -39,7 +39,7 @@ class DynamicsSamples:
     rate: float = field(default=FREQUENCY, kw_only=True)
 
     def __getitem__(self, rows: slice) -> DynamicsSamples:
-        """Return the samples of these rows."""
+        """Return the samples in a slice of rows; a step of the slice lowers the sample rate."""
         z = None if self.z is None else self.z[rows]
         direction = None if self.direction is None else self.direction[rows]
         motion = self.q[rows], self.qd[rows], self.qdd[rows], self.tau[rows]
@@ -57,12 +57,13 @@ def dynamics_samples(
 
     Trajectories whose sample rate is too low for accelerations are omitted.
 
-    Each gap-free piece is brought to 100 Hz (logs from 24 Hz on are interpolated, see `resampled`). The zero-phase
-    low-pass of ``preprocessing``, by default of 8 Hz, is applied to q, qd and tau at the higher of the two rates, and
-    its transients at both ends are removed. qdd is the central difference of the filtered qd.
+    Each gap-free piece is resampled to 100 Hz; the sample rate of a log must be at least 24 Hz, see `resampled`. The
+    zero-phase low-pass of ``preprocessing``, by default with a cutoff of 8 Hz, is applied to q, qd and tau at the
+    higher of both sample rates, and the transients of the filter at both ends are removed. qdd is the central
+    difference of the filtered qd.
 
-    pauses: return all samples from the first to the last motion, standstill between them included. reach: break-away
-    displacements of the bristles whose states z are computed, with the same filter; see ``bristles_along``.
+    pauses: True: return all samples from the first to the last motion, including standstill. reach: break-away
+    displacements of the bristles whose states z are computed and filtered like tau; see ``bristles_along``.
     """
     samples = []
     for trajectory in preprocessing.moved(trajectories):
@@ -91,7 +92,7 @@ def _columns(
     """Return the columns of `DynamicsSamples` for one piece, at the samples at which a joint moves.
 
     The columns are q, qd, qdd, tau (T, n) and, if `reach` is given, z (T, n, K) and the direction of friction (T, n).
-    cutoff: of the low-pass filter [Hz]; None: no filter.
+    pauses: see `dynamics_samples`. cutoff: cutoff of the low-pass filter [Hz]; None: no filter.
     """
     rate, times, t = piece.sample_rate, piece.t, regular_times(piece.t, FREQUENCY)
     is_denser = rate > 1.5 * FREQUENCY

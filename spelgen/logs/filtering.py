@@ -14,9 +14,8 @@ from spelgen.logs.tuning import is_dense
 def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
     """Return a gap-free trajectory with q, qd and tau filtered by a zero-phase Butterworth low-pass.
 
-    cutoff: [Hz]. All signals have the same filter, since the equation of a linear system remains valid if its input and
-    output are filtered equally.
-    Raises LogError if the sample rate is too low for this cutoff.
+    cutoff: cutoff frequency [Hz]. All signals have the same filter, since the equation of a linear system remains
+    valid if its input and output are filtered equally. Raises LogError if the sample rate is too low for this cutoff.
     """
     t = trajectory.t
     require_cutoff(trajectory, _mean_rate(t), cutoff)

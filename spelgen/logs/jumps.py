@@ -202,7 +202,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        # the range of overflowing words is one period (1 % for noise); words with a sign bit exceed this bit
+        # words that overflow have a range of one period (plus 1 % for noise); negative words exceed the sign bit
         readings = []
         if np.ptp(values) < 1.01 * size:
             readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))
@@ -210,7 +210,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
             jumps = np.abs(np.diff(reading.values))
-            # a step of fast motion, or across a gap, only becomes one period smaller, and remains large
+            # a wrong decoding is rejected: it shortens large steps of motion by one period, but leaves them large
             if np.median(jumps[rows]) > TUNING.jump * usual:
                 continue
             bends = np.abs(np.diff(reading.values, 2))

@@ -31,7 +31,7 @@ class NpzArrays:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
             member = self._members[name]
-            # the size in the file's directory is reliable as a bound: zipfile does not read more
+            # the size that the archive states is a reliable bound, since zipfile does not read more of a member
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
                 got, expected = (

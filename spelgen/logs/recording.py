@@ -64,7 +64,7 @@ def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping
         count = jump_count(column, period)
         result = unwrapped(column, period)
         if quantity == "u":
-            # registers of commands and of positions may start in different revolutions: the median difference of the
+            # Registers of commands and of positions may start in different revolutions: the median difference of the
             # unwrapped signals is reduced to less than half a period
             result = result - period * np.round(np.median(result - values["q", joint]) / period)
         # an angle that does not wrap keeps its logged revolution; all other signals are centred about zero
@@ -141,7 +141,7 @@ def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, 
         return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
     from scipy.integrate import cumulative_trapezoid  # takes long to import
 
-    # a frozen q or qd makes the integral of qd drift from q: by more than 0.05 rad or m it is stale
+    # if q or qd is frozen, the integral of qd drifts from q; a drift of more than 0.05 rad or m is evidence
     return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)
 
 

@@ -18,7 +18,7 @@ from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
 UNITS_KEY = b"units"  # key in the metadata of a Parquet file under which it declares its units
-UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # omitted for declared units
+UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # checks of units
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # declaration of units in files that spelgen wrote
 
 # types of the errors that Arrow, NumPy and zipfile raise for damaged files
@@ -111,6 +111,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     if labels and pa.types.is_nested(schema.field(labels).type):
         got = f"values of type {schema.field(labels).type}"
         raise LogError(got, file=file, element=f"column {labels}", expected="names")
+    # units that the file declares are not checked
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
