@@ -43,7 +43,7 @@ class TorqueDelay:
 
     @property
     def notes(self) -> list[Diagnostic]:
-        """Message about the delay, or about a coupling that prevents the estimation of the delay; [] if there is neither."""
+        """Message about the delay, or about a coupling that prevents the estimation of a delay; [] if none is found."""
         if self.coupling is not None:
             joint, other = (number + 1 for number in self.coupling[0].pair)
             message = (
@@ -185,5 +185,5 @@ _cardinal = CubicSpline(SHIFTS, np.eye(len(SHIFTS)))
 
 
 def _spline(delay: float) -> np.ndarray:
-    """Return the spline weights (D,): the weighted sum of the D shifted torques is the torque shifted by `delay` [s]."""
+    """Return weights (D,): the weighted sum of the D shifted torques is the torque shifted by `delay` [s]."""
     return np.asarray(_cardinal(delay))

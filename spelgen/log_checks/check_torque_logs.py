@@ -86,7 +86,7 @@ class TorqueLogs:
         for coordinate, report, gravity in zip(chain.coordinates, reports, fits, strict=True):
             completed.append(replace(report, gravity=gravity))
             evidence.append(JointEvidence(coordinate, completed[-1]))
-        # with wrong velocities the fitted friction would be wrong, and with other errors the hints about drives
+        # the model is fitted only to sound logs: wrong velocities give wrong friction, and other faults wrong hints
         is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)

@@ -210,7 +210,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
             jumps = np.abs(np.diff(reading.values))
-            # a wrong decoding is rejected: it shortens large steps of motion by one period, but leaves them large
+            # a wrong decoding is rejected: it shortens large steps of motion by one period, but they remain large
             if np.median(jumps[rows]) > TUNING.jump * usual:
                 continue
             bends = np.abs(np.diff(reading.values, 2))

@@ -127,7 +127,7 @@ def time_unit(step: float) -> str | None:
 def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     """Find velocities that are not the derivative of the positions, and a sign or other columns that fit better."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
-    # times in a wrong unit also give wrong velocities: the check of times reports them
+    # times in a wrong unit also make dq/dt wrong; the check of times reports this cause
     if signals.step > SIGNALS.slowest_step:
         return None
     if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
