@@ -251,7 +251,7 @@ def test_what_is_no_run_is_refused(run, tmp_path):
     with pytest.raises(RunError) as caught:
         evaluate(tmp_path / "none", [])
     assert str(caught.value) == (
-        f"{tmp_path}/none: got no such run, expected a folder with config.json; spelgen train"
+        f"{tmp_path}/none: got no such run, expected a folder with config.json; make one with `spelgen train`"
     )
     with pytest.raises(LogError, match="got no such file or folder, expected a log; check the path"):
         read_test_logs(run, [tmp_path / "none.parquet"])

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import sys
 import textwrap
 import tracemalloc
@@ -13,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+import yaml
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
@@ -460,6 +462,17 @@ def test_names_of_a_bag_are_mapped(bag):
         read_logs([folder], JOINTS)
 
 
+def test_the_line_that_maps_prefixed_names_of_a_bag_is_right(bag):
+    folder = bag([(topic, [f"left_{name}" for name in names], *values) for topic, names, *values in STATES])
+    with pytest.raises(LogError) as caught:
+        read_logs([folder], JOINTS)
+    (line,) = re.findall(r"write '(.*)' under 'logs'", str(caught.value))
+    mapping = LogMapping.model_validate(yaml.safe_load(f"{{{line}}}"))
+    check(read_logs([folder], JOINTS, mapping=mapping)[0], "bag", rtol=1e-12)
+    with pytest.raises(LogError, match=r"messages of ROS, .* other names of joints are mapped by 'name'"):
+        suggest_mapping(folder, JOINTS)
+
+
 def test_of_several_topics_one_is_named(bag):
     folder = bag([*STATES, ("/other", JOINTS, [0, 0], [0, 0], [0, 0])])
     with pytest.raises(LogError) as caught:
@@ -494,7 +507,8 @@ def test_a_pipe_in_a_bag_is_not_waited_for(bag):
 BAD_BAGS = {
     "part": (
         [("/a", JOINTS[:1], [0.0], [0.0], [0.0])],
-        "{}: message 1: got a message with the joints shoulder, expected elbow in it too",
+        "{}: message 1: got a message with the joints shoulder, expected elbow in it too; "
+        "record one message with the states of all joints of the arm, as joint_state_broadcaster publishes",
     ),
     "lengths": (
         [STATES[0], ("/joint_states", JOINTS, [0.0], [0.0, 0.0], [0.0, 0.0])],
@@ -697,6 +711,14 @@ def test_no_column_of_another_joint_is_offered(tmp_path):
         with pytest.raises(LogError, match="missing column effort_3") as caught:
             read_logs(path, asked, {"columns": names})
         assert "rename the column '" not in str(caught.value)
+
+
+def test_accelerations_are_not_offered_as_torques(tmp_path):
+    names = [f"{quantity}_{joint}" for quantity in ("q", "qd", "qdd") for joint in JOINTS]
+    path = parquet(tmp_path / "x.parquet", {"t": T} | {name: T for name in names})
+    with pytest.raises(LogError, match="missing columns tau_shoulder, tau_elbow") as caught:
+        read_logs(path, JOINTS)
+    assert "rename the column '" not in str(caught.value)
 
 
 def joint_states(order=("b", "a")):

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 from html_page import Page
+from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
+from spelgen.cli.main import app
 from spelgen.design import PRESETS
 from spelgen.emission.build import build
 from spelgen.emission.specify import make_spec
@@ -314,3 +316,9 @@ def test_meshes_are_drawn_where_the_robot_is_named(run, robots, tmp_path):
     scene = json.loads(re.search(r'id="scene">(.*?)</script>', drawn)[1])
     assert 200 < sum(len(link["shape"]["faces"]) for link in scene["links"]) <= 4100
     assert len(drawn) < 2_000_000
+
+
+def test_only_a_page_is_called_a_page(run, tmp_path):
+    for name, end in (("r.json", "r.json"), ("r.html", "r.html: the report, for any browser")):
+        result = CliRunner().invoke(app, ["report", str(run), "-o", str(tmp_path / name)])
+        assert result.exit_code == 0 and result.stdout.splitlines()[-1].endswith(end)

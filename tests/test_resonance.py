@@ -76,5 +76,7 @@ def test_no_recorded_arm_has_a_resonance(shared):
 def test_a_model_of_an_elastic_joint_is_not_called_good_without_its_band():
     note = Diagnostic("warning", ELASTIC, "joint 'b'", None, "a model of rigid bodies is valid below 3 Hz")
     assessment = verdict(replace(evaluation(), diagnostics=(note,)))
-    assert assessment.sentence.startswith("Below the resonance of an elastic joint only: good enough for")
+    assert assessment.sentence.startswith(
+        "Not valid near the resonance of an elastic joint; below it, usable for "
+    )
     assert assessment.because.startswith("joint 'b': a model of rigid bodies is valid below 3 Hz.")

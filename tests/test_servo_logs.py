@@ -13,6 +13,7 @@ import spelgen
 from spelgen.cli.main import app
 from spelgen.errors import LogError
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.log_mapping import LogMapping
 
 SETTINGS = "input: position\njoints: {shoulder: {kp: 14.0}}\n"
 
@@ -135,3 +136,37 @@ def test_commands_without_torques_ask_for_the_setting(tmp_path):
     (tmp_path / "log.csv").write_text(",".join(["t", *names]) + "\n0,0,0,0,0\n0.02,0,0,0,0\n")
     with pytest.raises(LogError, match="write 'input: position' into the YAML beside the URDF"):
         spelgen.read_logs(tmp_path / "log.csv", arm)
+
+
+DEGREES = LogMapping.model_validate({"input": "position", "units": {"q": "deg"}})
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_normalised_positions_that_are_declared_as_degrees_are_told_by_their_steps(arm, logs, seed):
+    counts = np.random.default_rng(seed).integers(1100, 2600, 2)  # of each motor's calibrated range
+    step = np.radians(200 / counts)
+    wrong = changed(logs, q=lambda x: np.round(x.q / step) * step, mapping=lambda x: DEGREES)
+    (error,) = spelgen.check_logs(wrong, arm).errors
+    assert all(
+        f"{name} {200 / count:.4f}" in str(error)
+        for name, count in zip(arm.chain.joint_names, counts, strict=True)
+    )
+    assert "write 'units: {q: normalised}' and 'calibration:'" in str(error)
+    accepted = changed(wrong, accepted=lambda x: ("normalised",))
+    assert not spelgen.check_logs(accepted, arm).errors
+
+
+@pytest.mark.parametrize("turns", [(4096, 4096), (4095, 4095), (4096, 1024), (16384, 4096), (3600, 3600)])
+def test_degrees_of_encoders_and_rounded_degrees_are_no_normalised_positions(arm, logs, turns):
+    step = 2 * np.pi / np.array(turns)
+    right = changed(logs, q=lambda x: np.round(x.q / step) * step, mapping=lambda x: DEGREES)
+    assert not spelgen.check_logs(right, arm).errors
+
+
+def test_commands_in_radians_beside_positions_in_degrees_are_an_error_with_the_line(arm, logs):
+    # both converted from degrees: such commands look constant
+    small = changed(logs, u=lambda x: np.radians(x.u))
+    errors = [str(error) for error in spelgen.check_logs(small, arm).errors]
+    assert len(errors) == 2
+    for error, joint in zip(errors, arm.chain.joint_names, strict=True):
+        assert f"write 'joints: {{{joint}: {{units: {{q: deg, u: rad}}}}}}'" in error

@@ -418,7 +418,7 @@ def test_a_run_is_resumed_only_as_it_was_started(module, logs, tmp_path):
     with pytest.raises(RunError) as caught:
         train(module, [logs], tmp_path / "none", QUICK, options=RunOptions(resume=True))
     assert str(caught.value) == (
-        f"{tmp_path}/none: got no such run, expected a folder with config.json; spelgen train"
+        f"{tmp_path}/none: got no such run, expected a folder with config.json; make one with `spelgen train`"
     )
 
 

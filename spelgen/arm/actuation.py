@@ -1,7 +1,7 @@
 """Input matrix G of M qdd + ... = G tau, from the transmissions of the URDF and the settings.
 
-Logs contain joint torques, or motor torques if the settings specify ``torque: motor``; G then contains gear ratios and
-the couplings of wrists.
+tau are the logged torques: joint torques, or motor torques if the settings specify ``torque: motor``. In the second
+case G contains the gear ratios and the couplings of motors that drive several joints, as in many wrists.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,10 +20,10 @@ _SIMPLE, _DIFFERENTIAL = "SimpleTransmission", "DifferentialTransmission"
 
 @dataclass(frozen=True)
 class InputEntry:
-    """A nonzero entry of G, with indices from 0.
+    """A nonzero entry of G, with 0-based row and column.
 
-    ``fixed``: a known gear; ``coupled``: known, of a motor that moves several joints; ``gain``: trained, with the
-    initial value ``value``.
+    ``kind``: ``fixed`` for the known gear of a motor of one joint; ``coupled`` for a known entry of a motor that moves
+    several joints; ``gain`` for an entry that is trained, with the initial value ``value``.
     """
 
     row: int
@@ -35,8 +35,8 @@ class InputEntry:
 class Drives(NamedTuple):
     """Matrices (n, n) of the motors of n joints.
 
-    inputs: G, the joint torques are G times the logged torques. speeds: C, the motors rotate at C qd in units of the
-    joints; friction and rotor inertia act at these speeds (see `motor_speeds`).
+    inputs: the matrix G; the joint torques are G times the logged torques. speeds: the matrix C; the motor speeds, in
+    units of the joint velocities, are C qd. Friction and rotor inertia act at these speeds (see `motor_speeds`).
     """
 
     inputs: np.ndarray
@@ -45,9 +45,10 @@ class Drives(NamedTuple):
 
 @dataclass(frozen=True)
 class Actuation:
-    """The entries of G for n joints, and diagnostics.
+    """The nonzero entries of G for ``joints`` joints, and diagnostics.
 
-    couplings: torque of a joint per motor torque, for coupled motors of a robot whose logs contain joint torques.
+    couplings: entries (joint torque per motor torque) of coupled motors if the logs contain joint torques. G does not
+    contain these entries; they determine the motor speeds.
     """
 
     joints: int
@@ -57,7 +58,7 @@ class Actuation:
 
     @property
     def direct(self) -> bool:
-        """Whether G is the identity for all joints with a drive."""
+        """Whether G is the identity, except for zero rows of passive joints."""
         return all(entry == InputEntry(entry.row, entry.row, "fixed", 1.0) for entry in self.entries)
 
     def matrix(self) -> np.ndarray:
@@ -68,7 +69,7 @@ class Actuation:
         return result
 
     def drives(self) -> Drives:
-        """Return the input matrix G, (n, n), and the motor speeds C per joint velocity, (n, n)."""
+        """Return the input matrix G and the matrix C of motor speeds per joint velocity, (n, n) each."""
         torques = self.matrix()
         for coupling in self.couplings:
             torques[coupling.row] = 0.0  # the logged torque acts at the joint, not at its motors
@@ -78,16 +79,18 @@ class Actuation:
 
 
 def motor_speeds(inputs: np.ndarray) -> np.ndarray:
-    """Return C, with which the motors rotate at C qd.
+    """Return the matrix C of the motor speeds C qd at the joint velocities qd.
 
     Args:
         inputs: joint torques per motor torque, (n, n).
 
     Returns:
-        C (n, n). The speed of a motor is in units of the joint with its largest torque: C is the identity if each motor
-        moves only its own joint. A joint without motor has the row of the identity.
+        C (n, n), row i for motor i. The speed of a motor is measured on the output side of its gear, at the joint that
+        gets its largest torque: C is the identity if each motor moves only its own joint. The row of a passive joint,
+        which has no motor, is the row of the identity.
     """
-    # Equal power, tau_m . speed_m = tau . qd with tau = G tau_m, gives C = G^T, up to the scales of the motors.
+    # Motors and joints have equal power: tau_m . speed_m = tau . qd with tau = G tau_m gives speed_m = G^T qd. Each
+    # row of C = G^T is then divided by its element of largest magnitude.
     largest = np.take_along_axis(inputs, np.abs(inputs).argmax(axis=0)[None], axis=0)
     passive = largest == 0
     speeds: np.ndarray = (inputs / np.where(passive, 1.0, largest)).T + np.diag(passive[0].astype(float))
@@ -95,11 +98,12 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
 
 
 def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) -> Actuation:
-    """Return G of the arm with these ``joints``.
+    """Return the input matrix of the arm whose coordinates are the joints named ``joints``.
 
-    Raises SettingsError for couplings with locked joints, UrdfError for a required transmission with unusable numbers.
+    Raises SettingsError for a coupling of a moving and a locked joint, and UrdfError if a transmission that is needed
+    has unusable numbers.
     """
-    # the row of a passive joint is zero
+    # A passive joint gets no entry: its row of G is zero.
     driven = [name for name in joints if settings.joint(name).actuated]
     remarks = tuple(_undriven(robot, settings, driven))
     couplings = tuple(_couplings(robot, settings, joints))
@@ -107,7 +111,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # G is known for coupled joints, and a gear of their own would count twice
+    # Coupled joints get no gear, because their entries of G in `couplings` include the gears.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)
@@ -118,9 +122,12 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
 
 
 def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterator[Diagnostic]:
-    """Yield a remark for each joint without transmission if other joints have one: it may be a passive joint."""
+    """Yield a remark for each joint without transmission if other joints have one; such a joint may be passive.
+
+    driven: names of the joints that are not passive in the settings.
+    """
     transmitted = {name for transmission in robot.transmissions for name in transmission.joint_names}
-    # most URDFs have no transmissions
+    # No remarks for a URDF without transmissions: most URDFs have none.
     if transmitted.isdisjoint(driven):
         return
     for name in driven:
@@ -130,35 +137,42 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
 
 
 def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEntry:
-    """Return the entry of a motor and its joint: the gear of the settings, else of the URDF, else a trained gain."""
+    """Return the entry of G of a motor that moves only the joint ``name``, with the index ``index``.
+
+    Its value is the gear in the settings, otherwise the reduction in the URDF; without both, the entry is a trained
+    gain with the initial value 1.
+    """
     joint = settings.joint(name)
     gear = joint.gear if "gear" in joint.model_fields_set else _reduction(robot, name)
-    # an unknown gain is trained, not assumed to be 1
+    # An unknown gear is trained: a gear of 1 is not assumed.
     if gear is None:
         return InputEntry(index, index, "gain", 1.0)
     return InputEntry(index, index, "gain" if joint.gain == "trained" else "fixed", gear)
 
 
 def _reduction(robot: Robot, name: str) -> float | None:
-    """Return the reduction of the simple transmission of a joint; None if the URDF has none, or 0."""
+    """Return the reduction of the simple transmission of a joint; None if it is absent or 0 in the URDF."""
     for transmission in robot.transmissions:
         if _SIMPLE in transmission.type and transmission.joint_names == [name]:
             collect(transmission.errors)
             reductions = [reduction for _, reduction in transmission.actuators if reduction]
-            # URDF does not specify the distribution of the load on two actuators of a joint
+            # A joint with two actuators has no known reduction: URDF does not specify how they share the load.
             if len(reductions) == 1:
                 return reductions[0]
     return None
 
 
 def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[InputEntry]:
-    """Return the couplings of the settings, then the differential transmissions of the URDF for all other joints."""
+    """Return the entries of coupled motors: from the settings, and for all other joints from the URDF.
+
+    The URDF specifies couplings as differential transmissions.
+    """
     entries: list[InputEntry] = []
     free = set(joints)
     errors = []
     for coupling in settings.couplings:
         locked = [name for name in coupling.joints if name not in joints]
-        # a coupling of only locked joints belongs to another part of the robot
+        # A coupling whose joints are all locked belongs to another arm of the robot.
         if len(locked) == len(coupling.joints):
             continue
         free.difference_update(coupling.joints)
@@ -172,7 +186,7 @@ def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[
     for transmission in robot.transmissions:
         names = transmission.joint_names
         is_pair = _DIFFERENTIAL in transmission.type and len(names) == len(transmission.actuators) == 2
-        # for logged joint torques an unusable transmission is not needed
+        # An unusable transmission is an error only if the logs contain motor torques: joint torques do not need it.
         if is_pair and free.issuperset(names) and not (transmission.errors and settings.torque == "joint"):
             collect(transmission.errors)
             entries += _block(joints, names, _differential(transmission))
@@ -181,9 +195,9 @@ def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[
 
 
 def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]:
-    """Return the torques of two joints per torque of two motors, each of which moves both joints.
+    """Return the matrix of the torques of two joints (rows) per torque of two motors, each of which moves both joints.
 
-    Source: ROS transmission_interface, DifferentialTransmission. An absent reduction, or 0, counts as 1.
+    Source: ROS transmission_interface, DifferentialTransmission. A reduction that is absent or 0 is replaced by 1.
     """
     first, second = (reduction or 1.0 for _, reduction, _ in transmission.joints)
     a, b = (reduction or 1.0 for _, reduction in transmission.actuators)
@@ -193,7 +207,7 @@ def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]
 def _block(
     joints: Sequence[str], names: Sequence[str], matrix: Sequence[Sequence[float]]
 ) -> Iterator[InputEntry]:
-    """Yield the nonzero entries of ``matrix``, the block of G of the joints ``names``."""
+    """Yield the nonzero entries of ``matrix``, the block of G for ``names``, with their indices in ``joints``."""
     for row, values in zip(names, matrix, strict=True):
         for column, value in zip(names, values, strict=True):
             if value:

@@ -1,4 +1,4 @@
-"""Robot -> Chain: the serial chain with exact geometry; links on fixed and locked joints are lumped into bodies."""
+"""Robot -> Chain: the serial chain with exact geometry; links that move rigidly together are lumped into bodies."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,11 @@ from spelgen.urdf.robot import JointType, Robot, UrdfJoint, UrdfLink
 
 
 class Coordinate(NamedTuple):
-    """A degree of freedom; limits as in the file (rad or m, N m or N, per second), None if absent."""
+    """A degree of freedom: a joint with its limits, damping and friction in the URDF, None for an absent limit.
+
+    ``lower``, ``upper`` [rad, m]; ``effort`` [Nm, N]; ``velocity`` [rad/s, m/s]; ``damping`` [Nm s/rad, N s/m];
+    ``friction`` [Nm, N]. ``passive``: whether the joint has no actuator.
+    """
 
     name: str
     joint_type: JointType
@@ -31,7 +35,7 @@ class Coordinate(NamedTuple):
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """Lower and upper limit [rad, m]; None for a continuous joint, and if one is absent."""
+        """Lower and upper limit [rad, m]; None for a continuous joint, or if one of the two limits is absent."""
         if self.continuous or self.lower is None or self.upper is None:
             return None
         return self.lower, self.upper
@@ -39,13 +43,14 @@ class Coordinate(NamedTuple):
 
 @dataclass(frozen=True)
 class Body:
-    """A joint and all links that move rigidly with it.
+    """A joint and all links that move rigidly with the child link of the joint.
 
-    ``link`` is the name of the child link of the joint. ``rotation`` and ``translation`` [m] are the pose of the
-    joint's frame in the frame of the parent body (parent -1: the root link) at zero position; the joint rotates about,
-    or translates along, z of its frame by multiplier * q + offset, q the coordinate. ``inertia`` is (m, m c, Ixx, Ixy,
-    Ixz, Iyy, Iyz, Izz) [kg, kg m, kg m^2] about the origin of the joint's frame, in that frame; None if no link of the
-    body has an inertial.
+    ``name`` is the name of the joint, ``link`` of its child link. ``parent`` is the index of the parent body, -1 for
+    the root link. ``rotation`` and ``translation`` [m] are the pose of the joint's frame in the frame of the parent
+    body at zero position. The joint rotates about, or translates along, the z axis of its frame by
+    multiplier * q + offset [rad, m], where q is the position of the coordinate with the index ``coordinate``.
+    ``inertia`` is (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) [kg, kg m, kg m^2] about the origin of the joint's frame, in
+    this frame; None if no link of the body has an inertial.
     """
 
     name: str
@@ -64,8 +69,9 @@ class Body:
 class Chain:
     """A serial arm with n coordinates from the root to the tip; parents precede their children in ``bodies``.
 
-    ``gravity`` [m/s2] is in the frame of the root link; ``locked`` are the names of locked joints; ``diagnostics`` are
-    the diagnostics of this step, without the diagnostics of the robot.
+    ``gravity`` [m/s2] is in the frame of the root link. ``locked`` are the names of the locked joints, in the order of
+    the URDF. ``diagnostics`` are the diagnostics of the choice and lumping of joints, without the diagnostics of the
+    URDF.
     """
 
     name: str
@@ -92,7 +98,7 @@ class Chain:
 
 
 class MovingJoint(NamedTuple):
-    """A moving joint, the ``links`` with an inertial that move rigidly with it, and their body."""
+    """A moving joint, the links with an inertial that move rigidly with its child link, and the body of these links."""
 
     joint: UrdfJoint
     links: tuple[UrdfLink, ...]
@@ -100,7 +106,11 @@ class MovingJoint(NamedTuple):
 
 
 class LumpedLinks(NamedTuple):
-    """Moving joints (the chain first), locked joints (fixed ones included), and the frames of all links by name."""
+    """Moving joints, locked joints, and the frames of all links by name.
+
+    ``moved`` lists the joints of the chain before their mimic joints on other branches; ``locked`` includes fixed
+    joints.
+    """
 
     moved: tuple[MovingJoint, ...]
     locked: tuple[UrdfJoint, ...]
@@ -122,8 +132,10 @@ def make_arm(
     Args:
         robot: the robot.
         joints: names of the moving joints.
-        tip: the last link, in place of ``joints``; without both, the arm is the longest serial chain.
-        angle_tolerance: angles within it [rad] of a multiple of pi/2 are rounded to it; 0: none are.
+        tip: name of the last link, in place of ``joints``. Without ``joints`` and ``tip``, the arm is the longest
+            serial chain.
+        angle_tolerance: angles [rad] that differ from a multiple of pi/2 by at most this tolerance are rounded to the
+            multiple; 0: no angle is rounded.
         gravity: acceleration of gravity in the frame of the root link [m/s2].
         passive: names of the joints without an actuator.
 
@@ -136,7 +148,7 @@ def make_arm(
     _require_small(robot, chain)
     lumped = lump_links(robot, chain, angle_tolerance)
     locked = {joint.name for joint in lumped.locked if joint.type != "fixed"}
-    # exact, so that the gravity torque of a vertical axis is 0 and not 1e-17
+    # Fractions in place of floats, so that the gravity torque about a vertical axis is 0 and not 1e-17.
     x, y, z = map(exact, map(float, gravity))
     return Chain(
         name=robot.name,
@@ -149,13 +161,14 @@ def make_arm(
 
 
 def _require_small(robot: Robot, chain: ChainChoice) -> None:
-    """Raise ArmError for an arm whose derivation would take more than some seconds."""
-    # the cost of the derivation increases with about the fifth power of the joints
+    """Raise ArmError for an arm whose structure would take more than some seconds to derive."""
+    # The time of the derivation increases with about the fifth power of the number of joints.
     moving, largest, most_followers = len(chain.joints), 16, 48
     if moving > largest:
         do = "choose fewer with --joints or --tip"
         raise ArmError(f"{moving} joints", file=robot.source, expected=f"at most {largest}", do=do)
-    # each mimic joint is a separate body in the derivation; each joint of the chain is its own leader
+    # Mimic joints are counted too, because each is a separate body in the derivation. Each joint of the chain is its
+    # own leader in `leaders`, and is subtracted.
     following = sum(x.leader.name in chain.names for x in leaders(robot).values()) - moving
     if following > most_followers:
         got = f"{following} joints that follow others by <mimic>"
@@ -174,27 +187,30 @@ def _joint_type(joint: UrdfJoint) -> JointType:
 
 
 def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> LumpedLinks:
-    """Return the robot with moving joints of the chain and their followers, and all other joints locked."""
+    """Return the bodies of the joints of the chain and of their mimic joints; all other joints are locked.
+
+    angle_tolerance: see ``make_arm`` [rad].
+    """
     rounding = AngleRounding(angle_tolerance)
     placement = Placement(robot.root, rounding)
-    # Chains of mimic joints are resolved to the joint that leads them, with products of the multipliers.
+    # A mimic joint may follow a mimic joint: `leaders` returns the joint at the end, and the total multiplier.
     following = leaders(robot)
     poses = []
     locked: list[UrdfJoint] = []
-    # bodies have this order: parents first, and the chain before followers on branches
+    # The bodies are ordered with parents first, and joints of the chain before mimic joints on other branches.
     path = robot.path_to(chain.joints[-1].child)
     for joint in dict.fromkeys([*path, *robot.joints_from_root]):
         followed = following[joint.name]
         if joint.moves and followed.leader.name in chain.names and followed.multiplier:
             poses.append((joint, *placement.move(joint)))
         else:
-            # the position of a follower of a locked joint is its offset
+            # Locked joints are at 0: a mimic joint of a locked joint is then at its offset.
             locked.append(joint)
             placement.lock(joint, float(followed.offset) if joint.moves else 0.0)
     moved = []
     for index, (joint, parent, rotation, translation) in enumerate(poses):
         followed = following[joint.name]
-        # M and V depend only on the sum of the inertias of links that move together
+        # Links that move together are one body: M and V depend only on the sum of their inertias.
         links = tuple(x for x in robot.links if x.inertial and placement.frames[x.name].body == index)
         body = Body(
             name=joint.name,
@@ -221,12 +237,12 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
 
 
 def _total(placement: Placement, links: Sequence[UrdfLink]) -> TenVector | None:
-    """Return the sum of the inertias of links about the origin of their body; None without links."""
+    """Return the sum of the inertial parameters of links about the origin of their common body; None without links."""
     tens = [placement.inertia(link, link.inertial) for link in links if link.inertial]
     if not tens:
         return None
     total = tens[0]
-    # bounded after each sum: of an untrusted file digits could grow with every link
+    # The number of digits is bounded after each sum: in a malformed file it could grow with every link.
     for ten in tens[1:]:
         total = tuple(bounded(a + b) for a, b in zip(total, ten, strict=True))
     return total
@@ -254,7 +270,7 @@ def _moved_remarks(moved: Sequence[MovingJoint], following: Mapping[str, Leader]
 
 
 def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
-    # one remark for all: a humanoid has thirty locked joints
+    # One remark lists all locked joints, because a humanoid robot has thirty of them.
     outside = [joint for joint in locked if joint.moves and joint.mimic is None]
     if outside:
         names = ", ".join(repr(joint.name) for joint in outside)
@@ -273,16 +289,16 @@ def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]
 def _dependent_remarks(
     placement: Placement, moved: Sequence[MovingJoint], locked: Sequence[UrdfJoint]
 ) -> Iterator[Diagnostic]:
-    """Yield a warning for each locked joint that is parallel to a joint of the chain with the same parent body.
+    """Yield a warning for each locked joint whose axis is parallel to a joint of the chain with the same parent body.
 
-    Such a pair indicates a parallelogram linkage whose loop was opened in the URDF.
+    Such a pair of joints indicates a parallelogram linkage whose loop was opened in the URDF.
     """
     behind: set[str] = set()
     for joint in locked:
         if joint.moves or joint.parent in behind:
             behind.add(joint.child)
         turns = joint.type in ("revolute", "continuous") and joint.mimic is None
-        # joints behind a locked joint are not part of a linkage of the arm
+        # Joints between a locked joint and the tip of its branch are not part of a linkage of the arm.
         if joint.parent in behind or not turns:
             continue
         beside = _parallel_beside(placement.frames[joint.parent], moved, joint)
@@ -295,12 +311,15 @@ def _dependent_remarks(
 
 
 def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], joint: UrdfJoint) -> list[str]:
-    """Return the revolute joints with the same parent body as ``joint``, in its frame, and a parallel axis."""
+    """Return the names of the revolute joints with the same parent body as ``joint`` and an axis parallel to it.
+
+    frame: frame of the parent link of ``joint``.
+    """
     rotation = np.array(frame.rotation, dtype=float) @ rotation_from_rpy(joint.rpy)
     axis = rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis)
     parallel = []
     for body in (moving.body for moving in moved):
-        # a body rotates about the z axis of its frame
+        # The axis of the other joint in the frame of the parent body: the z axis of the joint's frame.
         beside = np.array(body.rotation, dtype=float)[:, 2]
         is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2  # [rad] parallel within rounding errors
         if body.parent == frame.body >= 0 and body.joint_type != "prismatic" and is_parallel:

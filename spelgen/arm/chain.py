@@ -1,4 +1,4 @@
-"""Robot -> the joints that are the coordinates of the arm, and the leaders of mimic joints."""
+"""Robot -> the serial chain of joints that are the coordinates of an arm, and the leaders of mimic joints."""
 
 import math
 import re
@@ -10,12 +10,12 @@ from spelgen.arm.rational import bounded, exact
 from spelgen.errors import ArmError, Diagnostic, Severity, suggestion
 from spelgen.urdf.robot import Robot, UrdfJoint
 
-# names of joints of grippers, at which the arm ends
+# Names of joints of grippers. The arm ends at the first joint of a gripper.
 _GRIPPER = re.compile(r"gripper|finger|thumb|knuckle|(?:^|[^a-z])jaws?(?:[^a-z]|$)", re.IGNORECASE)
 
 
 class ChainChoice(NamedTuple):
-    """The selected joints, root first, and diagnostics of the selection."""
+    """The joints of the chain, from the root to the tip, and diagnostics of their selection."""
 
     joints: tuple[UrdfJoint, ...]
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -27,7 +27,7 @@ class ChainChoice(NamedTuple):
 
 
 class Leader(NamedTuple):
-    """The leader of a joint, which is no mimic joint: q = multiplier * q_leader + offset."""
+    """The leader of a joint: q = multiplier * q_leader + offset [rad, m]. The leader itself is not a mimic joint."""
 
     leader: UrdfJoint
     multiplier: Fraction
@@ -35,9 +35,10 @@ class Leader(NamedTuple):
 
 
 def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) -> ChainChoice:
-    """Return the named joints, the joints from the root to the link ``tip``, or the longest serial chain.
+    """Return the chain of the joints named ``joints``, the chain to the link ``tip``, or the longest serial chain.
 
-    The longest chain excludes joints at its end with the name of a gripper or finger. Raises ArmError.
+    Joints with the name of a gripper or finger at the end of the longest chain are excluded. Raises ArmError if the
+    joints do not form a serial chain, or if the choice is ambiguous.
     """
     if joints is not None and tip is not None:
         raise ArmError("both joints and a tip", file=robot.source, expected="one of the two")
@@ -52,7 +53,8 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
     if not chain.joints:
         expected = "a serial chain of joints"
         raise ArmError("no joint that moves by itself", file=robot.source, expected=expected)
-    # A mobile base has a floating joint below the arm, which is described relative to it: held fixed.
+    # A floating joint between the root and the arm, of a mobile base, is not an error: the arm is described relative
+    # to the base.
     below = robot.path_to(chain.joints[0].parent)
     for joint in robot.path_to(chain.joints[-1].parent):
         if joint.type in ("floating", "planar") and joint not in below:
@@ -66,17 +68,20 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
 
 
 def leaders(robot: Robot) -> dict[str, Leader]:
-    """Return the leader of each joint, through any number of mimic joints; a joint without <mimic> leads itself."""
+    """Return the leader of each joint by the joint's name; a joint without <mimic> is its own leader.
+
+    The leader of a joint that mimics a mimic joint is the joint without <mimic> at the end of this sequence.
+    """
     result: dict[str, Leader] = {}
     for joint in robot.joints:
         followers = []
         leader = joint
-        # A loop replaces recursion: the nesting of mimic joints is not bounded.
+        # A loop in place of recursion, because a file may have any number of mimic joints in sequence.
         while leader.name not in result and leader.mimic is not None:
             followers.append((leader.name, leader.mimic))
             leader = robot.joint[leader.mimic.joint]
         follow = result.setdefault(leader.name, Leader(leader, Fraction(1), Fraction(0)))
-        # from the leader outwards
+        # From the leader outwards, because the multiplier and offset of a joint depend on its leader's.
         for name, mimic in reversed(followers):
             multiplier = exact(mimic.multiplier)
             offset = multiplier * follow.offset + exact(mimic.offset)
@@ -94,14 +99,14 @@ def _independent(joints: Iterable[UrdfJoint]) -> tuple[UrdfJoint, ...]:
 
 
 def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
-    """Return the joints of these names. Raises ArmError unless they are in their order on one path."""
+    """Return the joints of these names. Raises ArmError unless all are on one path, in the order from the root."""
     chosen = [_usable(robot, name) for name in names]
     for name in names:
         if list(names).count(name) > 1:
             raise ArmError(f"the joint {name!r} twice", file=robot.source, expected="each joint once")
     if not chosen:
         return ()
-    # the path to the deepest joint contains all others, unless they are on another branch
+    # The path to the joint that is farthest from the root contains all others, unless they are on another branch.
     deepest = max(chosen, key=lambda joint: len(robot.path_to(joint.child)))
     ordered = tuple(joint for joint in robot.path_to(deepest.child) if joint in chosen)
     for joint in chosen:
@@ -110,7 +115,7 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
             raise ArmError(
                 got, file=robot.source, line=joint.line, expected="joints on one path from the root"
             )
-    # columns of logs have the given order, which sorting would permute
+    # An error in place of sorting: columns of logs have the order of `names`.
     if list(ordered) != chosen:
         got, do = f"the joints in the order {','.join(names)}", f"use {','.join(x.name for x in ordered)}"
         raise ArmError(got, file=robot.source, expected="the order from the root to the tip", do=do)
@@ -118,7 +123,7 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
 
 
 def _usable(robot: Robot, name: str) -> UrdfJoint:
-    """Return the joint of this name. Raises ArmError for an unknown, mimic, fixed, floating or planar joint."""
+    """Return the joint of this name. Raises ArmError if it is unknown, or a mimic, fixed, floating or planar joint."""
     joint = robot.joint.get(name)
     if joint is None:
         names = [joint.name for joint in _independent(robot.joints)]
@@ -134,10 +139,13 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
 
 
 def _longest(robot: Robot) -> ChainChoice:
-    """Return the longest chain. Raises ArmError for several of equal length without an unambiguous criterion."""
-    # Arms are the longest chain of a robot; hands, tools and sensors are on shorter branches.
+    """Return the longest chain. Raises ArmError if several chains have this length and the choice is ambiguous.
+
+    Prismatic joints of a pair of jaws are excluded. Of several chains, the only one with effort limits is chosen.
+    """
+    # Hands, tools and sensors are on shorter branches than the arm.
     tips = [link.name for link in robot.links if not robot.joints_below[link.name]]
-    # several fixed fingers are at the end of the same chain
+    # Duplicates are removed: several fixed fingers are at the end of the same chain.
     chains = dict.fromkeys(_without_gripper(_independent(robot.path_to(tip))) for tip in tips)
     length = max(map(len, chains), default=0)
     longest = [chain for chain in chains if len(chain) == length]
@@ -146,14 +154,16 @@ def _longest(robot: Robot) -> ChainChoice:
     first, last = longest[0], longest[0][-1]
     if len(longest) == 1:
         return ChainChoice(first, _possible_gripper(robot, last))
-    # two jaws form two chains of equal length, which differ only in a last prismatic joint with the same parent link
+    # The two jaws of a gripper form two chains of equal length, which differ only in the last joint: a prismatic joint
+    # with the same parent link.
     if first[:-1] and {(*x[:-1], x[-1].type, x[-1].parent) for x in longest} == {
         (*first[:-1], "prismatic", last.parent)
     }:
         jaws = ", ".join(repr(chain[-1].name) for chain in longest)
         message = f"{jaws} slide side by side at the end of the chain: taken as a gripper's and locked"
         return ChainChoice(first[:-1], _remark(last, "info", message))
-    # nothing drives a joint without an effort limit, which is 0 in the file
+    # A joint without effort limit (absent, or 0 in the file) probably has no motor: the chain without such joints is
+    # the arm.
     driven = [chain for chain in longest if all(joint.effort is not None for joint in chain)]
     if len(driven) == 1:
         message = f"{len(longest)} chains of {length} joints: the only one with effort limits of all joints is taken"
@@ -167,9 +177,10 @@ def _longest(robot: Robot) -> ChainChoice:
 
 
 def _possible_gripper(robot: Robot, last: UrdfJoint) -> tuple[Diagnostic, ...]:
-    """Return a remark if the last joint may open a gripper: it moves a link of that name, and no other joint does.
+    """Return a remark if the last joint of the chain may open a gripper; otherwise no remark.
 
-    No jaw opens by half a turn: a joint with a larger range turns the gripper.
+    The link of such a joint has the name of a gripper, and no joint of the robot has one. A joint with a range of more
+    than half a turn rotates the gripper as a whole, because no jaw opens that far.
     """
     turns = last.lower is not None and last.upper is not None and last.upper - last.lower > math.pi
     if turns or not _GRIPPER.search(last.child) or any(map(_GRIPPER.search, robot.joint)):
@@ -189,5 +200,5 @@ def _without_gripper(chain: tuple[UrdfJoint, ...]) -> tuple[UrdfJoint, ...]:
     end = len(chain)
     while end and _GRIPPER.search(chain[end - 1].name):
         end -= 1
-    # if all joints are joints of fingers, the finger is the arm
+    # If all joints have names of fingers, the robot is a single finger, which is then the arm.
     return chain[:end] or chain

@@ -15,9 +15,9 @@ from spelgen.urdf.robot import Robot
 
 @dataclass(frozen=True, repr=False)
 class Arm:
-    """An arm: the robot of a URDF, its settings, the serial chain, and how motors drive the joints.
+    """An arm: the robot of a URDF, its settings, the serial chain, and the input matrix of the motors.
 
-    ``joints``, ``tip`` and ``angle_tolerance`` are the arguments of ``load_arm``.
+    ``joints``, ``tip`` and ``angle_tolerance`` are the arguments of ``load_arm`` with which the chain was chosen.
     """
 
     robot: Robot
@@ -30,7 +30,7 @@ class Arm:
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """Return the diagnostics of the URDF, the settings, the chain and its inputs."""
+        """Diagnostics of the URDF, the chain, the input matrix and the settings, in this order."""
         sources = (self.robot, self.chain, self.actuation, self.settings)
         return tuple(item for source in sources for item in source.diagnostics)
 
@@ -55,9 +55,11 @@ def load_arm(
 
     Args:
         path: URDF or xacro file.
-        joints: names of the moving joints; None: the joints in the settings, or of the longest actuated chain.
-        tip: name of the last link, in place of ``joints``.
-        angle_tolerance: angles within it [rad] of a multiple of pi/2 are rounded to it; 0: none are.
+        joints: names of the moving joints. Without ``joints`` and ``tip`` the settings specify the chain, or the
+            longest serial chain is used.
+        tip: name of the last link of the chain, in place of ``joints``.
+        angle_tolerance: angles [rad] that differ from a multiple of pi/2 by at most this tolerance are rounded to the
+            multiple; 0: no angle is rounded.
 
     Raises UrdfError, ArmError or SettingsError.
     """

@@ -1,8 +1,8 @@
 """Exact poses of joints and links at zero position, and inertias in the frame of their body.
 
-A rotation composed of decimal angles is not rational. Rotations are therefore composed in float64 between revolute
-joints (a segment), and approximated by a rational matrix once: 45 degrees, a prismatic joint and another 45 degrees are
-exactly 90, and every rotation is exactly orthogonal.
+The rotation matrix of a decimal angle is not rational. All rotations between two successive revolute joints (a segment)
+are therefore composed in float64, and the product is approximated by a rational orthogonal matrix once. For example,
+45 degrees, a prismatic joint and another 45 degrees give exactly 90 degrees.
 """
 
 from collections.abc import Sequence
@@ -34,10 +34,11 @@ TenVector = tuple[Fraction, ...]
 
 @dataclass(frozen=True)
 class AngleRounding:
-    """Rounding of origins and axes of a URDF to the special values that they represent, with diagnostics.
+    """Rounding of the geometry of a URDF to the special values that its rounded numbers represent, with diagnostics.
 
-    Angles are rounded within ``tolerance`` [rad], also offsets, axes and tensors; a tolerance of 0 disables it.
-    ``diagnostics`` has one entry per changed origin or axis.
+    tolerance: largest change of an angle to a multiple of pi/2 [rad]. Offsets, axes and inertia tensors are rounded
+    with tolerances of their own. A tolerance of 0 disables all rounding. diagnostics: one entry per changed position,
+    rotation, axis or tensor.
     """
 
     tolerance: float
@@ -45,14 +46,17 @@ class AngleRounding:
 
     @property
     def rotation_error(self) -> float:
-        """Largest error of rational rotations [rad]."""
-        # 1.57079632679 is pi/2 within 5e-12: without rounding it must not become pi/2
+        """Largest error of the rational approximation of a rotation [rad]."""
+        # Without rounding, an angle of 1.57079632679 must not become pi/2, from which it differs by 5e-12.
         return TUNING.rotation_error if self.tolerance else 1e-15
 
     def origin(
         self, xyz: Sequence[float], rpy: Sequence[float], where: str, line: int
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return position (3,) [m] and rotation (3, 3) of an <origin>; None: no rotation."""
+        """Return the position (3,) [m] and rotation (3, 3) of an <origin>; the rotation is None if all angles are zero.
+
+        where, line: name and line of the element in diagnostics.
+        """
         written = np.array(list(map(exact, xyz)))
         offset = self.position(written)
         if (offset != written).any():
@@ -64,14 +68,14 @@ class AngleRounding:
                 changes.append(f"{angle:.10g} is taken as {_in_pi(special)}")
         if changes:
             self._note("snapped-angle", where, line, "; ".join(changes))
-        # most origins have no rotation: None avoids a product of exact matrices
+        # Most origins have no rotation: with None, callers avoid a product of exact matrices.
         return offset, rotation_from_rpy(angles) if any(angles) else None
 
     def tensor(self, link: UrdfLink, inertial: Inertial) -> np.ndarray:
-        """Return the exact inertia tensor (3, 3) [kg m2]; products of inertia of the order of rounding errors are 0."""
+        """Return the exact inertia tensor (3, 3) [kg m2]; products of inertia of the size of rounding errors are 0."""
         xx, xy, xz, yy, yz, zz = inertial.tensor
         if self.tolerance:
-            # CAD programs export products of inertia of 1e-18 for symmetric parts.
+            # CAD programs export products of inertia such as 1e-18 in place of 0 for symmetric parts.
             noise = TUNING.zero_noise * max(abs(xx), abs(yy), abs(zz))
             products = [0.0 if abs(product) < noise else product for product in (xy, xz, yz)]
             if [xy, xz, yz] != products:
@@ -84,12 +88,12 @@ class AngleRounding:
 
     def axis(self, joint: UrdfJoint) -> np.ndarray:
         """Return the axis of a joint as a unit vector in the frame of the joint, (3,)."""
-        # axes in URDFs often have other lengths, such as 0 0 -1.0001
+        # Axes in URDFs are often not unit vectors, such as 0 0 -1.0001.
         unit: np.ndarray = np.array(joint.axis) / np.linalg.norm(joint.axis)
         if self.tolerance == 0.0:
             return unit
-        rounded = np.where(np.abs(unit) < 1e-3, 0.0, unit)  # CAD exporters print three digits
-        # A unit vector again, as components below the noise were removed.
+        rounded = np.where(np.abs(unit) < 1e-3, 0.0, unit)  # some CAD exporters print three digits
+        # The axis is normalised again, because components were set to 0.
         rounded /= np.linalg.norm(rounded)
         if np.abs(rounded - unit).max() > TUNING.notable:
             message = f"{_text(joint.axis)} is taken as {_text(rounded)}"
@@ -97,7 +101,7 @@ class AngleRounding:
         return rounded
 
     def position(self, vector: np.ndarray) -> np.ndarray:
-        """Return a composed position (3,) [m] without the noise of rounded rotations."""
+        """Return a position (3,) [m] with components below 1 nm, which are rounding errors of rotations, set to 0."""
         noise = 1e-9 if self.tolerance else 0.0  # [m] rounding errors of composed rotations
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
 
@@ -107,7 +111,7 @@ class AngleRounding:
 
 def _in_pi(angle: float) -> str:
     """Return a rounded angle as a multiple of pi: "-3 pi/4"."""
-    multiple = Fraction(angle / pi).limit_denominator(120)  # a common multiple of the divisors
+    multiple = Fraction(angle / pi).limit_denominator(120)  # a common multiple of 2, 5, 8 and 12
     numerator, denominator = multiple.as_integer_ratio()
     if not numerator:
         return "0"
@@ -116,15 +120,17 @@ def _in_pi(angle: float) -> str:
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:
-    """Return a vector (3,) as text with six digits."""
+    """Return a vector (3,) as text with six digits per component."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
 
 
 class Frame(NamedTuple):
-    """The frame of a link at zero position in the frame of its body (-1: the root link).
+    """The pose of the frame of a link at zero position.
 
-    composed: float64 rotation (3, 3) in the frame of the last revolute body before the link. rotation: exact rotation
-    (3, 3) in the frame of the body, which differs if there are prismatic bodies between the two.
+    body: index of the body of the link, -1 for the root link. composed: float64 rotation (3, 3) of the link in the
+    frame of the last revolute body on the path from the root to the link. rotation: exact rotation (3, 3) of the link
+    in the frame of its own body, which is another frame if this body is prismatic. position: exact position (3,) of
+    the link in the frame of its own body [m].
     """
 
     body: int
@@ -134,20 +140,21 @@ class Frame(NamedTuple):
 
 
 _Rotation = tuple[np.ndarray, np.ndarray]
-"""Rotation (3, 3) of a frame in the frame of the last revolute body before it, in float64 and rational."""
+"""Rotation (3, 3) of a body in the frame of the last revolute body before it, in float64 and as rational numbers."""
 
 
 class Placement:
-    """Poses of links from the root outwards: a joint is locked, or starts a new body."""
+    """Poses of links, added from the root outwards: each joint is locked (`lock`) or starts a new body (`move`)."""
 
     def __init__(self, root: str, rounding: AngleRounding) -> None:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
-        # per body, the frames from the last revolute body (the body itself if it is revolute) to the body
+        # For the root and each body, the rotations of all bodies from the last revolute body to this body. The segment
+        # of a revolute body contains only the body itself.
         self._segments: list[tuple[_Rotation, ...]] = [((np.eye(3), IDENTITY),)]
 
     def lock(self, joint: UrdfJoint, value: float) -> None:
-        """Add the child of a joint that is locked at ``value`` [rad, m]."""
+        """Add the child link of a joint that is locked at the position ``value`` [rad, m]."""
         frame = self._joint_origin(joint)
         if value:
             axis = self._rounding.axis(joint)
@@ -155,40 +162,41 @@ class Placement:
             if joint.type == "prismatic":
                 offset = exact(value) * np.array(list(map(exact, axis.tolist())))
             else:
-                # A revolute joint locked off zero turns all later frames by a constant angle.
+                # A revolute joint that is not locked at zero rotates the frames of all later links by a constant angle.
                 turn = rotation_about(axis, rounded_angle(value, self._rounding.tolerance))
             frame = self._placed(frame, offset, turn)
         self.frames[joint.child] = frame
 
     def move(self, joint: UrdfJoint) -> tuple[int, np.ndarray, np.ndarray]:
-        """Add a moving joint and its child, which start a body; bodies are numbered in the order of the calls.
+        """Add a moving joint and its child link, which start a body; bodies are numbered in the order of the calls.
 
         Returns:
-            The parent body, and rotation (3, 3) and position (3,) [m] of the joint's frame, with +z along its axis, in
-            the frame of the parent body.
+            The index of the parent body, and the rotation (3, 3) and position (3,) [m] of the joint's frame in the
+            frame of the parent body. The +z axis of the joint's frame is the axis of the joint.
         """
         frame = self._joint_origin(joint)
-        # in the recursion all axes are z axes
+        # `structure.recursion` requires that each joint moves about or along z.
         aligning = alignment(self._rounding.axis(joint))
         aligned = frame.composed @ aligning
         rotation = self._in_body(frame.body, aligned)
         body = len(self._segments) - 1
         if joint.type == "prismatic":
-            # a prismatic joint does not rotate: rotations before and behind it compose to a constant rotation
+            # A prismatic joint does not rotate, so that the rotations before and after it compose to a constant one:
+            # the segment continues.
             segment = self._segments[frame.body + 1]
             self._segments.append((*segment, (aligned, segment[-1][1] @ rotation)))
             composed = frame.composed
         else:
-            # a revolute joint has any angle: a new segment begins
+            # The rotation across a revolute joint is not constant: a new segment begins.
             self._segments.append(((np.eye(3), IDENTITY),))
             composed = aligning.T
         self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)
         return frame.body, rotation, self._seen_from_both(rotation, frame.position)
 
     def inertia(self, link: UrdfLink, inertial: Inertial) -> TenVector:
-        """Return (m, m c, I) of a link about the origin of its body, in the frame of the body (parallel-axis theorem).
+        """Return the inertial parameters (m, m c, I) of a link, (10,) [kg, kg m, kg m2].
 
-        M and V are linear in these parameters.
+        They are about the origin of the frame of the link's body, in this frame (parallel-axis theorem).
         """
         where = f"link {link.name!r} inertial origin"
         origin = self._rounding.origin(inertial.com, inertial.rpy, where, inertial.line)
@@ -203,7 +211,7 @@ class Placement:
         return self._placed(self.frames[joint.parent], *origin)
 
     def _placed(self, frame: Frame, offset: np.ndarray, turn: np.ndarray | None) -> Frame:
-        """Return ``frame`` moved by ``offset`` (3,) [m] and then rotated by ``turn`` (3, 3), if not None."""
+        """Return ``frame`` moved by ``offset`` (3,) [m] and then rotated by ``turn`` (3, 3); None: no rotation."""
         position = self._rounding.position(frame.position + frame.rotation @ offset)
         if turn is None:
             return Frame(frame.body, frame.composed, frame.rotation, position)
@@ -211,21 +219,24 @@ class Placement:
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
     def _seen_from_both(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return the position (3,) of a joint, rounded in the frame of its parent and, if both agree, in its own
-        frame.
+        """Return a position (3,) [m] of a joint with rounding errors removed in two frames.
 
-        An offset of (0.1, 0.1, 0) is parallel to an axis at 45 degrees, but not to its rational approximation.
+        position: position in the frame of the parent body. rotation: rotation (3, 3) of the joint's frame. The position
+        is rounded in the joint's frame too, and kept if both roundings are consistent. Reason: an offset of
+        (0.1, 0.1, 0) is parallel to an axis at 45 degrees, but not exactly to the rational approximation of this axis.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
-        # An offset without a component along an axis may be a zero of M: it is kept if both frames agree.
+        # A component that is exactly 0 may make an entry of M zero, which a rounding error would make nonzero.
         moved = self._rounding.position(rotation @ in_own_frame)
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
-        """Return the exact rotation (3, 3) in the frame of a body for a rotation ``composed`` (3, 3) in its segment.
+        """Return an exact rotation (3, 3) in the frame of a body.
 
-        The rational approximation is made in the frame of the segment for which most zeros are preserved in all frames
-        of the segment: an axis at 45 degrees, which is not rational, may be normal to several other axes.
+        composed: float64 rotation (3, 3) in the frame of the last revolute body, where the segment of the body begins.
+        The rotation relative to one of the bodies of the segment is approximated. The body is chosen for which most
+        zero elements are preserved relative to all bodies of the segment: an axis at 45 degrees, which is not rational,
+        may be normal to several other axes.
         """
         segment = self._segments[body + 1]
         candidates: list[tuple[int, int, np.ndarray]] = []

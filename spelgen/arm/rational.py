@@ -1,4 +1,4 @@
-"""Exact rotations and vectors as arrays of fractions, and rational approximation of angles and rotations."""
+"""Exact rotations and vectors as arrays of fractions, and rational approximations of rotations in floating point."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,16 +13,17 @@ Matrix = tuple[Vector, ...]
 
 @dataclass(frozen=True)
 class GeometryTuning:
-    """Tolerances for the exact values that rounded numbers of a URDF represent."""
+    """Tolerances with which rounded numbers of a URDF are replaced by the exact values that they represent."""
 
-    # [rad, 1] A change of an angle or of an axis below this bound is not reported.
+    # [rad, 1] A change of an angle, or of a component of a unit axis, by at most this number is not reported.
     notable: float = 1e-9
-    # [1] An element of a rotation, or a moment divided by the largest moment, below this bound is rounding and means
-    # 0.
+    # [1] An element of a rotation matrix below this bound is a rounding error and is replaced by 0. So is a product of
+    # inertia whose ratio to the largest moment of inertia is below this bound.
     zero_noise: float = 1e-12
-    # [rad] Largest error of a rational rotation: thousands of times below the accuracy of any calibration.
+    # [rad] Largest error of a rational rotation. It is thousands of times smaller than the error of any calibration.
     rotation_error: float = 1e-11
-    # [1] Bounds of denominators, tried in turn so that the shortest fractions are found first.
+    # [1] Largest denominators of rational approximations. The smallest bound is tried first, so that fractions are
+    # short.
     denominators: tuple[int, ...] = (10**7, 10**10, 10**13)
 
 
@@ -33,28 +34,29 @@ ZERO = np.array([Fraction(0)] * 3)
 
 
 def exact(value: float) -> Fraction:
-    """Return the shortest decimal of a float as a fraction: 0.1 is 1/10."""
+    """Return the shortest decimal number that rounds to a float, as a fraction: 1/10 for 0.1."""
     return Fraction(repr(value))
 
 
 def bounded(value: Fraction) -> Fraction:
-    """Return a number, or the nearest float if it has thousands of digits.
+    """Return a number, rounded to the nearest float if its denominator has more than 4,096 bits.
 
-    Such a number results from dozens of consecutive approximated rotations, and is not exact. Arithmetic with it could
-    take hours for a file from an untrusted source.
+    Such a number results from dozens of consecutive rational approximations of rotations: it is not exact, and rounding
+    loses nothing. Without the bound, arithmetic could take hours for a file from an untrusted source.
     """
     return value if value.denominator.bit_length() <= 4096 else Fraction(float(value))
 
 
 def rounded_angle(angle: float, tolerance: float) -> float:
-    """Return the multiple of pi/2 within ``tolerance`` [rad], else of a finer step within 2e-5, else the angle.
+    """Return an angle [rad] rounded to a special angle if there is one close to it, otherwise the angle itself.
 
-    A tolerance of 0 disables rounding.
+    Special angles are multiples of pi/2 within ``tolerance`` [rad], and multiples of pi/12, pi/8 and pi/5 within 2e-5
+    rad. A tolerance of 0 disables rounding.
     """
     if tolerance == 0.0:
         return angle
-    # The special angles on the CAD drawings of 189 arms. The tolerance of multiples of pi/12, pi/8 and pi/5 is small
-    # because 0.26, 0.39 and 0.63 also occur as exact values.
+    # The divisors of pi give the special angles on the CAD drawings of 189 arms. The tolerance of pi/12, pi/8 and pi/5
+    # is small, because 0.26, 0.39 and 0.63 rad also occur as exact values.
     limits = {2: tolerance, 12: 2e-5, 8: 2e-5, 5: 2e-5}
     for divisor, limit in limits.items():
         step = pi / divisor
@@ -65,8 +67,8 @@ def rounded_angle(angle: float, tolerance: float) -> float:
 
 
 def rotation_from_rpy(rpy: Sequence[float]) -> np.ndarray:
-    """Return Rz(yaw) Ry(pitch) Rx(roll) for the fixed-axis angles of URDF [rad], (3, 3) float64."""
-    # Explicit, because a call of SciPy's Rotation takes longer than all other operations of a joint together.
+    """Return the rotation Rz(yaw) Ry(pitch) Rx(roll), (3, 3) float64; rpy: roll, pitch and yaw of a URDF [rad]."""
+    # SciPy's Rotation is not used: one call takes longer than all other operations for a joint together.
     (cr, cp, cy), (sr, sp, sy) = map(cos, rpy), map(sin, rpy)
     return np.array(
         [
@@ -78,7 +80,7 @@ def rotation_from_rpy(rpy: Sequence[float]) -> np.ndarray:
 
 
 def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return the rotation (3, 3) by ``angle`` [rad] about the unit vector ``axis`` (3,), in float64 (Rodrigues)."""
+    """Return the rotation (3, 3), float64, by ``angle`` [rad] about the unit vector ``axis`` (3,) (Rodrigues)."""
     cross = np.cross(np.eye(3), axis)
     rotation: np.ndarray = np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * (cross @ cross)
     return rotation
@@ -87,8 +89,8 @@ def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
 def alignment(axis: np.ndarray) -> np.ndarray:
     """Return a rotation R (3, 3) with R z = ``axis``, a unit vector (3,).
 
-    For axes along x, y or z it is a signed permutation. For other axes it is followed by the smallest rotation from the
-    closest coordinate axis, which preserves zeros.
+    For an axis along +-x, +-y or +-z, R is a signed permutation. For any other axis, R is the signed permutation for
+    the closest coordinate axis, followed by the smallest rotation from this axis to ``axis``, which preserves zeros.
     """
     index = int(np.argmax(np.abs(axis)))
     sign = 1.0 if axis[index] > 0 else -1.0
@@ -97,7 +99,7 @@ def alignment(axis: np.ndarray) -> np.ndarray:
     cross = np.cross(closest, axis)
     skew = np.cross(np.eye(3), cross)
     smallest = np.eye(3) + skew + skew @ skew / (1.0 + float(closest @ axis))
-    # a signed permutation that maps +z to the closest coordinate axis, or to its opposite
+    # The columns of a signed permutation that maps +z to the closest coordinate axis, with its sign.
     first, second = np.eye(3)[(index + 1) % 3], np.eye(3)[(index + 2) % 3]
     columns = [first, second, closest] if sign > 0 else [second, first, closest]
     if sign < 0 and index == 2:
@@ -108,16 +110,17 @@ def alignment(axis: np.ndarray) -> np.ndarray:
 
 
 def exact_rotation(rotation: np.ndarray, error: float = TUNING.rotation_error) -> np.ndarray:
-    """Return a rational approximation (3, 3) of a float64 rotation (3, 3): orthogonal, within ``error``, same zeros.
+    """Return a rational approximation (3, 3), exactly orthogonal, of a float64 rotation (3, 3).
 
-    The unit quaternion is divided by its largest component and each ratio is replaced by a close fraction; the rotation
-    matrix of an unnormalised rational quaternion is rational (Euler-Rodrigues). A zero that depends on several ratios
-    may be lost. The rotation is then approximated by a signed permutation between two rotations about coordinate axes,
-    which preserves the zero.
+    Elements differ by less than ``error``; a zero element remains zero. The components of the quaternion are divided by
+    the largest one and replaced by close fractions; the rotation matrix of an unnormalised rational quaternion is
+    rational (Euler-Rodrigues). A zero element that depends on several components may thereby become nonzero. The
+    rotation is then approximated by a product that preserves one zero: a rotation about a coordinate axis, a signed
+    permutation, and a rotation about a coordinate axis.
     """
     ratios = _quaternion_ratios(rotation)
     candidate = IDENTITY
-    # Short fractions make exact arithmetic fast.
+    # The smallest bound is tried first, because exact arithmetic with short fractions is fast.
     for bound in TUNING.denominators:
         candidate = _rotation_of([Fraction(ratio).limit_denominator(bound) for ratio in ratios])
         if np.abs(candidate.astype(float) - rotation).max() < error:
@@ -134,7 +137,7 @@ def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
     SciPy's Rotation is not used, because its checks of the input take 0.2 ms per call.
     """
     trace = float(np.trace(rotation))
-    squares = np.empty((4, 4))  # 4 q q^T
+    squares = np.empty((4, 4))  # 4 q q^T of the unit quaternion q
     squares[0, 0] = 1.0 + trace
     squares[1:, 1:] = rotation + rotation.T + (1.0 - trace) * np.eye(3)
     antisymmetric = rotation - rotation.T
@@ -147,14 +150,16 @@ def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
 
 
 def lost_zeros(candidate: np.ndarray, rotation: np.ndarray) -> int:
-    """Return the number of zeros of a float64 rotation (3, 3) that are nonzero in the rational candidate (3, 3)."""
+    """Return the number of zero elements of a float64 rotation (3, 3) that are nonzero in a rational one (3, 3)."""
     return int(np.count_nonzero(candidate[np.abs(rotation) < TUNING.zero_noise]))
 
 
 def _rotation_with_zero(rotation: np.ndarray, row: int, column: int, error: float) -> np.ndarray:
-    """Return a rational approximation of a float64 rotation (3, 3) in which this element is zero.
+    """Return a rational approximation (3, 3) of a float64 rotation whose element (``row``, ``column``) is zero.
 
-    It is the product of a rotation about axis ``row``, a signed permutation, and a rotation about axis ``column``.
+    The element of the approximation is exactly zero. The approximation is the product of a rotation about the
+    coordinate axis ``row``, a signed permutation, and a rotation about the coordinate axis ``column``. error: largest
+    error of an element.
     """
     first = _turn(row, rotation[(row + 1) % 3, column], rotation[(row + 2) % 3, column], error)
     last = _turn(column, rotation[row, (column + 1) % 3], -rotation[row, (column + 2) % 3], error)
@@ -164,9 +169,13 @@ def _rotation_with_zero(rotation: np.ndarray, row: int, column: int, error: floa
 
 
 def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
-    """Return the rational rotation (3, 3) about a coordinate axis by the angle with this cosine and sine."""
-    # Reduction to a quarter turn, so that the approximations of 45 and 135 degrees differ by exactly a right angle.
-    # Common angles are inside the interval of the reduced angles, not at its ends.
+    """Return a rational rotation (3, 3) about the coordinate axis 0, 1 or 2.
+
+    cosine, sine: cosine and sine of the angle in float64, up to a common factor. error: see ``exact_rotation``.
+    """
+    # The angle is a number of quarter turns plus a remainder from -0.7 to 0.87 rad, which is approximated. The
+    # approximations of 45 and 135 degrees then differ by exactly a right angle. The interval does not end at +-45
+    # degrees, so that rounding of these common angles does not change their quarter turn.
     eighth = 0.7  # [rad] just below pi/4
     quarter, angle = divmod(atan2(sine, cosine) + eighth, pi / 2)
     tangent = tan((angle - eighth) / 2)
@@ -174,7 +183,7 @@ def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     if abs(tangent) >= TUNING.zero_noise:
         for bound in TUNING.denominators:
             t = Fraction(tangent).limit_denominator(bound)
-            # The error of the angle is twice the error of t, and two rotations share the bound.
+            # A quarter of the bound: the angle has twice the error of t, and the product has two such rotations.
             if abs(float(t) - tangent) < error / 4:
                 break
     norm = 1 + t * t
@@ -185,7 +194,7 @@ def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
 
 
 def turn_about(axis: int, cosine: Fraction, sine: Fraction) -> np.ndarray:
-    """Return the rotation (3, 3) about the coordinate axis 0, 1 or 2 by the angle with this cosine and sine."""
+    """Return the rotation (3, 3) about the coordinate axis 0, 1 or 2 by the angle with these exact cosine and sine."""
     rotation = IDENTITY.copy()
     first, second = (axis + 1) % 3, (axis + 2) % 3
     rotation[first, first] = rotation[second, second] = cosine
@@ -195,8 +204,8 @@ def turn_about(axis: int, cosine: Fraction, sine: Fraction) -> np.ndarray:
 
 
 def _rotation_of(quaternion: Sequence[Fraction]) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of a quaternion (w, x, y, z) of any norm (Euler-Rodrigues)."""
-    # A common denominator: integers are faster than fractions.
+    """Return the exact rotation matrix (3, 3) of a rational quaternion (w, x, y, z) of any norm (Euler-Rodrigues)."""
+    # All components are multiplied by their common denominator, because integers are faster than fractions.
     common = lcm(*(component.denominator for component in quaternion))
     w, x, y, z = (int(component * common) for component in quaternion)
     v = np.array([x, y, z], dtype=object)

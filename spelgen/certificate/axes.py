@@ -1,7 +1,7 @@
 """Relations between the axes of joints that hold at every configuration, and balance of the last body.
 
-A relation is tested exactly at random rational configurations. A relation that does not hold in general fails at one of
-them with a probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
+A relation is tested in exact arithmetic at two random rational configurations. A relation that does not hold at every
+configuration fails this test with a probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
 """
 
 import random
@@ -17,7 +17,7 @@ from spelgen.urdf.robot import Assume
 
 
 def is_plain(arm: Chain) -> bool:
-    """Return True if the bodies form one chain and each has its own coordinate: no branches, no mimic joints."""
+    """Whether the bodies form one chain and each has its own coordinate: an arm without branches and mimic joints."""
     for index, body in enumerate(arm.bodies):
         if body.parent != index - 1 or body.coordinate != index or body.multiplier != 1:
             return False
@@ -25,18 +25,19 @@ def is_plain(arm: Chain) -> bool:
 
 
 class Axes:
-    """Tests of the axes of the joints of a plain arm at every configuration; joints are counted from 0.
+    """Tests of the axes of the joints of an arm without branches and mimic joints; joints are counted from 0.
 
-    assume: see ``derive``. With ``kinematics`` the last body counts as neither centred nor balanced.
+    A test is True if the relation holds at every configuration. assume: see ``derive``; with ``kinematics`` the
+    inertials are unknown, and the last body is neither centred nor balanced.
     """
 
     def __init__(self, arm: Chain, assume: Assume = "kinematics"):
         self.arm = arm
         self.assume = assume
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
-        generator = random.Random(0)  # reproducible reports
-        # per configuration: directions (n, 3) and twists (n, 6) of the axes
-        # two are enough: one accepts a false relation with a probability of about its degree divided by 1e6
+        generator = random.Random(0)  # a fixed seed, for reproducible reports
+        # For each configuration, the directions (n, 3) and the twists (n, 6) of the axes. Two configurations suffice:
+        # at one, a false relation holds by chance with a probability of about its polynomial degree divided by 1e6.
         self._configurations = [_configuration(arm, generator) for _ in range(2)]
 
     def parallel(self, a: int, b: int) -> bool:
@@ -52,16 +53,16 @@ class Axes:
         return {axes[a] @ axes[b] for axes, _ in self._configurations}
 
     def opposed(self, a: int, b: int) -> bool:
-        """Whether two axes, which are always parallel, have opposite directions."""
-        # The cosine of parallel unit vectors is 1 or -1 at all configurations.
+        """Whether the axes of two joints have opposite directions; they must be parallel at every configuration."""
+        # The cosine of the angle between parallel unit vectors is 1 or -1, equal at all configurations.
         return max(self._cosines(a, b)) < 0
 
     def same_twist(self, a: int, b: int) -> bool:
-        """Whether unit rates of the two joints give equal or opposite velocity fields."""
+        """Whether unit velocities of two joints cause equal or opposite velocity fields of the bodies."""
         return all(_are_parallel(twists[a], twists[b]) for _, twists in self._configurations)
 
     def commute(self, a: int, b: int) -> bool:
-        """Whether motion of one joint does not move the axis of the other: the Lie bracket of the twists is zero."""
+        """Whether motion of one joint does not move the axis of the other: the Lie bracket of both twists is zero."""
         for _, twists in self._configurations:
             (v, w), (v_b, w_b) = np.split(twists[a], 2), np.split(twists[b], 2)
             if np.cross(w, w_b).any() or (np.cross(w, v_b) - np.cross(w_b, v)).any():
@@ -69,9 +70,13 @@ class Axes:
         return True
 
     def keep_offset(self, slider: int, hinge: int) -> bool:
-        """Whether no joint moves the mass carried by ``slider`` normal to the plane of the two directions."""
+        """Whether the mass carried by a prismatic joint keeps its distance from a plane.
+
+        The plane contains the axis of the revolute joint ``hinge``, which is nearer the root, and is parallel to the
+        axis of the prismatic joint ``slider``.
+        """
         if not all(self.prismatic[hinge + 1 : slider]):
-            return False  # a rotation between the two may rotate the plane
+            return False  # a revolute joint between the two joints may rotate the plane
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]
         for axes, twists in self._configurations:
             normal = np.cross(axes[slider], axes[hinge])
@@ -81,7 +86,7 @@ class Axes:
 
     @cached_property
     def centred(self) -> bool:
-        """Whether the centre of mass of the last body is on the axis of its joint, according to the URDF."""
+        """Whether the centre of mass of the last body in the URDF is on the axis of the last joint."""
         return not any(self._last_inertia[1:3])
 
     @cached_property
@@ -92,13 +97,13 @@ class Axes:
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether the inertia of the last body does not change with the angle of its joint."""
+        """Whether the inertia of the last body, seen from the body before, does not depend on the last joint."""
         xx, xy, yy = self._last_inertia[4], self._last_inertia[5], self._last_inertia[7]
         return self.balanced and xx == yy and not xy
 
     @cached_property
     def without_inertia(self) -> bool:
-        """Whether the last body has no moment of inertia about the axis of its joint."""
+        """Whether the last body has no moment of inertia about the axis of the last joint."""
         return not self._last_inertia[9]
 
     @cached_property
@@ -106,24 +111,24 @@ class Axes:
         body = self.arm.bodies[-1]
         if self.assume == "inertials" and body.inertia is not None and body.joint_type == "revolute":
             return body.inertia
-        # Balance is a property of rotations and of the values of the URDF. For a prismatic joint, and for any inertial
-        # values, inertial parameters of one fail every test of balance.
+        # Only a revolute joint with known inertials can be balanced. In all other cases all parameters are set to 1,
+        # for which every test of balance is False.
         return (Fraction(1),) * 10
 
     def is_weightless(self, joint: int) -> bool:
-        """Whether the joint slides horizontally, or rotates about the vertical."""
+        """Whether the joint does no work against gravity: it slides horizontally, or rotates about a vertical axis."""
         gravity = np.array(self.arm.gravity)
         return all(_is_orthogonal(twists[joint], gravity) for _, twists in self._configurations)
 
 
 def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return axes, n times (3,), and twists, n times (6,), of the joints in the root frame, at a random configuration.
+    """Return the axes and twists of the n joints in the root frame, at a random configuration, as fractions.
 
-    A twist is the velocity of a body for a unit rate: linear velocity (3,) at the origin of the root frame, then
-    angular velocity (3,). All numbers are rational.
+    axes: n unit vectors (3,). twists: n vectors (6,), the velocity of a body for a unit velocity of the joint: linear
+    velocity (3,) at the origin of the root frame, then angular velocity (3,).
     """
     axes, twists = [], []
-    # numerators and denominators: with a larger bound fewer relations hold by chance
+    # Range of random numerators and denominators: the larger the range, the fewer relations hold by chance.
     numbers = range(1, 10**6)
     rotation, origin = IDENTITY, ZERO
     for body in arm.bodies:
@@ -150,6 +155,6 @@ def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _is_orthogonal(twist: np.ndarray, direction: np.ndarray) -> bool:
-    """Whether a joint with this twist (6,) moves no point of a body along the direction (3,)."""
+    """Whether a joint with this twist (6,) gives no point of its body a velocity along the direction (3,)."""
     v, w = np.split(twist, 2)
     return not v @ direction and not np.cross(w, direction).any()

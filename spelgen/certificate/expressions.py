@@ -1,9 +1,9 @@
-"""Expressions of SymPy: made from the polynomials of an arm in a canonical form, and printed as text, LaTeX and Python.
+"""SymPy expressions from the polynomials of an arm, and their output as text, LaTeX and Python.
 
-Products of cosines and sines of consecutive joints with parallel axes become cosines and sines of sums of their angles.
-Alternatives (powers of single angles, common factors of several terms) reduce the length of long formulas by 20 %, but
-not the length of formulas that are short enough to be read. Printed decimals have at most twelve digits; Python for
-SymPy has exact fractions. Blanks at which a line must not be broken are no-break spaces until the text is wrapped.
+Products of cosines and sines of the angles of consecutive joints with parallel axes become cosines and sines of sums of
+these angles. Other forms (powers of single angles, common factors of several terms) shorten long formulas by 20 %, but
+not the formulas that are short enough to be read. Printed decimals have at most twelve digits; Python for SymPy has
+exact fractions. Before lines are wrapped, blanks at which a line must not be broken are replaced by no-break spaces.
 """
 
 import re
@@ -21,10 +21,10 @@ from spelgen.arm.arm import Chain
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.structure.recursion import base_denominators
 
-FLOAT_DIGITS = 17  # decimals that determine a double
+FLOAT_DIGITS = 17  # significant decimal digits that determine a double
 _FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at it
 Terms = dict[Expr, fmpq]
-"""A linear combination of products of distances, cosines and sines, with nonzero coefficients."""
+"""A linear combination {product of distances, cosines and sines: coefficient}, with nonzero coefficients."""
 
 
 @cache
@@ -39,9 +39,9 @@ def parameter(name: str) -> Symbol:
 
 
 def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
-    """Return the linear combination of the expressions with these coefficients."""
+    """Return the sum of expressions multiplied by coefficients; terms: expression -> coefficient."""
     products = []
-    # Otherwise SymPy expands 2*(a + b) to 2*a + 2*b.
+    # Without this setting SymPy expands 2*(a + b) to 2*a + 2*b.
     with distribute(False):
         for expression, number in terms.items():
             products.append(Rational(int(number.p), int(number.q)) * expression)
@@ -49,13 +49,16 @@ def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
 
 
 class PolynomialWriter:
-    """Conversion of the polynomials of an arm, over s1, c1, q1, s2, ..., to terms."""
+    """Conversion of polynomials of an arm to SymPy terms.
+
+    The variables of the polynomials are s1, c1, q1, s2, ...: sine, cosine and position per coordinate (`Expansion`).
+    """
 
     def __init__(self, arm: Chain, context: fmpq_mpoly_ctx):
         generators = context.gens()
         waves = zip(generators[::3], generators[1::3], strict=True)
         self._circles = [sine**2 + cosine**2 - 1 for sine, cosine in waves]
-        # angles of mimic joints are multiples of a fraction of the coordinate
+        # s and c are sine and cosine of a fraction of the coordinate: the angles of mimic joints are multiples of it.
         fractions = enumerate(base_denominators(arm))
         self._angles = [coordinate(joint) / denominator for joint, denominator in fractions]
         self._runs = parallel_runs(arm)
@@ -63,12 +66,12 @@ class PolynomialWriter:
     def reduced(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
         """Return the polynomial of the same function in which the power of every sine is at most 1."""
         for circle in self._circles:
-            # The remainder modulo s^2 + c^2 - 1, with s as the leading variable.
+            # The remainder modulo s^2 + c^2 - 1, with s as the leading variable, has no s^2.
             polynomial %= circle
         return polynomial
 
     def terms(self, polynomial: fmpq_mpoly) -> Terms:
-        """Return the terms of a polynomial, with cosines and sines of sums of angles in place of products."""
+        """Return a polynomial as terms, with cosines and sines of sums of angles in place of their products."""
         result: Terms = {}
         for exponents, coefficient in polynomial.terms():
             distances = Integer(1)
@@ -87,9 +90,9 @@ class PolynomialWriter:
 
 
 def parallel_runs(arm: Chain) -> list[list[int]]:
-    """Return the revolute coordinates in groups of consecutive axes that are parallel at every configuration.
+    """Return groups of consecutive revolute coordinates whose axes are parallel at every configuration.
 
-    If bodies share coordinates (mimic joints), each coordinate is its own group.
+    In an arm with mimic joints or branches, each coordinate is a group of its own.
     """
     turning = sorted({body.coordinate for body in arm.bodies if body.joint_type == "revolute"})
     if not is_plain(arm):
@@ -106,11 +109,12 @@ def parallel_runs(arm: Chain) -> list[list[int]]:
 
 @lru_cache(4096)
 def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
-    """Return a product of powers, given as (angle, power of sin, power of cos), as a sum.
+    """Return a product of powers of sines and cosines as a sum.
 
-    Each term is a constant, or a multiple of a cosine or sine of a sum of the angles.
+    powers: one tuple (angle, power of the sine, power of the cosine) per angle. Each term of the sum is a constant, or
+    a multiple of a cosine or sine of a sum of angles.
     """
-    # A wave (angle, k) is cos(angle - k pi/2); sin(x) = cos(x - pi/2).
+    # A key (angle, k) of `waves` represents cos(angle - k pi/2); sin(x) = cos(x - pi/2) has k = 1.
     waves: dict[tuple[Expr, int], fmpq] = {(Integer(0), 0): fmpq(1)}
     for angle, sines, cosines in powers:
         for quarter in [1] * sines + [0] * cosines:
@@ -133,16 +137,19 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
 
 
 def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
-    """Return the sum of parameters times functions; parameters with proportional functions form one product."""
+    """Return the sum of parameters times functions; parameters with proportional functions share one product.
+
+    functions: pairs of the symbol of a parameter and its function.
+    """
     groups: dict[tuple[tuple[Expr, fmpq], ...], dict[Expr, fmpq]] = {}
     for symbol, terms in functions:
         leading = next(iter(terms.values()))
-        # Proportional functions have the same coefficients relative to their first term.
+        # Functions are proportional if their coefficients, divided by the coefficient of the first term, are equal.
         unit = tuple((function, value / leading) for function, value in terms.items())
         groups.setdefault(unit, {})[symbol] = leading
     total = []
     for unit, parameters in groups.items():
-        # The function of a single parameter retains its coefficients, which are dimensions of the arm.
+        # A function of one parameter is not normalised, because its coefficients are dimensions of the arm.
         factor = abs(next(iter(parameters.values()))) if len(parameters) == 1 else fmpq(1)
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))
@@ -164,7 +171,7 @@ def latex(expression: Expr) -> str:
 
 
 def python(expression: Expr) -> str:
-    """Return an expression in Python for SymPy: exact, except fractions with more digits than a float."""
+    """Return an expression as Python code for SymPy, exact except for fractions with more digits than a float."""
     result: str = _PythonPrinter({"sympy_integers": True}).doprint(
         _rounded(expression, 10**FLOAT_DIGITS, FLOAT_DIGITS)
     )
@@ -172,9 +179,12 @@ def python(expression: Expr) -> str:
 
 
 def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
-    """Return ``start``, a formula and ``end`` as lines of at most ``width`` characters if possible."""
+    """Return ``start``, a formula and ``end`` as lines of at most ``width`` characters.
+
+    A line is longer if it has no permitted break.
+    """
     indent = " " * (len(start) - len(start.lstrip()) + 4)
-    # No line break after a sign, nor within angles and short brackets.
+    # A line must not be broken after a sign, nor within arguments of cos and sin and short brackets.
     formula = re.sub(r"([+-]) ", rf"\1{_FIXED}", formula)
     brackets = re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula)
     angles = re.findall(r"(?:cos|sin)\b.*?\)", formula)
@@ -197,12 +207,15 @@ class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
 
 
 def _rounded(expression: Expr, largest: int, digits: int) -> Expr:
-    """Return the expression with decimals for fractions whose numerator or denominator exceeds ``largest``."""
+    """Return the expression with long fractions replaced by decimals of ``digits`` digits.
+
+    A fraction is long if its numerator or denominator exceeds ``largest``.
+    """
     decimals = {}
     for number in expression.atoms(Rational):
         if not number.is_Integer and max(abs(number.p), number.q) > largest:
             decimals[number] = Float(number, digits)
-    # Otherwise SymPy expands products.
+    # Without this setting SymPy expands products of numbers and sums.
     with distribute(False):
         return expression.xreplace(decimals)
 

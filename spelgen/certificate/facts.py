@@ -1,9 +1,9 @@
 """A structure in words: zero, constant and equal entries of M, joints without effect on M or V, and the reasons.
 
-A reason is given only if the exact geometry of the arm proves it. The entry of joints a and b is the integral of
-v_a . v_b over the mass that both move, with v the velocity field of a unit rate; the reasons are properties of this
-integral. Each function of a reason returns None if it knows none. ``{joints}`` and ``{axes}`` in a reason are
-placeholders for the other joints of the entries, and for their axes.
+A reason is given only if the exact geometry of the arm proves it. The entry of M of joints a and b is the integral of
+v_a . v_b over the mass that both joints move, where v_a is the velocity field for a unit velocity of joint a; the
+reasons are properties of this integral. A function that returns a reason returns None if it finds none. In the text of
+a reason, ``{joints}`` and ``{axes}`` are placeholders for the other joints of the entries, and for their axes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -21,10 +21,10 @@ EntryReason = Callable[[Axes, MassEntry], Reason]
 
 @dataclass(frozen=True)
 class Fact:
-    """A property of M or V at all configurations, its consequence for the model (``means``), and its reason.
+    """A property of M or V at all configurations.
 
-    ``reason`` is None if the geometry gives no simple reason, or if bodies share a coordinate: the fact then follows
-    from exact ranks only.
+    ``statement`` is the property, ``means`` its consequence for the model. ``reason`` is None if the geometry gives no
+    simple reason, or if the arm has branches or mimic joints; the fact is then known from exact zeros and ranks only.
     """
 
     statement: str
@@ -38,7 +38,7 @@ class Fact:
 
 def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
     """Return the properties of M and V at all configurations, with simple geometric reasons if there are any."""
-    # A mimic joint moves several bodies, for which the reasons about pairs of axes are not valid.
+    # A coordinate with mimic joints moves several joints, for which reasons about pairs of axes are not valid.
     words = _Sentences(structure, Axes(arm, structure.assume) if is_plain(arm) else None)
     zero = ("always zero", "Nothing is learned for it", "Nothing is learned for them")
     constant = ("constant", "It needs one parameter and no network", "They need parameters and no networks")
@@ -53,7 +53,7 @@ def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
 
 @dataclass(frozen=True)
 class _Sentences:
-    """The facts of a structure. axes: None if bodies share coordinates, and no reasons are given."""
+    """The facts of a structure. axes: None for an arm with branches or mimic joints; no reasons are then given."""
 
     structure: Structure
     axes: Axes | None
@@ -64,8 +64,16 @@ class _Sentences:
     def entries(
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
     ) -> Iterator[Fact]:
-        """Yield facts about the entries of M of this kind: one fact for all entries with the same reason."""
-        # a table of facts would repeat one reason for every entry of a wrist
+        """Yield facts about the zero or the constant entries of M, one fact for all entries with the same reason.
+
+        Args:
+            kind: "zero" or "constant".
+            why: function that returns the reason for an entry.
+            statement: predicate of the sentence about the entries.
+            means_one: consequence for the model, if the fact is about one entry.
+            means_several: consequence for the model, if the fact is about several entries.
+        """
+        # Entries are grouped by reason: otherwise the same reason would be repeated for many entries.
         groups: dict[Reason, list[MassEntry]] = {}
         for entry in self.structure.entries:
             if entry.kind == kind:
@@ -82,14 +90,17 @@ class _Sentences:
             yield Fact(f"{names} {verb} {statement}", means, reason)
 
     def equalities(self) -> Iterator[Fact]:
-        """Yield entries that are equal or opposite at every configuration: they have the same terms."""
+        """Yield a fact for each set of entries of M that are equal, or opposite, at every configuration.
+
+        Such entries have the same terms in the minimal form of M, with equal or opposite factors.
+        """
         terms: dict[tuple[int, int], dict[int, Fraction]] = {}
         for number, term in enumerate((*self.structure.outputs, *self.structure.constants)):
             for row, column, factor in term.basis:
                 terms.setdefault((row, column), {})[number] = factor
         groups: dict[tuple[tuple[int, Fraction], ...], dict[tuple[int, int], bool]] = {}
         for entry, factors in sorted(terms.items()):
-            # Entries are opposite if all factors are opposite: normalise the sign of the first factor.
+            # The first factor is made positive, so that opposite entries have equal factors.
             positive = next(iter(factors.values())) > 0
             if not positive:
                 factors = {number: -factor for number, factor in factors.items()}
@@ -102,10 +113,10 @@ class _Sentences:
                 yield Fact(f"{' = '.join(names)} always", "One of them is learned", reason)
 
     def idle_joints(self) -> Iterator[Fact]:
-        """Yield joints that no entry of M depends on."""
+        """Yield a fact for each joint on which no entry of M depends."""
         inputs = {joint for entry in self.structure.entries for joint in entry.joints}
         if not inputs:
-            return  # M is constant, which other facts state
+            return  # M is constant, which the facts about its entries state
         for joint in sorted(set(range(len(self.structure.joints))) - inputs):
             means = "It is not an input of the networks of M"
             yield Fact(f"M does not depend on joint {joint + 1}", means, self._reason(idle_reason, joint))
@@ -114,7 +125,7 @@ class _Sentences:
         if not self.structure.potential:
             yield Fact("V is zero", "It needs no network", self._reason(potential_reason))
             return
-        # joints with the same reason share a sentence
+        # Joints with the same reason are listed in one fact.
         groups: dict[Reason, list[int]] = {}
         for joint in range(len(self.structure.joints)):
             if joint not in self.structure.potential:
@@ -126,7 +137,7 @@ class _Sentences:
 
 
 def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason for a zero entry."""
+    """Return the reason for an entry of M that is zero."""
     later, earlier = entry.row, entry.column
     slider = later if axes.prismatic[later] else earlier
     if axes.prismatic[later] != axes.prismatic[earlier] and axes.parallel(later, earlier):
@@ -138,7 +149,7 @@ def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason for a constant entry."""
+    """Return the reason for an entry of M that is constant."""
     later, earlier = entry.row, entry.column
     if later == earlier:
         return _diagonal_reason(axes, later)
@@ -159,7 +170,8 @@ def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def _diagonal_reason(axes: Axes, joint: int) -> Reason:
-    # Joints before this one move its load as a rigid body: they do not change the inertia about its axis.
+    # Joints nearer the root move the axis and the load of this joint together: only joints after it can change the
+    # inertia of the load about the axis.
     behind = range(joint + 1, len(axes.prismatic))
     if axes.prismatic[joint]:
         return "the diagonal entry of a prismatic joint is the mass that it carries"
@@ -173,11 +185,14 @@ def _diagonal_reason(axes: Axes, joint: int) -> Reason:
 
 
 def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason for an entry of a balanced last body: Izz times the cosine of the angle between the axes."""
+    """Return the reason for a constant or zero entry of the last joint, if its body is dynamically balanced.
+
+    Such an entry is Izz of the body times the cosine of the angle between the axes of the two joints.
+    """
     last, earlier = len(axes.prismatic) - 1, entry.column
     if not axes.balanced or entry.row != last:
         return None
-    # Rotation about a principal axis through the centre of mass has angular momentum along this axis only.
+    # A body that rotates about a principal axis through its centre of mass has angular momentum along this axis only.
     balanced = f"the load of joint {last + 1} is dynamically balanced"
     if axes.without_inertia:
         return f"{balanced}, and its inertia about the joint axis is zero"
@@ -191,8 +206,11 @@ def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
-    """Return the reason for equal entries of a row: the joints of the columns move the load of the row equally."""
-    # Entries of different rows belong to different loads: there is no simple reason.
+    """Return the reason for equal entries of one row of M: the joints of the columns move the load of the row equally.
+
+    entries: (row, column) of each entry, 0-based.
+    """
+    # Entries of different rows are integrals over different loads, for whose equality there is no simple reason.
     rows, columns = map(sorted, zip(*entries, strict=True))
     if rows[0] != rows[-1]:
         return None
@@ -210,10 +228,11 @@ def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
 
 
 def idle_reason(axes: Axes, joint: int) -> Reason:
-    """Return the reason for M not to depend on ``joint``."""
+    """Return the reason that M does not depend on the position of ``joint``."""
     if joint == 0:
         return "it moves the whole arm as one rigid body"
-    # M does not depend on the pose of the base: a joint that commutes with all joints before it acts as the first.
+    # M does not depend on the first joint, which moves the whole arm. A joint whose motion commutes with all joints
+    # nearer the root could be the first joint.
     nearer = list(range(joint))
     if all(axes.commute(joint, earlier) for earlier in nearer):
         return f"its motion commutes with {joints_in_words(nearer)}, as if it were the first joint"
@@ -223,7 +242,7 @@ def idle_reason(axes: Axes, joint: int) -> Reason:
 
 
 def weightless_reason(axes: Axes, joint: int) -> Reason:
-    """Return the reason for V not to depend on ``joint``."""
+    """Return the reason that V does not depend on the position of ``joint``."""
     if axes.is_weightless(joint):
         if axes.prismatic[joint]:
             return "gravity does no work in a translation orthogonal to it"
@@ -235,7 +254,7 @@ def weightless_reason(axes: Axes, joint: int) -> Reason:
 
 
 def potential_reason(axes: Axes) -> Reason:
-    """Return the reason for V = 0."""
+    """Return the reason that V is zero at all configurations."""
     if not any(axes.arm.gravity):
         return "gravity is zero"
     if all(axes.is_weightless(joint) for joint in range(len(axes.prismatic))):

@@ -19,7 +19,8 @@ from spelgen.labels import printable, short_name
 _LATEX_WIDTH = 140
 _PYTHON_WIDTH = 100
 
-# The docstring comes first: a name in a comment of the first two lines could declare an encoding (PEP 263).
+# The docstring is the start of the file and not the comments with names from the URDF: a comment in the first two lines
+# could declare an encoding (PEP 263).
 _HEAD = '''"""Closed forms of a serial arm's mass matrix M(q) and potential energy V(q), by spelgen.
 
 q: the joints' positions [rad, m]. entries: {(row, column): entry of M}, counted from 1, lower triangle.
@@ -32,7 +33,10 @@ values: what the URDF gives them, where it has inertials.
 
 
 def text(formulas: Formulas, width: int = 80) -> str:
-    """Return the formulas, the definitions of their parameters, and the values of the parameters from the URDF."""
+    """Return a text for a terminal: formulas, definitions of the base parameters, and their values from the URDF.
+
+    width: largest number of characters per line.
+    """
     title = f"{printable(formulas.arm.name)}: closed forms for {formulas.trusted}"
     lines = [*textwrap.wrap(title, width), ""]
     for row in formulas.rows:
@@ -48,10 +52,10 @@ def text(formulas: Formulas, width: int = 80) -> str:
 
 
 def to_dict(formulas: Formulas) -> dict[str, object]:
-    """Return a JSON object; rows and columns are counted from 1, and an expression is null if it is too long."""
+    """Return the formulas as a JSON object. Rows and columns are counted from 1; an omitted expression is null."""
     base, values, entries = [], formulas.values, []
     for symbol, definition in formulas.base_parameters.items():
-        # JSON has no fractions
+        # JSON has no fractions: exact values are rounded to floats.
         value = float(values[symbol]) if symbol in values else None
         base.append({"name": symbol.name, "definition": expressions.text(definition), "value": value})
     for formula in formulas.rows:
@@ -87,7 +91,7 @@ def _parameters(formulas: Formulas, width: int) -> list[str]:
 
 
 def _legend(formulas: Formulas) -> str:
-    # ten inertial parameters a body
+    # A body has ten inertial parameters, so that index // 10 is the index of the body.
     bodies = {index // 10 for base in formulas.base for index, _ in base.weights}
     names = [f"{body + 1} {short_name(formulas.arm.bodies[body].name)}" for body in sorted(bodies)]
     return (
@@ -98,9 +102,9 @@ def _legend(formulas: Formulas) -> str:
 
 
 def latex(formulas: Formulas) -> str:
-    """Return the formulas and the definitions of their parameters in two ``align*`` environments."""
+    """Return LaTeX: the formulas, and the definitions of the base parameters, in two ``align*`` environments."""
     rows = {Symbol(row.name): row.expression for row in formulas.written}
-    # a base parameter that equals an inertial parameter needs no definition
+    # A base parameter that equals a single inertial parameter has its name and needs no definition.
     definitions = {name: x for name, x in formulas.base_parameters.items() if not x.is_Symbol}
     result = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
     result += _comments(formulas, "%")
@@ -110,17 +114,17 @@ def latex(formulas: Formulas) -> str:
             start = f"{expressions.latex(name)} &= "
             aligned += expressions.lines(expressions.latex(expression), start, _LATEX_WIDTH)
         if aligned:
-            # continuation lines are indented
+            # The second and further lines of a formula are indented by \quad.
             body = " \\\\\n".join(re.sub("^ +", r"    &\\quad ", line) for line in aligned)
             result += [r"\begin{align*}", body, r"\end{align*}"]
     return "\n".join(result) + "\n"
 
 
 def sympy_source(formulas: Formulas) -> str:
-    """Return the text of the file for SymPy."""
+    """Return the text of a Python file that defines the formulas as SymPy expressions."""
     n = len(formulas.q)
     body = _table("entries", formulas.entries)
-    # an incomplete matrix is omitted
+    # M is omitted if one of its entries has no expression.
     if formulas.mass_matrix is not None:
         body.append(f"M = Matrix({n}, {n}, lambda i, j: entries[max(i, j) + 1, min(i, j) + 1])")
     body.append("")
@@ -139,8 +143,8 @@ def _table(name: str, rows: Mapping[tuple[int, int], Expr] | Mapping[Symbol, Exp
 
 
 def _beginning(formulas: Formulas, body: str) -> list[str]:
-    """Return the comments, the imports that ``body`` needs, and the symbols."""
-    # Linters reject unused imports.
+    """Return the lines before ``body``: comments, the imports that ``body`` needs, and definitions of the symbols."""
+    # Only names that occur in `body` are imported, because linters reject unused imports.
     imported = sorted({"Symbol", *re.findall(r"\b(Add|Matrix|S|cos|sin)\(", body)})
     inertial = {symbol.name for x in formulas.base_parameters.values() for symbol in x.free_symbols}
     positions = [symbol.name for symbol in formulas.q]
@@ -148,12 +152,12 @@ def _beginning(formulas: Formulas, body: str) -> list[str]:
     lines = [*_comments(formulas, "#"), "", f"from sympy import {', '.join(imported)}", ""]
     for name in dict.fromkeys([*positions, *sorted(inertial), *bases]):
         lines.append(f'{name} = Symbol("{name}", real=True)')
-    # a tuple of one element needs a trailing comma
+    # A tuple of one element needs a trailing comma in Python.
     return [*lines, f"q = ({', '.join(positions)}{',' * (len(positions) == 1)})", ""]
 
 
 def _comments(formulas: Formulas, mark: str) -> list[str]:
-    """Return the names of the robot, the joints and the bodies as comments."""
+    """Return the names of robot, joints and bodies, and the omitted entries, as comments that begin with ``mark``."""
     arm = formulas.arm
     lines = [f"{mark} Robot {json.dumps(arm.name)}, for {formulas.trusted}."]
     for number, coordinate in enumerate(arm.coordinates, start=1):

@@ -1,7 +1,8 @@
 """Closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
 
-Each entry is expanded exactly (``expansion``), its terms are collected per base parameter (``base_parameters``) and
-expressed with sums of angles (``expressions``). For an entry that is too long, only the number of terms is given.
+Each entry of M, and V, is expanded exactly (``expansion``). Its terms are collected per base parameter
+(``base_parameters``) and expressed with sums of angles (``expressions``). For an entry that is too long, only the
+number of terms is given.
 """
 
 from dataclasses import dataclass
@@ -30,18 +31,18 @@ from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 
 WRITABLE = 3000
-"""Largest number of terms of an entry in a file for programs, or of a single requested entry."""
+"""Largest number of terms of an entry that is written to a file, or requested as a single entry."""
 
 Entry = tuple[int, int] | Literal["V"]
-"""An entry of M, (row, column) from 1, or V."""
+"""An entry of M as (row, column), counted from 1, or the potential energy V."""
 
 
 @dataclass(frozen=True)
 class Formula:
-    """An entry of the lower triangle of M, or V: its number of terms and its expression.
+    """Closed form of an entry of the lower triangle of M, or of V.
 
-    terms: products of a base parameter and a monomial in cosines, sines and distances; None if the expansion exceeds
-    its budget. expression: with sums of angles; None if it is too long.
+    terms: number of terms, that is, products of a base parameter and a monomial in cosines, sines and distances; None
+    if the expansion exceeds its budget. expression: SymPy expression; None if the entry is too long.
     """
 
     entry: Entry
@@ -50,12 +51,12 @@ class Formula:
 
     @property
     def name(self) -> str:
-        """``M21`` or ``V``."""
+        """Name of the entry, such as ``M21``, or ``V``."""
         return "V" if self.entry == "V" else entry_name(self.entry[0] - 1, self.entry[1] - 1)
 
     @property
     def omission(self) -> str:
-        """The reason for an entry without expression."""
+        """Text with the reason why an entry has no expression."""
         if self.terms is None:
             return "too many terms to be expanded"
         return f"{self.terms} terms, not written out"
@@ -63,9 +64,9 @@ class Formula:
 
 @dataclass(frozen=True, repr=False)
 class Formulas:
-    """Closed forms of ``arm`` in the base parameters ``base``; V up to a constant.
+    """Closed forms of M, and of V up to a constant, of ``arm`` in the base parameters ``base``.
 
-    With ``inertials``, terms that vanish for the values of the URDF are omitted.
+    If ``assume`` is ``inertials``, terms that vanish for the inertials of the URDF are omitted.
     """
 
     arm: Chain
@@ -75,17 +76,20 @@ class Formulas:
 
     @property
     def q(self) -> tuple[Symbol, ...]:
-        """The positions of the joints [rad, m]."""
+        """Symbols of the positions of the joints [rad, m]."""
         return tuple(map(coordinate, range(len(self.arm.coordinates))))
 
     @cached_property
     def entries(self) -> dict[tuple[int, int], Expr]:
-        """Expressions of the entries of M that are not too long: {(row, column): entry}, lower triangle, from 1."""
+        """Expressions of the entries of M that are not too long, {(row, column): expression}.
+
+        The entries are in the lower triangle; rows and columns are counted from 1.
+        """
         return {row.entry: row.expression for row in self.written if row.entry != "V"}
 
     @property
     def mass_matrix(self) -> Matrix | None:
-        """M(q); None if an entry has no expression."""
+        """M(q) as a SymPy matrix (n, n); None if an entry has no expression."""
         n = len(self.arm.coordinates)
         if len(self.entries) < n * (n + 1) // 2:
             return None
@@ -93,12 +97,12 @@ class Formulas:
 
     @property
     def potential(self) -> Expr | None:
-        """V(q) [J]; None if it has no expression."""
+        """Expression of V(q) [J]; None if V has no expression."""
         return next((row.expression for row in self.written if row.entry == "V"), None)
 
     @property
     def base_parameters(self) -> dict[Symbol, Expr]:
-        """Return the definition of each base parameter as a sum of inertial parameters of the bodies.
+        """Definition of each base parameter as a sum of inertial parameters of the bodies.
 
         m is a mass [kg], h = m c a first moment [kg m] and I an inertia tensor [kg m2] about the origin of the joint's
         frame, whose z axis is the axis of the joint.
@@ -111,12 +115,12 @@ class Formulas:
 
     @property
     def values(self) -> dict[Symbol, Rational]:
-        """Exact values of the base parameters from the URDF, if it has inertials."""
+        """Exact values of the base parameters for the inertials of the URDF; empty if the URDF has none."""
         return {parameter(base.name): Rational(base.value) for base in self.base if base.value is not None}
 
     @property
     def trusted(self) -> str:
-        """The inertial values for which the formulas are valid."""
+        """Text that states the inertial values for which the formulas are valid."""
         return (
             "the URDF's inertial zeros and symmetries"
             if self.assume == "inertials"
@@ -125,12 +129,12 @@ class Formulas:
 
     @property
     def written(self) -> tuple[Formula, ...]:
-        """The entries with an expression."""
+        """The entries of M, and V, that have an expression."""
         return tuple(row for row in self.rows if row.expression is not None)
 
     @property
     def unwritten(self) -> tuple[Formula, ...]:
-        """The entries without an expression."""
+        """The entries of M, and V, that have no expression, because they are too long."""
         return tuple(row for row in self.rows if row.expression is None)
 
     def __repr__(self) -> str:
@@ -138,7 +142,7 @@ class Formulas:
         return f"<Formulas of {self.arm.name!r}: {counts}>"
 
     def _repr_html_(self) -> str:
-        """A table of LaTeX, for a notebook."""
+        """Return a table of the entries in LaTeX, for a notebook."""
         rows = []
         for row in self.rows:
             rows.append((row.name, row.omission if row.expression is None else f"${latex(row.expression)}$"))
@@ -148,28 +152,35 @@ class Formulas:
 def formulas(
     arm: Chain, structure: Structure, *, entry: Entry | None = None, longest: int | None = None
 ) -> Formulas:
-    """Return closed forms of all entries of M and of V, or of one ``entry``.
+    """Return closed forms of all entries of M and of V, or of one entry.
 
-    Entries of more than ``longest`` terms (by default 40, for one entry ``WRITABLE``) have no expression.
+    Args:
+        arm: The arm.
+        structure: Structure of the arm.
+        entry: The entry; None: all entries.
+        longest: Largest number of terms of an entry; longer entries have no expression. Default: 40, or ``WRITABLE``
+            for one entry.
+
     Raises SpelgenError for an entry that M does not have.
     """
     n = len(arm.coordinates)
     entries: list[Entry] = [*((row + 1, column + 1) for row, column in triangle(n)), "V"]
     if entry is not None:
         lower: Entry = entry if entry == "V" else (max(entry), min(entry))
-        # M is symmetric: 1,2 is written as 2,1
+        # M is symmetric, and only its lower triangle is computed: entry 2,1 is returned for 1,2.
         if lower not in entries:
             expected = f"a row and a column from 1 to {n}, or V"
             raise SpelgenError(f"the entry {entry[0]},{entry[1]} of M", expected=expected)
         entries = [lower]
     if longest is None:
-        # 40 terms are three lines of a terminal
+        # Entries of up to 40 terms, about three lines of a terminal, can be read.
         longest = 40 if entry is None else WRITABLE
     writer = _Writer(arm, structure)
     budget = Budget(2_000_000)  # multiplications of terms, about 2 s
-    # Entries close to the tip are short: they come first, before the budget is exhausted.
+    # Entries of joints close to the tip are short. They are expanded first, so that they are complete if the budget
+    # does not suffice for all entries.
     rows = [writer.formula(x, longest, budget) for x in reversed(entries)]
-    # For a single entry, list only its own parameters.
+    # For a single entry, only the base parameters in its expression are listed.
     base = writer.base
     if entry is not None:
         symbols = (rows[0].expression or Integer(0)).free_symbols
@@ -178,7 +189,7 @@ def formulas(
 
 
 class _Writer:
-    """The formulas of the entries of one arm; recursion and base parameters are computed once."""
+    """Computes the formulas of single entries; the recursion and the base parameters of the arm are computed once."""
 
     def __init__(self, arm: Chain, structure: Structure):
         self._at_urdf_values = structure.assume == "inertials"
@@ -187,12 +198,12 @@ class _Writer:
         self._writer = PolynomialWriter(arm, self._expansion.context)
 
     def formula(self, entry: Entry, longest: int, budget: Budget) -> Formula:
-        """Return an entry; it has no expression if it has more than ``longest`` terms or exceeds ``budget``."""
+        """Return the formula of an entry, without expression if it exceeds ``longest`` terms or the budget."""
         try:
             polynomials = self._polynomials(entry, budget)
         except TooLarge:
             return Formula(entry, None, None)
-        # counted first: an entry that is too long is not converted to expressions
+        # The terms are counted before the conversion to SymPy, which would be slow for an entry that is too long.
         terms = sum(map(len, polynomials.values()))
         if terms > longest:
             return Formula(entry, terms, None)
@@ -209,16 +220,17 @@ class _Writer:
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:
-            # The coefficient of a base parameter is the coefficient of its first inertial parameter.
+            # A base parameter has the same coefficient in M as its first inertial parameter, which is in no other one.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index, budget))
-            # V has an arbitrary constant: without it the formula is shorter
+            # V is determined up to a constant: constant terms are omitted.
             if entry == "V":
                 polynomial -= polynomial[(0,) * self._expansion.context.nvars()]
             polynomials[base.name] = polynomial
             total += rational(base.value or Fraction(0)) * polynomial
         if not self._at_urdf_values:
             return polynomials
-        # For the values of the URDF, a monomial may cancel between parameters.
+        # For the inertials of the URDF, terms of different parameters with the same monomial may cancel: monomials with
+        # a total coefficient of zero are removed.
         remaining = set(total.monoms())
         for name, polynomial in polynomials.items():
             terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}

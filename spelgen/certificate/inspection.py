@@ -21,14 +21,17 @@ from spelgen.structure.servo_rank import servo_rank
 from spelgen.structure.structure import MassEntry, Structure, derive
 from spelgen.urdf.robot import Assume
 
-if TYPE_CHECKING:  # SymPy is imported for formulas only
+if TYPE_CHECKING:  # not imported at run time, since these modules import SymPy, which is slow
     from spelgen.certificate.formulas import Entry as PlaceOfEntry
     from spelgen.certificate.formulas import Formulas
 
 
 @dataclass(frozen=True, repr=False)
 class Inspection:
-    """The facts that ``spelgen inspect`` shows of an arm."""
+    """The result of ``spelgen inspect`` for an arm: structure, inputs and diagnostics.
+
+    input: whether the inputs of the arm are torques, or positions of servos.
+    """
 
     arm: Chain
     structure: Structure
@@ -38,17 +41,17 @@ class Inspection:
 
     @property
     def facts(self) -> tuple[Fact, ...]:
-        """Return the facts about the structure, in plain words."""
+        """Facts about the structure as sentences."""
         return facts(self.arm, self.structure)
 
     def closed_forms(self, entry: PlaceOfEntry | None = None, *, longest: int | None = None) -> Formulas:
-        """Return M and V, or one entry, as expressions; arguments and errors as for ``formulas.formulas.formulas``."""
+        """Return M and V, or one entry, as expressions; arguments and errors: see ``certificate.formulas.formulas``."""
         from spelgen.certificate.formulas import formulas
 
         return formulas(self.arm, self.structure, entry=entry, longest=longest)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the documented JSON object; names are the names in the URDF, rows and columns are counted from 1."""
+        """Return the result as a JSON object. Names are names in the URDF; rows and columns are counted from 1."""
         structure = self.structure
         entries = []
         for entry in structure.entries:
@@ -95,7 +98,7 @@ class Inspection:
         cells, n = self._cells(), len(self.structure.joints)
         rows = []
         for row, name in enumerate(self.structure.joints):
-            # M is symmetric
+            # M is symmetric, and only its lower triangle has cells.
             line = [cells[max(row, column), min(row, column)] for column in range(n)]
             rows.append((f"{row + 1} {name}", *line))
         title = f"{self.arm.name}: mass matrix; joints each entry depends on, C constant, 0 always zero"
@@ -108,7 +111,7 @@ class Inspection:
 
     def _input_matrix(self) -> dict[str, object]:
         n = len(self.structure.joints)
-        # JSON contains the zero entries of G as well
+        # The JSON object contains zero entries of G too, unlike `actuation.entries`.
         values = {(entry.row, entry.column): (entry.kind, entry.value) for entry in self.actuation.entries}
         entries: list[dict[str, object]] = []
         for row, column in product(range(n), repeat=2):
@@ -116,7 +119,7 @@ class Inspection:
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
         if self.input == "torque":
             return {"entries": entries}
-        # logs of torques have a scale; under servos only ratios are determined, and JSON states which
+        # Logs of position servos determine only ratios of parameters, which are listed; logs of torques determine all.
         rank = servo_rank(self.arm)
         undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
         ratios = list(map(self._names, rank.groups))
@@ -124,10 +127,10 @@ class Inspection:
         return {**content, "entries": entries}
 
     def _servo_needs(self) -> str:
-        """Return the parameters that logs of positions determine, in words."""
-        # Logs of positions do not determine the scale of torques: kp, mass and friction may be multiplied by a factor.
+        """Return a text with the parameters that logs of position servos determine."""
+        # Logs of positions do not determine the scale of torques: kp, mass and friction of a group of joints may be
+        # multiplied by a common factor. One known parameter of the group determines this factor.
         rank = servo_rank(self.arm)
-        # One known torque parameter determines the scale of a group of joints.
         determined = f"those of {' or of '.join(map(joints_in_ranges, rank.groups))}"
         if len(rank.groups) == 1:
             determined = "all"
@@ -144,11 +147,11 @@ class Inspection:
         return text
 
     def _input_needs(self) -> str:
-        """Return the requirements on G in words."""
+        """Return a text about the input matrix G and the servos of the model."""
         needs = ["fixed"]
         if self.input == "position":
             needs = [self._servo_needs()]
-        # logs contain motor torques, which a model converts to joint torques
+        # G is not the identity if the logs contain motor torques, which the model converts to joint torques.
         if not self.actuation.direct:
             needs = ["motor torques"]
             for kind, meaning in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
@@ -157,7 +160,7 @@ class Inspection:
                     needs.append(f"{meaning} at {_rows(entries)}")
         if self.actuation.couplings:
             needs.append(f"motors coupled at {_rows(self.actuation.couplings)}")
-        # a joint without a drive has no input
+        # Joints without a drive are listed, because they have no input.
         if self.structure.passive:
             needs.append(f"{joints_in_ranges(self.structure.passive)} without a drive")
         return ", ".join(needs)
@@ -174,10 +177,10 @@ class Inspection:
         return {(entry.row, entry.column): cell_text(entry) for entry in self.structure.entries}
 
     def _matrix(self) -> str:
-        """Return the lower triangle of M as aligned text: the joints that each entry depends on."""
+        """Return the lower triangle of M as an aligned text, with the joints on which each entry depends."""
         cells, n = self._cells(), len(self.structure.joints)
         lines = ["Mass matrix: joints each entry depends on; C constant, 0 always zero"]
-        # each column as narrow as possible: seven joints must fit into 80 characters
+        # Each column is as narrow as its widest cell, so that M of seven joints fits into 80 characters.
         widths = [max(len(cells[row, column]) for row in range(column, n)) for column in range(n)]
         for row in range(n):
             line = f"  {row + 1:>2}"
@@ -187,14 +190,17 @@ class Inspection:
         return "\n".join(lines)
 
     def needs(self) -> dict[str, str]:
-        """Return the requirements of a model of M(q), V(q) and G in words, and the number of base parameters."""
+        """Return texts about the functions and constants that a model of M(q), V(q) and G needs.
+
+        The keys are "M(q)", "V(q)", "G" and "base", for the number of base parameters.
+        """
         structure = self.structure
-        # outputs that depend on the same joints are one network
+        # Outputs are counted per set of joints, because outputs that depend on the same joints are one network.
         counts = Counter(output.joints for output in structure.outputs)
         outputs, constants = len(structure.outputs), len(structure.constants)
         mass = f"{counted(outputs, 'output')} and {counted(constants, 'constant')}"
         mass += f" make all {len(structure.entries)} entries"
-        # an arm whose M is constant needs no networks
+        # An arm whose M is constant needs no networks, and has no groups to list.
         if counts:
             groups = [f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items()]
             mass += f": {'; '.join(groups)}"
@@ -216,7 +222,7 @@ class Inspection:
 
 
 def _rows(entries: Iterable[InputEntry]) -> str:
-    """Return the joints (rows) of these entries of G, in words."""
+    """Return the joints, which are the rows, of these entries of G as text."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
 
 
@@ -233,7 +239,7 @@ def _remark(diagnostic: Diagnostic) -> str:
 
 
 def range_text(coordinate: Coordinate) -> str:
-    """Return the range of a joint with its unit."""
+    """Return the range of a joint as text, with its unit."""
     if coordinate.continuous:
         return "continuous"
     if coordinate.lower is None or coordinate.upper is None:
@@ -242,7 +248,7 @@ def range_text(coordinate: Coordinate) -> str:
 
 
 def cell_text(entry: MassEntry) -> str:
-    """Return the joints that an entry of M depends on; C: constant, 0: always zero."""
+    """Return the joints on which an entry of M depends as text; "C" for a constant entry, "0" for a zero entry."""
     return {"zero": "0", "constant": "C"}.get(entry.kind, joint_ranges(entry.joints))
 
 
@@ -257,12 +263,15 @@ def inspect(
     """Return the derived structure of an arm.
 
     Args:
-        arm: the result of ``load_arm``, or the path of a URDF; the other arguments of ``load_arm`` go with a path.
+        arm: The result of ``load_arm``, or the path of a URDF.
+        joints: See ``load_arm``; used only with a path.
+        tip: See ``load_arm``; used only with a path.
         assume: ``kinematics``: structure for any inertial parameters; ``inertials``: for the parameters of the URDF.
+        angle_tolerance: See ``load_arm``; used only with a path [rad].
 
-    Raises the errors of ``load_arm``, and ArmError for ``inertials`` if the URDF has none.
+    Raises the errors of ``load_arm``, and ArmError for ``inertials`` if a body has no inertial.
     """
-    # an arm that is loaded keeps its own options
+    # An arm that was loaded before has its own joints, tip and tolerance.
     if not isinstance(arm, Arm):
         arm = load_arm(arm, joints, tip, angle_tolerance)
     structure = derive(arm.chain, assume)

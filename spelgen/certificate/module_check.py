@@ -1,4 +1,4 @@
-"""Whether a module is up to date with its URDF: the function ``check``."""
+"""Test that a module that spelgen has built is up to date with its URDF: the function ``check``."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +12,11 @@ from spelgen.structure.structure import derive
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Whether a module is up to date with its URDF; ``reasons`` state the differences."""
+    """Result of ``check``.
+
+    ``urdf`` is the path of the URDF. ``fresh`` is True if the module is up to date; otherwise ``reasons`` state the
+    differences. ``proof`` is the numerical verification of the structure.
+    """
 
     urdf: Path
     fresh: bool
@@ -21,27 +25,32 @@ class CheckResult:
 
 
 def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
-    """Derive the module at ``module`` again with its own options, compare it, and verify its structure numerically.
+    """Derive a module again with its own options, compare the result, and verify its structure numerically.
 
-    Without ``urdf``, the URDF is searched by its name in the folder of the module, the current folder and
-    ``robots/``. Raises ModuleError if there is none, or if the file is no module.
+    Raises ModuleError if the URDF is not found, or if the file is not a module of spelgen.
+
+    Args:
+        module: Path of the module.
+        urdf: Path of the URDF; None: it is searched by its name in the folder of the module, the current folder and
+            ``robots/``.
     """
     module = Path(module)
     text = read_source(module)
     stated = parse_spec(text, module)
     path = Path(urdf) if urdf is not None else find_urdf(module, stated.urdf)
     arm = arm_of_spec(stated, path)
-    # the path of the URDF may differ from the one at the time of the build; its digest is compared
+    # The digest of the URDF is compared and not its path, because the file may have been moved since the build.
     spec = replace(derive_spec(arm, stated.options), urdf=stated.urdf)
     reasons = []
     if spec.urdf_sha256 != stated.urdf_sha256:
         reasons.append(f"{path} has changed since the module was built")
     if spec.sha256 != stated.sha256:
         reasons.append("the derived model differs from the one in the module")
-    # a module is built again in both forms, because its text does not state its form
+    # The text is compared with both forms of the module, standalone or not, because it does not state its form.
     if text not in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         reasons.append("the text of the module differs from that of `spelgen build`")
-    # independently of the comparison: an error of the derivation would be in both texts
+    # The comparison cannot detect an error of the derivation, which would be in both texts. The verification by
+    # Pinocchio is independent of the derivation.
     proof = verify(arm.robot, arm.chain, derive(arm.chain, stated.options.assume))
     reasons += [str(difference) for difference in proof.differences]
     return CheckResult(path, not reasons, tuple(reasons), proof)

@@ -1,11 +1,12 @@
-"""Computations by Pinocchio that a structure is verified with: random samples of an arm, and its reading of the URDF.
+"""Computations by Pinocchio for the verification of a structure: random samples, and a second reading of the URDF.
 
-Samples: mass matrices, gravity torques and torque regressors at random configurations. Random inertial parameters are
-physically consistent: their pseudo-inertia is positive definite (Wensing, Kim and Slotine, RA-L 3(1), 2018).
+The samples are mass matrices, gravity torques and torque regressors of a chain at random configurations. Random
+inertial parameters are physically consistent: their pseudo-inertia is positive definite (Wensing, Kim and Slotine, RA-L
+3(1), 2018).
 
-The reading is compared with the chain: axes of joints, masses and inertias. It detects errors of reading, which checks
-of the derivation cannot detect, because the derivation starts from the chain. Pinocchio does not round angles: a chain
-with rounded angles is also made from the file without rounding.
+The URDF is also read by Pinocchio, and axes of joints, masses and inertias are compared with the chain. This detects
+errors in the reading of the file, which the samples cannot detect, because they start from the chain. Pinocchio does
+not round angles: it is compared with a chain without rounding, and the effect of rounding is computed separately.
 """
 
 import hashlib
@@ -33,9 +34,9 @@ TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 class NumericSamples:
     """Samples of M and of the gravity torque.
 
-    mass: lower triangles of M divided by ``scale``, (1 + n, S, n(n+1)/2); in block k only coordinate k differs from
-    block 0. scale: geometric mean of the diagonal entries of row and column, (n(n+1)/2,). gravity: dV/dq divided by its
-    largest value, (S, n).
+    mass: lower triangles of M divided by ``scale``, (1 + n, S, n(n+1)/2); block 1 + k has the positions of block 0,
+    except for coordinate k (k from 0). scale: geometric mean of the mean diagonal entries of row and column,
+    (n(n+1)/2,). gravity: gravity torque dV/dq divided by its largest magnitude, (S, n).
     """
 
     mass: np.ndarray
@@ -44,37 +45,40 @@ class NumericSamples:
 
     @property
     def changes(self) -> np.ndarray:
-        """Differences of M between block k and block 0, (n, S, n(n+1)/2)."""
+        """Differences of M between each further block and block 0, (n, S, n(n+1)/2)."""
         result: np.ndarray = self.mass[1:] - self.mass[0]
         return result
 
 
 def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:
-    """Return samples at ``count`` configurations, with random inertial parameters or those from the URDF."""
+    """Return samples at ``count`` random configurations.
+
+    random_inertials: whether each sample has other random inertial parameters; otherwise they are from the URDF.
+    """
     n = len(arm.coordinates)
     rows, columns = np.tril_indices(n)
     mass = np.zeros((1 + n, count, n, n))
     gravity = np.zeros((count, n))
     for sample in range(count):
         dynamics = arm_dynamics(with_random_inertias(arm, rng) if random_inertials else arm, Settings())
-        # Every further row differs from the base in one coordinate: a difference of M is an effect of this
-        # coordinate.
+        # Each further row of q differs from the first in one coordinate, so that a difference of M is an effect of
+        # this coordinate.
         base, moved = _positions(arm, rng), _positions(arm, rng)
         q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)  # (1 + n, n)
         mass[:, sample] = dynamics.mass_matrix(q)
         gravity[sample] = dynamics.gravity(base)
-    # Entries have different units (kg, kg m, kg m2): each is relative to its own scale.
+    # Entries have different units (kg, kg m, kg m2), and are therefore divided by scales with the same units.
     diagonal = np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1))
     scale = np.sqrt(np.outer(diagonal, diagonal))[rows, columns]
     scale[scale == 0] = 1.0
-    # An arm without gravity has zeros, which are compared without a unit.
+    # Without gravity all torques are zero, and are not divided.
     largest = np.abs(gravity).max() or 1.0
     return NumericSamples(mass[:, :, rows, columns] / scale, scale, gravity / largest)
 
 
 def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
-    """Return rows of the inverse-dynamics regressor at random q, qd, qdd, (m n, 10 B) for B bodies."""
-    # The regressor does not depend on the inertial parameters.
+    """Return the torque regressors at m random states q, qd, qdd, (m n, 10 B) for n coordinates and B bodies."""
+    # The regressor does not depend on inertial parameters. Random ones are used, because Pinocchio needs some values.
     dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
     n, bodies = len(arm.coordinates), len(arm.bodies)
     rows = []
@@ -83,23 +87,24 @@ def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
         qd = dynamics.jacobian @ rng.normal(size=n)
         qdd = dynamics.jacobian @ rng.normal(size=n)
         by_joint = pin.computeJointTorqueRegressor(dynamics.model, dynamics.data, q, qd, qdd)
-        # Pinocchio returns a vector for a single joint.
+        # Pinocchio returns a vector in place of a matrix for a single joint.
         rows.append(dynamics.jacobian.T @ by_joint.reshape(bodies, -1))
     return np.concatenate(rows)
 
 
 def _positions(arm: Chain, rng: np.random.Generator) -> np.ndarray:
     """Return random positions (n,) [rad, m]."""
-    # The structure holds at every configuration, also outside the limits.
+    # Limits of joints are not used, because the structure is valid at every configuration.
     half_range = np.where(np.array(arm.joint_types) == "revolute", np.pi, 1.0)
     return rng.uniform(-half_range, half_range)
 
 
 def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
-    """Return the arm with random, physically consistent inertial parameters of all bodies."""
+    """Return the arm with random inertial parameters of all bodies, which are physically consistent."""
     translations = np.array([body.translation for body in arm.bodies], dtype=float)
     size = float(np.linalg.norm(translations, axis=1).mean()) or 1.0
-    # A A^T is a positive definite pseudo-inertia; lengths have the magnitude of the arm's.
+    # A A^T is a positive definite pseudo-inertia for a random A, `factors`. Centres of mass and radii of gyration are
+    # of the magnitude of the distances between joints.
     factors = rng.normal(size=(len(arm.bodies), 4, 4)) * np.array([[size], [size], [size], [1.0]])
     bodies = []
     for body, inertia in zip(arm.bodies, parameters_of(factors @ factors.mT).tolist(), strict=True):
@@ -109,7 +114,11 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
 
 @dataclass(frozen=True)
 class ReadingDifference:
-    """Largest differences of a quantity, relative to its size: from Pinocchio's reading, and by rounded angles."""
+    """Largest differences of a quantity, relative to its magnitude.
+
+    difference: between the chain without rounding and the reading by Pinocchio. rounding: between the chain without
+    rounding and the chain of the arm.
+    """
 
     quantity: str
     difference: float
@@ -117,9 +126,9 @@ class ReadingDifference:
 
 
 def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingDifference]:
-    """Compare ``arm`` with Pinocchio's reading of the same bytes at random configurations.
+    """Return the differences of an arm from the reading of its URDF by Pinocchio, at random configurations.
 
-    Raises any exception of Pinocchio, and ValueError if the file has changed.
+    seed: seed of the configurations. Raises any exception of Pinocchio, and ValueError if the file has changed.
     """
     dynamics = _pinocchio_dynamics(robot, arm)
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, len(arm.coordinates)))
@@ -131,7 +140,9 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
         del written["masses and inertias"]
     differences = []
     for quantity, values in written.items():
-        # Relative to the magnitude of each number, so that light bodies count; bounded below against rounding errors.
+        # Differences are relative to the magnitude of each number, so that errors of light bodies are detected. A
+        # thousandth of the largest magnitude is added, so that rounding errors of numbers close to zero are not
+        # reported as differences.
         scale = np.abs(values).max(axis=0) + (1e-3 * np.abs(values).max() or 1.0)
         pair = (np.abs(samples[quantity] - values) / scale for samples in (theirs, ours))
         differences.append(ReadingDifference(quantity, *(float(apart.max()) for apart in pair)))
@@ -139,12 +150,12 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
 
 
 def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
-    """Return the dynamics of the URDF by Pinocchio's reader. Raises ValueError if the file has changed."""
+    """Return the dynamics of the URDF as read by Pinocchio. Raises ValueError if the file has changed."""
     data = urdf_bytes(robot.path)
     if hashlib.sha256(data).hexdigest() != robot.digest:
         raise ValueError("the file has changed since it was read")
     root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True))
-    # Pinocchio rejects files with some limits and friction, which are not compared.
+    # Limits and friction are replaced, because they are not compared, and Pinocchio rejects some of their values.
     for element in [*root.iter("limit"), *root.iter("dynamics")]:
         element.getparent().remove(element)
     for joint in root.iterfind("joint"):
@@ -160,24 +171,25 @@ def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
 def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
     bodies = []
     for body in arm.bodies:
-        # In Pinocchio's reading, a body without inertial has no mass.
+        # A body without inertial has no mass when Pinocchio reads the URDF: the chain must agree.
         bodies.append(replace(body, inertia=body.inertia or (Fraction(0),) * 10))
     return arm_dynamics(replace(arm, bodies=tuple(bodies)), Settings())
 
 
 def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Return kinematic and dynamic quantities of the B moving bodies at positions q (S, n).
+    """Return kinematic and dynamic quantities of the B moving bodies of an arm at positions q (S, n).
 
-    "axes of the joints": twists of unit rates in the root frame, (S, 6, B). "masses and inertias": M, with
-    its diagonal doubled, and the gravity torque as the last column, (S, B, B + 1).
+    The key "axes of the joints" has the twists for unit velocities in the root frame, (S, 6, B). "masses and inertias"
+    has M of the B joints, in which diagonal entries are doubled, and the gravity torque as the last column,
+    (S, B, B + 1).
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]
     axes, loads = [], []
     for configuration in dynamics.configuration(q):
-        # Pinocchio returns a vector for a single joint.
+        # Pinocchio returns a vector in place of a matrix for a single joint.
         axes.append(pin.computeJointJacobians(model, data, configuration).reshape(6, -1)[:, columns])
-        # Pinocchio computes the upper triangle only.
+        # Pinocchio computes only the upper triangle of M.
         upper = np.triu(pin.crba(model, data, configuration))
         mass = upper + upper.T
         gravity = pin.computeGeneralizedGravity(model, data, configuration)

@@ -1,8 +1,8 @@
 """Numerical verification of a structure by Pinocchio at random configurations.
 
-With ``kinematics`` every sample has its own random inertial parameters; with ``inertials`` all samples have the
-parameters of the URDF. The verification shares only the chain with the derivation; the chain is compared with the
-reading of the file by Pinocchio (``numeric_samples``).
+For a structure with ``assume="kinematics"`` each sample has other random inertial parameters; for ``inertials`` all
+samples have the inertial parameters of the URDF. The verification and the derivation of the structure have only the
+chain in common. The chain is therefore compared with a reading of the URDF by Pinocchio (``numeric_samples``).
 """
 
 import textwrap
@@ -33,9 +33,10 @@ _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 
 @dataclass(frozen=True)
 class FactCheck:
-    """A derived fact, the result of an independent computation, and whether the two agree.
+    """A derived fact, the result of an independent computation (``found``), and whether the two agree.
 
-    ``undecided``: neither confirmed nor refuted in double precision, or by the other program.
+    A verdict of ``undecided`` means that the fact is neither confirmed nor refuted, because of rounding errors in
+    double precision, or because Pinocchio cannot read the file.
     """
 
     fact: str
@@ -49,7 +50,10 @@ class FactCheck:
 
 @dataclass(frozen=True, repr=False)
 class Verification:
-    """The checks of an arm at ``samples`` random configurations from ``seed``."""
+    """The checks of an arm at ``samples`` random configurations, which depend on ``seed``.
+
+    ``means``: text that states the program, the number of configurations and the inertial values.
+    """
 
     means: str
     samples: int
@@ -58,12 +62,12 @@ class Verification:
 
     @property
     def agrees(self) -> bool:
-        """Whether no result contradicts the derivation."""
+        """Whether no check contradicts the derivation, or the chain."""
         return not self.differences
 
     @property
     def differences(self) -> tuple[FactCheck, ...]:
-        """The checks that contradict the derivation, or the reading of the file."""
+        """The checks that contradict the derivation of the structure, or the chain."""
         return tuple(check for check in self.checks if check.verdict == "differs")
 
     def __repr__(self) -> str:
@@ -75,7 +79,7 @@ class Verification:
         return Listing(f"Verified by {self.means}", head, tuple(rows), left=(0, 1, 2, 3)).html()
 
     def to_dict(self) -> dict[str, object]:
-        """Return a JSON object."""
+        """Return the verification as a JSON object."""
         return {"agrees": self.agrees} | asdict(self)
 
     def text(self) -> str:
@@ -90,12 +94,12 @@ class Verification:
 
 
 def size_text(size: float) -> str:
-    """Return the order of magnitude of an error: ``3e-12``, or ``0``."""
+    """Return an error with one digit as text, such as ``3e-12``, or ``0``."""
     return f"{size:.0e}" if size else "0"
 
 
 Magnitude = tuple[str, float, bool]
-"""Name and value of a number relative to its scale, and whether the derivation states that it differs from zero."""
+"""Name of a number, its magnitude divided by its scale, and whether the derivation states that it is nonzero."""
 
 
 @dataclass(frozen=True)
@@ -105,13 +109,14 @@ class _DerivedFact:
     fact: str
     derived: str
     magnitudes: list[Magnitude]
-    # numbers below this fraction of their scale are rounding; measured differences are reported
+    # [1] Numbers up to this fraction of their scale are regarded as zero: they are rounding errors.
     rounding: float = 1e-12
 
     def check(self, is_fine: bool) -> FactCheck:
         """Return the result of the check.
 
-        is_fine: whether products of small dimensions may be below rounding errors.
+        is_fine: whether the arm has such small dimensions that nonzero numbers may be lost in rounding errors. A number
+        that should be nonzero, but is not, then makes the check undecided.
         """
         zeros = [(name, value) for name, value, is_nonzero in self.magnitudes if not is_nonzero]
         nonzeros = [(name, value) for name, value, is_nonzero in self.magnitudes if is_nonzero]
@@ -131,12 +136,15 @@ class _DerivedFact:
 
 
 def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> Verification:
-    """Verify the structure of ``arm``, and the arm against the file of ``robot``, at random configurations."""
-    # r samples have the rank r of a space; six additional samples would reveal a larger rank
+    """Verify the structure of an arm, and compare the arm with the URDF of ``robot``, at random configurations.
+
+    seed: seed of the configurations.
+    """
+    # r samples suffice for a space of the derived rank r; six more samples would reveal a larger rank.
     count = len(structure.entries) + 6
     rng = np.random.default_rng(seed)
     is_random = structure.assume == "kinematics"
-    # one set of samples for all facts: a fact that needed samples of its own could pass by chance
+    # All facts are checked on the same samples: with other samples for each fact, an error could pass by chance.
     samples = draw(arm, count, rng, random_inertials=is_random)
     facts = [
         *_entries(structure, samples),
@@ -153,7 +161,7 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
 
 
 def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
-    """Yield the comparison of the chain with the reading of the URDF by Pinocchio."""
+    """Yield checks that compare the chain with the reading of the URDF by Pinocchio."""
     try:
         differences = differences_of_reading(robot, arm, seed)
     except Exception as problem:  # a failure of Pinocchio is no evidence about the chain
@@ -162,7 +170,8 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
         yield FactCheck("reading of the file", "the moving bodies", result, "undecided")
         return
     is_rounded = any(remark.code.startswith("snapped-") for remark in arm.diagnostics)
-    # per joint [rad, m]: dropped offsets, and composed rotations of 1e-11 each
+    # [1] Tolerance, 1e-9 per joint: the chain drops offsets of less than 1e-9 m, and its rational rotations have errors
+    # of 1e-11 rad each.
     allowed = 1e-9 * len(robot.joints)
     for difference in differences:
         verdict: Verdict = "agrees"
@@ -175,7 +184,7 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
 
 
 def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield the zero entries, and the dependence of each entry on each joint."""
+    """Yield two facts: which entries of M are zero, and on which joints each entry depends."""
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()  # (entries, n)
     zeros: list[Magnitude] = []
@@ -195,7 +204,10 @@ def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_Derived
 
 
 def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFact:
-    """Return the fact that M = sum c A + sum f B, where each f depends only on its joints, and each c on none."""
+    """Return the fact that M = sum_k c_k A_k + sum_j f_j B_j, where each f_j depends only on its joints.
+
+    The c_k must not depend on any joint.
+    """
     n = len(structure.joints)
     remainder = samples.mass
     magnitudes = []
@@ -203,38 +215,39 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFac
         functional = row_of(term.functional, n)
         values = samples.mass @ (functional * samples.scale)
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
-        # relative to the sum of the absolute values of the terms
+        # Changes of the value are relative to the sum of the magnitudes of the summands of the functional.
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
-        # its own joints may change the term: only changes by other joints contradict the fact
+        # The joints of the term may change its value: only changes caused by other joints contradict the fact.
         changes[list(term.joints)] = 0.0
         name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
         magnitudes.append((f"change of {name}", float(changes.max()), False))
     magnitudes.append(("remainder of M", float(np.abs(remainder).max(initial=0.0)), False))
-    # long fractions are evaluated in double precision: rounding is larger than in the other facts
-    derived = f"{len(structure.outputs)} outputs and {len(structure.constants)} constants give M"
+    # The bound of rounding errors is larger than for other facts, because long fractions are replaced by floats.
+    derived = f"outputs: {len(structure.outputs)}, constants: {len(structure.constants)}, which give M"
     return _DerivedFact("smallest form", derived, magnitudes, rounding=1e-6)
 
 
 def _ranks(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield the numbers of outputs and constants, and of outputs that do not depend on the first joints."""
+    """Yield facts about the numbers of outputs and constants, and of outputs that do not depend on the first joints."""
     changes, outputs = samples.changes, len(structure.outputs)
     width = changes.shape[-1]
     yield _rank("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield _rank("outputs and constants together", samples.mass[0], together)
-    # The greedy selection maximises the number of outputs that depend only on joints close to the tip.
+    # The selection of outputs maximises the number of outputs that depend only on joints from any joint to the tip;
+    # this number is checked for each joint.
     counts, magnitudes = [str(outputs)], []
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)
         counts.append(str(without))
-        # the rank of the changes with the first joints is the number of all other outputs
+        # The rank of the changes of M caused by the first joints is the number of outputs that depend on these joints.
         name = f"outputs before joint {first + 1}"
         magnitudes += _rank(name, changes[:first].reshape(-1, width), outputs - without).magnitudes
     yield _DerivedFact("outputs without the first 0, 1, ... joints", ", ".join(counts), magnitudes)
 
 
 def _potential(structure: Structure, samples: NumericSamples) -> _DerivedFact:
-    """Return the joints that V depends on."""
+    """Return the fact that V depends on certain joints only: the gravity torque of all other joints is zero."""
     magnitudes = []
     for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):
         name = f"torque of gravity at joint {joint + 1}"
@@ -244,12 +257,15 @@ def _potential(structure: Structure, samples: NumericSamples) -> _DerivedFact:
 
 
 def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
-    """Return the fact that rows (m, k) have this rank: the number of singular values above rounding errors."""
+    """Return the fact that rows (m, k) have this rank, which is the number of nonzero singular values.
+
+    fact: name of the fact.
+    """
     if len(rows) > rows.shape[1]:
-        # The triangular factor has the same singular values and fewer rows.
+        # The triangular factor of the QR decomposition has the same singular values and fewer rows.
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
     values = np.linalg.svd(rows, compute_uv=False)
-    # relative, as the rows have no common unit
+    # Singular values are relative to the largest, because the rows have no common unit.
     values = values / (values.max(initial=0.0) or 1.0)
     values = np.pad(values, (0, max(0, rank - len(values))))
     magnitudes = []
@@ -259,7 +275,7 @@ def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
 
 
 def _is_fine(arm: Chain, structure: Structure) -> bool:
-    """Return True if a nonzero number of the arm is so small that its products may vanish in rounding errors."""
+    """Whether a nonzero number of the arm is so small that its products may be lost in rounding errors."""
     numbers = [np.array(body.rotation, dtype=float).ravel() for body in arm.bodies]
     if structure.assume == "inertials":
         for body in arm.bodies:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -13,6 +14,7 @@ from spelgen.cli.console import FAILED, answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
 from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
+from spelgen.listing import WIDTH
 
 if TYPE_CHECKING:
     from spelgen.comparison.arms import Comparison
@@ -173,7 +175,7 @@ def report(
         listing = summary(Results.from_dict(folder.read_json(folder.evaluation)))
     if listing is not None:
         say(listing.text() + "\n")
-    say(f"wrote {path}: the report, for any browser")
+    say(f"wrote {path}: the report, for any browser" if path.suffix == ".html" else f"wrote {path}")
 
 
 Jobs = Annotated[
@@ -188,6 +190,7 @@ def compare(
     target: Annotated[
         Path, argument("TARGET", "URDF of an arm, or YAML file that lists arms and their logs.")
     ],
+    extra_logs: options.MoreData = None,
     data: options.Data = None,
     mapping: options.MappingFile = None,
     output: Annotated[
@@ -225,6 +228,7 @@ def compare(
 
     if ablation and presets is not None:
         raise UsageError("--ablation: names the presets itself, omit --presets")
+    paths = options.logs(data, extra_logs) if data or extra_logs else []
     names = options.names(presets)
     values = {
         "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
@@ -232,8 +236,8 @@ def compare(
     }  # fmt: skip
     # options of the command line take precedence over the file
     changes = {name: value for name, value in values.items() if value is not None}
-    comparison = _comparison(target, data, mapping).model_copy(update=changes)
-    name = target.stem + ("-logs" if data else "") + ("-ablation" if ablation else "")
+    comparison = _comparison(target, paths, mapping).model_copy(update=changes)
+    name = target.stem + ("-logs" if paths else "") + ("-ablation" if ablation else "")
     # the working folders of workers differ, so paths must be absolute
     folder = (output or Path("comparisons") / name).absolute()
     # all cores: a comparison takes hours on one
@@ -249,7 +253,7 @@ def compare(
         sections = arm_sections(study)
         # the tables are printed as well, since a page cannot be read in a terminal
         for section in sections:
-            say(f"{section.name}: {section.sentence}\n")
+            say(fill(f"{section.name}: {section.sentence}", WIDTH, break_on_hyphens=False) + "\n")
             for table in section.tables:
                 say(f"{table.text()}\n")
         say(f"wrote {write_comparison(study, sections)}")
@@ -258,14 +262,14 @@ def compare(
         raise typer.Exit(FAILED)
 
 
-def _comparison(target: Path, data: list[Path] | None, mapping: Path | None) -> Comparison:
+def _comparison(target: Path, logs: list[Path], mapping: Path | None) -> Comparison:
     """Return the comparison of a URDF with these logs, or the comparison in a YAML file."""
     from spelgen.comparison.arms import YAML, ComparedArm, Comparison, load_comparison
 
     if target.suffix not in YAML:
-        paths = tuple(path.absolute() for path in data or ())
-        arm = ComparedArm(urdf=target.absolute(), data=paths, mapping=mapping and mapping.absolute())
+        data = tuple(path.absolute() for path in logs)
+        arm = ComparedArm(urdf=target.absolute(), data=data, mapping=mapping and mapping.absolute())
         return Comparison.model_construct(arms={target.stem: arm})
-    if data or mapping:
+    if logs or mapping:
         raise UsageError("--data and --mapping: belong to a URDF; in a YAML file each arm has its own")
     return load_comparison(target.absolute())

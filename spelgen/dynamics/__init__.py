@@ -1,1 +1,1 @@
-"""Rigid-body dynamics under one protocol: by Pinocchio, by the regressor, of trained models; tip kinematics."""
+"""Rigid-body dynamics with a common protocol (Pinocchio, regressor, trained models), and kinematics of the tip."""

@@ -1,6 +1,7 @@
-"""Inertial parameters of bodies: in the form that simulators take, as pseudo-inertias, their regressor and its base.
+"""Conversions of inertial parameters, the regressor of the joint torques, and base parameters.
 
-Base parameters are equal to `identification.base_parameters`, but from the kinematics only, without exact arithmetic.
+The base parameters are equal to the ones of `identification.base_parameters`, which uses exact arithmetic. Here they
+are computed numerically from the kinematics.
 """
 
 import numpy as np
@@ -14,7 +15,7 @@ from spelgen.runtime.port_hamiltonian import applied
 
 
 def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass, centre of mass and inertia about it, (3, 3), from the ten parameters in the joint's frame."""
+    """Return the mass, the centre of mass and the inertia (3, 3) about the centre of mass, in the joint's frame."""
     mass = inertia[0]
     center = inertia[1:4] / mass
     xx, xy, xz, yy, yz, zz = inertia[4:]
@@ -25,19 +26,19 @@ def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def quaternion(rotation: object) -> np.ndarray:
-    """Return (w, x, y, z) of a rotation, (3, 3), w not negative."""
+    """Return the unit quaternion (w, x, y, z) with w >= 0 of a rotation matrix (3, 3)."""
     matrix = np.array(rotation, dtype=float)
-    # scipy has (x, y, z, w)
+    # scipy has the order (x, y, z, w)
     result: np.ndarray = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
     result[np.abs(result) < 1e-16] = 0.0  # rounding
     return result
 
 
 def pseudo_inertia(ten: Tensor) -> Tensor:
-    """Return [[tr(I)/2 - I, m c], [(m c)^T, m]], (..., 4, 4), of inertial parameters (m, m c, I), (..., 10).
+    """Return the pseudo-inertia (..., 4, 4) of inertial parameters (m, m c, I), (..., 10).
 
-    It is positive definite if and only if the parameters are physically consistent (Wensing, Kim and Slotine,
-    IEEE RA-L 3:60, 2018).
+    It is [[tr(I)/2 - I, m c], [(m c)^T, m]]. It is positive definite if and only if the parameters are physically
+    consistent (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
     """
     m, x, y, z, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
     half = (xx + yy + zz) / 2
@@ -46,14 +47,15 @@ def pseudo_inertia(ten: Tensor) -> Tensor:
 
 
 def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Return Y, (..., n, 10 bodies): joint torques [Nm, N] are Y @ inertial parameters.
+    """Return the regressor Y of B bodies, (..., n, 10 B): the joint torques [Nm, N] are Y @ inertial parameters.
 
     Args:
         chain: kinematics of the bodies.
-        q, qd, qdd: motion of the joints, (..., n) [rad, m], per s, per s^2.
+        q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     count = len(chain.parents)
-    # with the columns of the frames in place of points, kinetic energy is linear in the pseudo-inertias
+    # The columns of a body's homogeneous transform replace points of the body: the kinetic energy is then
+    # linear in its pseudo-inertia.
     pose = chain.forward(q, torch.eye(4 * count).to(q))
     rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
     rises = torch.unflatten(rises, -1, (3, count, 4))
@@ -64,8 +66,8 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
 
 
 def chain_regressor(chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-    """Return Y, (T, n, 10 bodies), for arrays q, qd, qdd (T, n); see ``regressor_of``."""
-    # copies: torch does not accept arrays with negative strides, which filters return
+    """Return the regressor Y, (T, n, 10 B), for arrays q, qd, qdd (T, n); see ``regressor_of``."""
+    # Filters return arrays with negative strides, which torch does not accept: copy them.
     states = [torch.from_numpy(np.array(x, dtype=float)) for x in (q, qd, qdd)]
     with torch.no_grad():
         return np.asarray(regressor_of(chain, *states))
@@ -76,24 +78,24 @@ def constants_regressor(chain: BodyChain, motors: Tensor, q: Tensor, qd: Tensor,
 
     Args:
         chain: kinematics of B bodies.
-        motors: C, (n, n), the drives rotate at C qd.
-        q, qd, qdd: motion of the joints, (T, n) [rad, m], per s, per s^2.
+        motors: matrix C, (n, n): the velocities of the drives are C qd.
+        q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (T, n).
 
     Returns:
-        (T, n, 10 B + n).
+        Derivative (T, n, 10 B + n): columns of the inertial parameters, then of the armatures.
     """
     rotors = (qdd @ motors.mT).unsqueeze(-2) * motors.mT
     return torch.cat([regressor_of(chain, q, qd, qdd), rotors], dim=-1)
 
 
 def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...], Tensor]:
-    """Return names and coefficients (r, 10 B + n) of the base parameters; see `constants_regressor`.
+    """Return the names of the r base parameters, and their coefficients (r, 10 B + n); see `constants_regressor`.
 
-    A column of the regressor at random states in the span of the columns before it is regrouped into these (Gautier and
-    Khalil, IEEE T-RA 6:368, 1990).
+    The regressor is evaluated at random states. The parameter of a column that depends linearly on the preceding
+    columns is regrouped into their parameters (Gautier and Khalil, IEEE T-RA 6:368, 1990).
     """
     n, inertial = len(motors), 10 * len(chain.parents)
-    # parameters that can always be regrouped come last, so that the conventional ones are kept
+    # Parameters that can always be regrouped come last, so that the conventional base parameters are found.
     order = [
         10 * body + INERTIAL_PARAMETERS.index(name) for body in range(inertial // 10) for name in BASE_ORDER
     ]
@@ -103,12 +105,12 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     columns = constants_regressor(chain, motors, *motion).flatten(0, 1)
     # norm of each column after projection onto the complement of all columns before it
     remainder = torch.linalg.qr(columns[:, order]).R.diagonal().abs()
-    # linearly dependent if the part orthogonal to all columns before it is shorter than 1e-8 of the column: above
-    # rounding errors
+    # A column is linearly dependent if its part orthogonal to all preceding columns is shorter than 1e-8 times
+    # the column. Rounding errors are smaller than this.
     is_base = remainder > 1e-8 * columns[:, order].norm(dim=0).clamp(min=1.0)
     base = torch.tensor(order)[is_base]
     combination = torch.linalg.lstsq(columns[:, base], columns).solution
-    # smaller coefficients are rounding errors
+    # coefficients below the threshold are rounding errors
     combination[combination.abs() < 1e-9] = 0.0
     names = []
     for index, row in zip(base.tolist(), combination, strict=True):

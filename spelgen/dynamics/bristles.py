@@ -14,10 +14,11 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 @dataclass(frozen=True, eq=False)
 class BristleReach:
-    """Break-away displacements of the bristles of all drives: values, (n, K) [rad, m]; K is 0 without bristles.
+    """Break-away displacements of the K bristles of each drive.
 
-    motors: C, (n, n), the drives rotate at C qd (see ``Actuation.motor_speeds``); None: each drive moves its own joint.
-    smoothing_velocity: of dry friction without bristles, (n,) [rad/s, m/s]; None: unknown.
+    values: (n, K) [rad, m]; K is 0 without bristles. motors: matrix C, (n, n): the velocities of the drives are C qd
+    (see ``Actuation.motor_speeds``); None: each drive moves its own joint. smoothing_velocity: width of the tanh of dry
+    friction without bristles, (n,) [rad/s, m/s]; None: unknown.
     """
 
     values: np.ndarray
@@ -26,12 +27,15 @@ class BristleReach:
 
     @property
     def elements(self) -> int:
-        """Bristles per joint, K."""
+        """Number of bristles per joint, K."""
         return int(self.values.shape[1])
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
-    """Return the typical break-away displacements, (n, K) [rad, m], of joints of these types; motors: C, (n, n)."""
+    """Return typical break-away displacements, (n, K) [rad, m].
+
+    kinds: type of each joint (revolute or prismatic). motors: see `BristleReach`.
+    """
     return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
 
 
@@ -41,13 +45,13 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
     tensors = (model.friction.reach, motors_of(model), width)
-    # paths are computed by NumPy in double precision, for a model on any device
+    # Paths are computed by NumPy in double precision, for models on any device.
     arrays = [x.detach().cpu().double().numpy() for x in tensors]
     return BristleReach(*arrays)
 
 
 def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-    """Return the deflections after a monotonic displacement of the drives, exactly.
+    """Return the exact deflections, (..., n, K), of bristles after a monotonic displacement of the drives.
 
     Args:
         z: (..., n, K) deflections of the bristles [rad, m].
@@ -58,10 +62,10 @@ def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Ten
 
 
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
-    """Return z, (T, n, K) [rad, m], along the path q (T, n) [rad, m]; z is zero at its start.
+    """Return the friction state z, (T, n, K) [rad, m], along positions q (T, n) [rad, m]; z[0] is zero.
 
-    Between two reversals of a drive, z is a function of the displacement since the first, so that only the reversals
-    are computed one after the other.
+    Between two reversals of a drive, z depends on the state at the first reversal and the displacement since then.
+    Only the reversals are therefore computed one after the other.
     """
     path = encoded(q)
     if bristles.motors is not None:
@@ -70,11 +74,12 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     drives, reach = np.arange(path.shape[1]), torch.from_numpy(bristles.values)
     turned_at = np.take_along_axis(path, corners, axis=0)
     at_corners = [torch.zeros_like(reach)]
-    # Only reversals are sequential, and they are few: given z at the last reversal, samples are independent.
+    # Only reversals are sequential, and they are few: given z at the latest reversal, all samples after it are
+    # independent of each other.
     for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
         at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
-    size = 2**14  # samples that are computed at a time: several arrays of this size are in memory
+    size = 2**14  # samples computed at a time, to limit the memory of temporary arrays
     for start in range(0, len(q), size):
         block = slice(start, start + size)
         corner = latest[block], drives
@@ -84,19 +89,21 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
 
 
 def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the samples (R, n) at which the columns of a path (T, n) begin and reverse.
+    """Return the samples at which each column of a path (T, n) begins or reverses, and the latest one at each sample.
 
-    The second array is the index of the latest reversal at each sample, (T, n).
+    Returns:
+        Indices of samples (R, n): first the start, then the reversals; columns with fewer reversals end with zeros.
+        Row of the first result that is the latest reversal at each sample, (T, n).
     """
     steps = np.diff(path, axis=0, prepend=path[:1])
-    # at rest, the direction of the last motion remains
+    # A drive at rest keeps the direction of its last motion.
     moving = np.where(steps != 0, np.arange(len(path))[:, None], 0)
-    # a running maximum of indices is the latest sample that moved
+    # The running maximum of the indices of moving samples is the latest moving sample.
     direction = np.sign(np.take_along_axis(steps, np.maximum.accumulate(moving, axis=0), axis=0))
     turns = np.zeros(path.shape, dtype=bool)
     turns[1:] = direction[1:] * direction[:-1] < 0
     latest = turns.cumsum(axis=0)
-    # drives with fewer reversals than others have zeros at the end, which no sample refers to
+    # Drives with fewer reversals than others have zeros at the end, to which no sample refers.
     corners = np.zeros((latest.max(initial=0) + 1, path.shape[1]), dtype=int)
     samples, drives = np.nonzero(turns)
     corners[latest[samples, drives], drives] = samples - 1
@@ -104,21 +111,24 @@ def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:
-    """Return the direction (T, n) of dry friction without bristles at qd (T, n); None: its smoothing is unknown."""
+    """Return the direction in [-1, 1] of dry friction without bristles, (T, n), at velocities qd (T, n).
+
+    The result is None if the smoothing velocity is unknown.
+    """
     if bristles.smoothing_velocity is None:
         return None
-    # the same smooth sign as in `runtime.friction_laws`: another would be an error of friction
+    # This smooth sign must be the one of `runtime.friction_laws`: any difference is an error of the friction torque.
     speed = qd if bristles.motors is None else qd @ bristles.motors.T
     return np.asarray(speed / np.hypot(speed, bristles.smoothing_velocity))
 
 
 def encoded(q: np.ndarray) -> np.ndarray:
-    """Return the path (T, n) without jitter of the encoder: a dead band of one encoder step to both sides."""
+    """Return the path (T, n) [rad, m] without encoder jitter: backlash of one encoder step to both sides."""
     step = encoder_step(q)
     if not step.any():
         return q
-    # the composition of two clamps is a clamp: log2(T) passes over all samples in place of T
-    # Backlash of one step: the output follows the input only beyond it, out[k] = clip(out[k-1], low[k], high[k]).
+    # Compositions of clamps are clamps, so a parallel scan needs log2(T) passes instead of T sequential steps.
+    # Backlash: out[k] = clip(out[k-1], low[k], high[k]), with low and high one encoder step from the input.
     low, high = q - step, q + step
     shift = 1
     while shift < len(q):
@@ -130,11 +140,11 @@ def encoded(q: np.ndarray) -> np.ndarray:
 
 
 def encoder_step(q: np.ndarray) -> np.ndarray:
-    """Return the encoder step (n,) of positions (T, n); 0 if they are not quantised."""
+    """Return the encoder step (n,) [rad, m] of positions (T, n); 0 for a joint whose positions are not quantised."""
     steps = np.zeros(q.shape[1])
     for joint, values in enumerate(q.T):
-        # Floating-point positions do not repeat; steps of an encoder do.
+        # Positions of an encoder repeat exactly; positions that are not quantised do not.
         levels = np.unique(values)
-        if len(levels) > 1 and len(levels) < len(values) / 4:  # repeated values
+        if len(levels) > 1 and len(levels) < len(values) / 4:  # many values are repeated
             steps[joint] = np.diff(levels).min()
     return steps

@@ -1,4 +1,4 @@
-"""Mimic joints: the positions of all joints of a robot are K q + offset, with q the coordinates of an arm."""
+"""Mimic joints as a linear constraint: joint positions = K q + offset, with the coordinates q of an arm."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from spelgen.urdf.robot import Robot
 class Constraint:
     """Positions of b joints as a function of n coordinates: jacobian @ q + offset.
 
-    names: of the joints. jacobian: K, (b, n). offset: (b,) [rad, m].
+    names: names of the b joints. jacobian: matrix K, (b, n). offset: joint positions at q = 0, (b,) [rad, m].
     """
 
     names: tuple[str, ...]
@@ -21,18 +21,21 @@ class Constraint:
 
 
 def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
-    """Return the constraint of all joints of ``robot``: coordinates, mimic joints, and locked joints (0)."""
+    """Return the constraint of all joints of ``robot``.
+
+    coordinates: names of the joints that are coordinates. All other joints are mimic joints, or locked at zero.
+    """
     columns = {name: k for k, name in enumerate(coordinates)}
     moving = [joint.name for joint in robot.joints if joint.moves]
     jacobian, offset = np.zeros((len(moving), len(columns))), np.zeros(len(moving))
     for row, name in enumerate(moving):
-        # the leader at the end of a chain of mimic joints
+        # A mimic joint may follow another mimic joint: find the coordinate at the end of the chain.
         multiplier, leader = 1.0, name
         while (mimic := robot.joint[leader].mimic) is not None:
             offset[row] += multiplier * mimic.offset
             multiplier *= mimic.multiplier
             leader = mimic.joint
-        # a locked joint keeps a row of zeros: it stays at zero
+        # The row of a locked joint is zero, so its position is zero.
         if leader in columns:
             jacobian[row, columns[leader]] = multiplier
     return Constraint(tuple(moving), jacobian, offset)

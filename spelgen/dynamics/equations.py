@@ -17,10 +17,10 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 @dataclass(frozen=True, eq=False)
 class MotionEquations:
-    """Equations of motion at positions (W, n).
+    """Equations of motion of W rollouts at fixed positions (W, n).
 
-    mass: M, (W, n, n). force: M qdd as a function of (qd, tau, z), (W, n). friction: friction torque as a function of
-    (qd, z), (W, n).
+    mass: mass matrix M, (W, n, n). force: function of (qd, tau, z) that returns M qdd, (W, n) [Nm, N]. friction:
+    function of (qd, z) that returns the friction torque, (W, n) [Nm, N].
     """
 
     mass: Tensor
@@ -33,14 +33,14 @@ EquationsAt = Callable[[Tensor], MotionEquations]
 
 @runtime_checkable
 class OwnEquations(Protocol):
-    """Dynamics with their own equations of motion, which take fewer operations than the general ones."""
+    """Dynamics that provide their own `equations_at`, which needs fewer operations than the general equations."""
 
     def equations_at(self, q: Tensor) -> MotionEquations:
         """Return the equations of motion at positions q, (W, n) [rad, m], of W rollouts."""
 
 
 def equations_of(dynamics: object) -> EquationsAt:
-    """Return the equations of motion as a function of q, (W, n), valid until the parameters change."""
+    """Return a function of q (W, n) that returns the equations of motion; it is valid until the parameters change."""
     if isinstance(dynamics, PortHamiltonian):
         return partial(_of_model, dynamics, dynamics.prepare())
     return dynamics.equations_at if isinstance(dynamics, OwnEquations) else partial(_of_any, dynamics)
@@ -62,7 +62,7 @@ def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEqua
 
 
 def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
-    """Return the equations of other dynamics, from their forward dynamics."""
+    """Return the equations of motion of dynamics that are no assembled model, from their forward dynamics."""
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
@@ -71,7 +71,7 @@ def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
         """Return the force M qdd, (W, n) [Nm, N]."""
-        # Other dynamics state no bias torque of their own: M times the acceleration contains it.
+        # These dynamics may not provide a bias torque. M times the acceleration contains it.
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
 
@@ -86,19 +86,19 @@ def runge_kutta(
     z: Tensor,
     step: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return q, p and z after one `step` [s], and q' at its start (Hairer et al., Solving ODEs I, II.1).
+    """Return q, p and z after one step of the classical Runge-Kutta method, and q' at the start of the step.
 
-    rhs: q' and p' as a function of q, p and z. p: momenta, or velocities. The friction state z, (..., n, K), is exact
-    in the displacement, so that it needs no stages.
+    Hairer et al., Solving ODEs I, II.1. rhs: function of (q, p, z) that returns q' and p'. p: momenta or velocities,
+    (..., n). z: friction state, (..., n, K); its update is exact for a given displacement. step: duration [s].
     """
 
     qd1 = qd = pd = torch.zeros_like(p)
     moved = pushed = torch.zeros_like(p)
-    # position of each stage in the step, and its weight
+    # time of each stage as a fraction of the step, and weight of the stage
     for fraction, weight in ((0.0, 1), (0.5, 2), (0.5, 2), (1.0, 1)):
         stage = fraction * step
-        # The bristles of a stage start at z, the state at the start of the step, and move by the stage's
-        # displacement.
+        # The friction state of a stage is z, the state at the start of the step, after the displacement from the
+        # start of the step to the stage.
         qd, pd = rhs(q + stage * qd, p + stage * pd, memory_after(dynamics, z, stage * qd))
         if fraction == 0:
             qd1 = qd
@@ -108,13 +108,13 @@ def runge_kutta(
 
 
 def unbounded(mass: Tensor) -> Tensor:
-    """Return ones, (...): M, (..., n, n), is not corrected; see ``DerivedMass.fraction``."""
+    """Return ones, (...), in place of ``DerivedMass.fraction``: M, (..., n, n), is then not corrected."""
     return mass.new_ones(mass.shape[:-2])
 
 
 @contextmanager
 def mass_as_learned(model: nn.Module) -> Iterator[None]:
-    """Do not correct an indefinite M of a network; other models are unchanged."""
+    """Disable the correction of an indefinite mass matrix of a network; other models are unchanged."""
     mass = model.mass if isinstance(model, NetworkDynamics) else None
     if not isinstance(mass, DerivedMass):
         yield

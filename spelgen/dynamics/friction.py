@@ -1,4 +1,4 @@
-"""Friction of drives: with constant coefficients, and as columns that are linear in the constants of each joint."""
+"""Friction of drives: a model with constant coefficients, and regressor columns for the fit of coefficients."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from spelgen.settings.settings import JointSettings
 
 
 class DampedJoint(Protocol):
-    """A joint with the damping and friction of <dynamics> in a URDF."""
+    """Joint of a URDF with the damping and the friction of its <dynamics> element."""
 
     @property
     def name(self) -> str: ...
@@ -23,11 +23,11 @@ class DampedJoint(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class DriveFriction:
-    """Friction of n drives, each array (n,), in Nm and rad/s, N and m/s for prismatic joints.
+    """Friction of n drives; arrays are (n,), in Nm and rad/s, or N and m/s for prismatic joints.
 
-    forward, backward: Coulomb torque for speeds > 0 (not negative) and for speeds < 0 (not positive).
-    smoothing_velocity: width of the tanh in place of the sign of the velocity. speeds: C, (n, n), the drives rotate at
-    C qd (see `motor_speeds`); None: each drive moves its own joint.
+    forward: Coulomb torque for velocities > 0, not negative. backward: Coulomb torque for velocities < 0, not positive.
+    smoothing_velocity: width of the tanh that replaces the sign of the velocity. speeds: matrix C, (n, n): the
+    velocities of the drives are C qd (see `motor_speeds`); None: each drive moves its own joint.
     """
 
     viscous: np.ndarray
@@ -37,20 +37,23 @@ class DriveFriction:
     speeds: np.ndarray | None = None
 
     def __call__(self, qd: np.ndarray) -> np.ndarray:
-        """Return the joint friction torque, (..., n), at velocities qd (..., n): C^T times the drives' torque
+        """Return the joint friction torque, (..., n) [Nm, N], at joint velocities qd (..., n).
+
+        The torque is C^T times the torque of the drives, which depends on their velocities v = C qd:
 
             viscous v + s (forward - backward)/2 + s^2 (forward + backward)/2,    s = tanh(v / smoothing_velocity)
 
         The last two terms tend to `forward` and `backward` for large |v|. The torque is smooth, 0 at rest, and
-        dissipative: its product with v = C qd is not negative.
+        dissipative: the torque of a drive times its velocity is not negative.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
         return self.torque(qd, np.tanh(v / self.smoothing_velocity))
 
     def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the joint friction torque (..., n) at velocities qd (..., n) for a direction of dry friction.
+        """Return the joint friction torque (..., n) [Nm, N] at joint velocities qd (..., n).
 
-        direction: (..., n) in [-1, 1] per drive: tanh(v / smoothing_velocity), or from the friction state.
+        direction: direction of dry friction per drive, (..., n) in [-1, 1]: tanh(v / smoothing_velocity), or a function
+        of the friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
         # s (f - b) / 2 + s^2 (f + b) / 2 is f at s = 1, b at s = -1, and has no jump between them.
@@ -65,11 +68,12 @@ def joint_friction(
     smoothing_velocity: float,
     speeds: np.ndarray | None,
 ) -> DriveFriction:
-    """Return the friction of joints: from the settings of a drive, or from <dynamics> of the URDF if there are none.
+    """Return the friction of joints, from the settings of their drives or else from <dynamics> of the URDF.
 
-    joints: of a URDF, or the coordinates of an arm. speeds: C, (n, n), see ``DriveFriction``.
+    joints: joints of a URDF, or coordinates of an arm. speeds: matrix C, (n, n), see ``DriveFriction``.
     """
-    # settings replace <dynamics> as a whole: both describe the same losses
+    # Settings replace the whole <dynamics> element: both describe the same losses, so adding them would count
+    # the losses twice.
     losses = []
     for joint in joints:
         if joint.name in drives:
@@ -77,7 +81,7 @@ def joint_friction(
             losses.append((drive.viscous, *drive.coulomb))
         else:
             losses.append((joint.damping, joint.friction, -joint.friction))
-    # Drives that are not coupled have C = 1: without it each integration step saves two matrix products.
+    # C is the identity for drives that are not coupled: omitting C saves two matrix products per integration step.
     if speeds is not None and np.array_equal(speeds, np.eye(len(speeds))):
         speeds = None
     viscous, forward, backward = np.array(losses).T
@@ -89,12 +93,12 @@ BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolu
 
 @dataclass(frozen=True)
 class FrictionModel:
-    """The effects that have a column, in addition to armature, viscous and Coulomb friction and offset.
+    """Columns of the regressor for armature, viscous and Coulomb friction, torque offset, and optional effects.
 
-    coulomb_smoothing_velocity [rad/s, m/s]: width of the tanh in place of the sign of the velocity. stribeck: dry
-    friction at low velocity (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3. memory: dry friction as
-    a function of the deflection of bristles (see ``runtime.friction_laws``), one column per bristle, in place of the
-    tanh.
+    coulomb_smoothing_velocity: width of the tanh that replaces the sign of the velocity [rad/s, m/s]. stribeck: adds
+    dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991). polynomial: adds qd |qd| and qd^3. memory: dry
+    friction is a function of the deflection of bristles (see ``runtime.friction_laws``), with one column per bristle,
+    instead of the tanh.
     """
 
     coulomb_smoothing_velocity: float = 0.01
@@ -104,7 +108,7 @@ class FrictionModel:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of the effects, in the order of the columns."""
+        """Names of all effects, in the order of the columns."""
         names = ["armature", "viscous", *(BRISTLES if self.memory else ("coulomb",)), "offset"]
         if self.stribeck:
             names.append("stribeck")
@@ -119,23 +123,23 @@ class FrictionModel:
         bent: np.ndarray | None = None,
         motors: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the columns, (T, n, effects n): effect e of drive j is column e n + j.
+        """Return the regressor of E effects, (T, n, E n): effect e of drive j is column e n + j.
 
         Args:
-            qd, qdd: motion of the joints, (T, n).
-            bent: deflections of the bristles relative to their break-away displacements, (T, n, K); None: unknown.
-            motors: C, (n, n), the drives rotate at C qd; None: each drive moves its own joint.
+            qd, qdd: velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2] of the joints, (T, n).
+            bent: deflections of the bristles divided by their break-away displacements, (T, n, K); None: unknown.
+            motors: matrix C, (n, n): the velocities of the drives are C qd; None: each drive moves its own joint.
         """
         motors = np.eye(qd.shape[-1]) if motors is None else motors
         effects = self._effects(qd @ motors.T, qdd @ motors.T, bent)
-        # The torque of drive j acts on joint i by C_ji, as power is equal on both sides of the gears.
+        # Power is equal on both sides of the gears, so the torque of drive j acts on joint i with the factor C_ji.
         columns: np.ndarray = effects[..., None, :, :] * motors.T[:, None]
         return columns.reshape(*qd.shape, -1)
 
     def torque(
         self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None, motors: np.ndarray
     ) -> np.ndarray:
-        """Return the torque without the armature's contribution, (..., n) [Nm, N], for ``constants`` (effects, n)."""
+        """Return the joint torque of all effects but the armature, (..., n) [Nm, N], for ``constants`` (effects, n)."""
         speed = qd @ motors.T
         torque: np.ndarray = (self._effects(speed, np.zeros_like(speed), bent) * constants).sum(
             axis=-2
@@ -143,17 +147,20 @@ class FrictionModel:
         return torque
 
     def _effects(self, speed: np.ndarray, rise: np.ndarray, bent: np.ndarray | None) -> np.ndarray:
-        """Return the factor of each constant, (..., effects, n), from velocity and acceleration of the drives."""
+        """Return the factor of each constant, (..., effects, n).
+
+        speed, rise: velocities and accelerations of the drives, (..., n).
+        """
         sign = np.tanh(speed / self.coulomb_smoothing_velocity)
         dry = [sign]
         if self.memory:
-            # if the history is unknown: bristles of a joint that has moved in this direction for a long time
+            # If the history of motion is unknown, assume that the joint has moved in this direction for a long time.
             dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
         effects = [rise, speed, *dry, np.ones_like(speed)]
         if self.stribeck:
-            # falls to 1/e at 0.1 rad/s or m/s
+            # the Stribeck effect falls to 1/e at 0.1 rad/s or m/s
             effects.append(sign * np.exp(-((speed / 0.1) ** 2)))
         if self.polynomial:
             effects += [speed * np.abs(speed), speed**3]
-        # the order of `effects`
+        # in the order of the property `effects`
         return np.stack(effects, axis=-2)

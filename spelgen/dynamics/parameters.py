@@ -1,4 +1,4 @@
-"""Group, unit and number of a model's trained parameters; other parameters than its own; removal of residual terms."""
+"""Trained parameters of a model: groups, units, number, evaluation at other values, and removal of residual terms."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -19,11 +19,11 @@ from spelgen.runtime.residual_terms import ResidualDynamics
 class ParameterInfo:
     """The group and the unit of a parameter.
 
-    kind: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of friction), effects (friction that
-    varies with velocity), velocities, load_dependence, fractions (of bristles), torque_splines, torque_ripple,
-    friction_splines, mass_constants, mass_residuals, stiffness, damping, dead_zone, delay, or network. unit: of the
-    quantity that the parameter represents, of revolute and of prismatic joints; most parameters are logarithms of it,
-    relative to a nominal value.
+    kind: the group: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of friction), effects
+    (friction that varies with velocity), velocities, load_dependence, fractions (of bristles), torque_splines,
+    torque_ripple, friction_splines, mass_constants, mass_residuals, stiffness, damping, dead_zone, delay, or network.
+    unit: unit of the physical quantity that the parameter represents, for revolute and for prismatic joints. Most
+    parameters are the logarithm of this quantity divided by a nominal value.
     """
 
     kind: str
@@ -37,16 +37,16 @@ NETWORK = ParameterInfo("network", "1")
 def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
     """Return the group and unit of each parameter of a model, by name, and of each buffer that a fit may set.
 
-    Parts of the model declare such buffers for quantities that only some logs determine, for example a friction
-    compensation.
+    Modules of the model declare such buffers for quantities that only some logs determine, for example the friction
+    compensation of a drive.
     """
     table = {name: NETWORK for name, _ in model.named_parameters()}
     for path, module in model.named_modules():
-        # A subclass adds groups to its base classes' groups.
+        # A subclass declares only its additional groups, so the groups of all base classes are collected.
         for declared in type(module).__mro__:
             for name, kind, unit, *_ in vars(declared).get("parameter_groups", ()):
                 weight = module._parameters.get(name, module._buffers.get(name))
-                if weight is not None and weight.numel():  # a part may have none
+                if weight is not None and weight.numel():  # a module may have no such parameter
                     table[f"{path}.{name}" if path else name] = ParameterInfo(kind, unit)
     return table
 
@@ -57,7 +57,7 @@ def parameter_count(model: nn.Module) -> int:
 
 
 def parameters_of_kind(model: nn.Module, *kinds: str) -> tuple[str, ...]:
-    """Return the names of the parameters of these groups, in the order of the model."""
+    """Return the names of the parameters of the given groups, in the order of the model."""
     return tuple(name for name, info in parameter_table(model).items() if info.kind in kinds)
 
 
@@ -68,11 +68,11 @@ NamedTensors = Mapping[str, Tensor]
 
 
 def idle_residuals(model: object) -> list[str]:
-    """Return the names of the parameters of residual terms that are zero."""
+    """Return the names of the parameters of the residual terms that are zero."""
     terms = residual_terms(model)
     if terms is None:
         return []
-    # of single joints; hidden layers of networks are never zero
+    # Only parameters of single joints are tested for zeros here, since hidden layers of networks are never zero.
     idle = [name for name, weights in terms.named_parameters(recurse=False) if not weights.any()]
     for prefix, network in (("mass", terms.mass), ("potential", terms.potential)):
         if _is_idle(network):
@@ -96,7 +96,7 @@ def without_residuals(model: Model) -> Model:
 
 def without_idle_residuals(model: Model) -> Model:
     """Return a copy of the model without residual terms that are zero; the copy must not be trained."""
-    # The caller's model may be trained further.
+    # Copy the model, since the caller may train it further.
     reduced = copy.deepcopy(model)
     if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:
         terms = reduced.residuals
@@ -104,14 +104,14 @@ def without_idle_residuals(model: Model) -> Model:
             terms.mass = None
         if _is_idle(terms.potential):
             terms.potential = None
-        # without any term, the factor on friction is one and needs no evaluation either
+        # Without any residual term the factor on friction is one: remove its evaluation, too.
         if not any(bool(weights.any()) for weights in terms.parameters()):
             reduced.residuals = None
     return reduced
 
 
 def _is_idle(network: MaskedNetwork | None) -> bool:
-    """Return True if a network is zero for all inputs; a network that does not exist is."""
+    """Return True if the output of a network is zero for all inputs, or if there is no network."""
     if not isinstance(network, MaskedMLP):
         return network is None
     # Only the last layer counts: hidden layers start at random weights.
@@ -146,9 +146,9 @@ class _Caller(nn.Module):
 
 
 def evaluate_with(model: Model, parameters: NamedTensors, function: Callable[[Model], Result]) -> Result:
-    """Return function(model) with other parameters than its own, as a differentiable function of these parameters.
+    """Return function(model), evaluated with the given parameters in place of the model's own values.
 
-    All other parameters of the model keep their values.
+    The result is differentiable with respect to the given parameters. Parameters that are not given keep their values.
     """
     named = {f"model.{name}": tensor for name, tensor in parameters.items()}
     result: Result = functional_call(_Caller(model), named, (function,))

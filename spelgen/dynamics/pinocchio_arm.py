@@ -16,15 +16,15 @@ from spelgen.settings.settings import Settings
 def arm_dynamics(
     arm: Chain, settings: Settings, friction: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> PinocchioDynamics:
-    """Return the dynamics of the arm with joint torques as inputs. Raises ArmError if a body has no inertial.
+    """Return the dynamics of the arm with joint torques as inputs. Raises ArmError if a body has no <inertial>.
 
-    friction: function of qd, (..., n), that returns the friction torque, (..., n) [Nm, N].
+    friction: function of qd, (..., n) [rad/s, m/s], that returns the friction torque, (..., n) [Nm, N].
     """
     return PinocchioDynamics(pinocchio_model(arm, settings), body_constraint(arm), friction)
 
 
 def body_constraint(arm: Chain) -> Constraint:
-    """Return the positions of the joints of all bodies, mimic joints included, as functions of the coordinates."""
+    """Return the constraint from the coordinates of the arm to the joints of all bodies, mimic joints included."""
     jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
     for row, body in enumerate(arm.bodies):
         jacobian[row, body.coordinate] = float(body.multiplier)
@@ -35,7 +35,7 @@ def body_constraint(arm: Chain) -> Constraint:
 def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
     """Return ``kinematic_model`` with the inertia of each body.
 
-    The rotor inertia on the joint side is the armature of the model. Raises ArmError if a body has no inertial.
+    The rotor inertia on the joint side is the armature of the model. Raises ArmError if a body has no <inertial>.
     """
     error = partial(
         ArmError,
@@ -45,7 +45,7 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
     )
     collect([error(element=f"joint {body.name!r}") for body in arm.bodies if body.inertia is None])
     model = kinematic_model(arm)
-    # index 0 is Pinocchio's universe
+    # index 0 of Pinocchio is the universe
     for index, body in enumerate(arm.bodies, start=1):
         model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
     # a mimic joint has no motor of its own
@@ -55,12 +55,12 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
 
 
 def kinematic_model(arm: Chain) -> pin.Model:
-    """Return a model with a joint about or along z for each body, in the order of the bodies, without inertia."""
+    """Return a model without inertia: for each body of the arm, in order, a joint about or along z."""
     model = pin.Model()
     model.name = arm.name
     model.gravity.linear = np.array(arm.gravity, dtype=float)
     for body in arm.bodies:
-        # frames of bodies have their joint's axis as z, so that two types of joints are enough
+        # The z axis of a body's frame is the axis of its joint, so that two types of joints are enough.
         joint = pin.JointModelPZ() if body.joint_type == "prismatic" else pin.JointModelRZ()
         placement = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
         model.addJoint(body.parent + 1, joint, placement, body.name)
@@ -69,6 +69,6 @@ def kinematic_model(arm: Chain) -> pin.Model:
 
 def _inertia(parameters: np.ndarray) -> pin.Inertia:
     mass, hx, hy, hz, ixx, ixy, ixz, iyy, iyz, izz = parameters
-    if mass == 0.0:  # Pinocchio would divide by it
+    if mass == 0.0:  # Pinocchio would divide by zero
         return pin.Inertia(0.0, np.zeros(3), np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]))
     return pin.Inertia.FromDynamicParameters(np.array([mass, hx, hy, hz, ixx, ixy, iyy, ixz, iyz, izz]))

@@ -1,8 +1,9 @@
-"""Rigid bodies by Pinocchio, with armature, friction, inputs and mimic joints.
+"""Dynamics of rigid bodies by Pinocchio, with armature, friction, an input matrix and mimic joints.
 
     M(q) qdd + h(q, qd) + friction(qd) = G tau        with  M = K^T M_joints(K q + offset) K
 
-K is constant, so it adds no velocity terms; it is a permutation unless there are mimic or locked joints.
+K maps the coordinates q to all joints of the model (see `constraint`). K is constant, so it adds no velocity terms. It
+is a permutation unless there are mimic or locked joints. G is the input matrix.
 """
 
 from __future__ import annotations
@@ -24,28 +25,29 @@ from spelgen.urdf.read import read_urdf
 
 
 def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
-    """Decorate a method of arrays so that states (..., n) may be tensors, and their batches are broadcast."""
+    """Decorate a method of arrays: arguments (..., n) may also be tensors, and their batch dimensions are broadcast."""
 
     @wraps(method)
     def on_arrays(self: PinocchioDynamics, *states: Any) -> object:
         first = states[0]
-        # a single state is a call of an integrator: broadcasting would take longer than the dynamics
+        # Integrators pass single states, for which broadcasting would take longer than the dynamics: skip it.
         if isinstance(first, np.ndarray) and first.ndim == 1:
             return method(self, *states)
         result = method(self, *np.broadcast_arrays(*map(np.asarray, states)))
         if isinstance(first, np.ndarray):
             return result
-        # importers of this file do not depend on torch
+        # torch is imported here, since this file must be importable without torch
         return first.new_tensor(result)
 
     return on_arrays
 
 
 class PinocchioDynamics:
-    """An arm of n coordinates (see ``RigidDynamics``); the model has b joints, with rotor inertia as armature.
+    """Dynamics of an arm of n coordinates (see ``RigidDynamics``).
 
-    constraint: joints that it does not name are locked. friction: torque (..., n) as a function of velocity (..., n);
-    None: no friction. inputs: G, (n, n); None: each input is the torque of its joint.
+    model: Pinocchio model of b joints, with the rotor inertia as armature. constraint: mimic joints; joints of the
+    model that it does not name are locked. friction: function of the velocity (..., n) that returns the torque (...,
+    n); None: no friction. inputs: input matrix G, (n, n); None: each input is the torque of its joint.
     """
 
     def __init__(
@@ -61,7 +63,7 @@ class PinocchioDynamics:
         order = [model.joints[model.getJointId(name)].idx_v for name in constraint.names]
         self.jacobian, self.offset = np.zeros((model.nv, len(self.inputs))), np.zeros(model.nv)
         self.jacobian[order], self.offset[order] = constraint.jacobian, constraint.offset
-        # without mimic or locked joints: products with the identity would take longer than `aba` itself
+        # Products with the identity would take longer than `aba` itself: they are skipped if K is the identity.
         self._same = np.array_equal(self.jacobian, np.eye(self.n)) and not self.offset.any()
 
     @property
@@ -71,7 +73,7 @@ class PinocchioDynamics:
 
     @_takes_tensors
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        """Return M, (..., n, n) [kg m^2, kg m, kg]."""
+        """Return the mass matrix M, (..., n, n) [kg m^2, kg m, kg]."""
         upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
         joints = upper + np.triu(upper, 1).swapaxes(-1, -2)  # Pinocchio guarantees the upper triangle only
         return np.asarray(self.jacobian.T @ joints @ self.jacobian)
@@ -84,7 +86,7 @@ class PinocchioDynamics:
 
     @_takes_tensors
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """Return dV/dq, (..., n) [Nm, N]."""
+        """Return the gravity torque dV/dq, (..., n) [Nm, N]."""
         return np.asarray(self.nonlinear_effects(q, np.zeros_like(q)))
 
     @_takes_tensors
@@ -94,11 +96,11 @@ class PinocchioDynamics:
 
     @_takes_tensors
     def forward_dynamics(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return qdd, (..., n), under the inputs tau (..., n)."""
+        """Return the accelerations qdd, (..., n), under the inputs tau (..., n)."""
         force = tau @ self.inputs.T - self.friction(qd)
-        if self._same:  # a copy: Pinocchio overwrites its result in the next call
+        if self._same:  # Pinocchio overwrites its result in the next call: copy it
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
-        # Mimic joints constrain the model of all b joints: J^T M J qdd = force, which `aba` cannot solve.
+        # `aba` cannot solve the constrained equations K^T M K qdd = force, so M is computed.
         force = force - self.nonlinear_effects(q, qd)
         return np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
 
@@ -108,27 +110,27 @@ class PinocchioDynamics:
         speeds, rates = qd @ self.jacobian.T, qdd @ self.jacobian.T
         torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
         torque = torque + self.friction(qd)
-        # the zero row of a passive joint would make G singular
+        # The row of a passive joint in G is zero, which makes G singular: use the row of the identity.
         passive = np.diag(~self.inputs.any(axis=1))
         return np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
-        """Return the configuration of Pinocchio, (..., nq), at q (..., n)."""
+        """Return the configuration vector of Pinocchio, (..., nq), at coordinates q (..., n)."""
         if not self._same:
             q = q @ self.jacobian.T + self.offset
         if self.model.nq == self.model.nv:
             return q
-        # planar and floating joints, which no coordinate moves, remain at the neutral configuration
+        # No coordinate moves planar and floating joints: they remain at the neutral configuration.
         configuration = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
         for joint in self.model.joints[1:]:
             position = q[..., joint.idx_v]
-            if joint.nq <= 2:  # a continuous joint is (cos, sin) in Pinocchio
+            if joint.nq <= 2:  # Pinocchio represents a continuous joint by (cos, sin)
                 values = [position] if joint.nq == 1 else [np.cos(position), np.sin(position)]
                 configuration[..., joint.idx_q : joint.idx_q + joint.nq] = np.stack(values, axis=-1)
         return configuration
 
     def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
-        """Return the results of an algorithm for a batch of states (..., nq), (..., nv), ..., state by state."""
+        """Call an algorithm of Pinocchio for each state of a batch (..., nq), (..., nv), ...; return a batch."""
         batch = states[0].shape[:-1]
         if not batch:
             return algorithm(self.model, self.data, *states)
@@ -138,14 +140,14 @@ class PinocchioDynamics:
 
 
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
-    """Return the dynamics of these joints of a URDF and of their mimic joints; all other joints are locked at zero.
+    """Return the dynamics of the given joints of a URDF and of their mimic joints; all other joints are locked at zero.
 
-    The URDF defines inertials, damping and friction; the settings define gravity and inputs. drives: with rotors of the
-    settings; if the settings have friction, it replaces the friction of the URDF. Raises the errors of Pinocchio if it
-    cannot read the file.
+    The URDF defines inertials, damping and friction. The settings define gravity and the input matrix. drives: use the
+    rotors of the settings, and their friction, if any, in place of the friction of the URDF. Raises the errors of
+    Pinocchio if it cannot read the file.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
-    # Pinocchio's own reading of the file is an independent reference for the chain of spelgen
+    # Pinocchio parses the file itself, so the result is an independent reference for spelgen's own parser.
     model = pin.buildModelFromXML(urdf_bytes(urdf).decode(errors="replace"))
     model.gravity.linear = np.array(settings.gravity)
     constraint = mimic_constraint(robot, joints)
@@ -153,18 +155,18 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     if missing:
         raise ValueError(f"Pinocchio sees no joint {', '.join(missing)}")
     motors = derive_actuation(robot, settings, joints).drives()
-    # friction of the URDF acts at the joints, friction of the settings at the motors
+    # Friction of the URDF acts at the joints; friction of the settings acts at the motors.
     by_joint, speeds = (settings.joints, motors.speeds) if drives else ({}, None)
     for name in joints:
         if name in by_joint:
             model.armature[model.joints[model.getJointId(name)].idx_v] = by_joint[name].armature
     moving = [robot.joint[name] for name in joints]
-    # width of the tanh in place of the sign of the velocity [rad/s, m/s]
+    # [rad/s, m/s] width of the tanh that replaces the sign of the velocity
     friction = joint_friction(moving, by_joint, 0.05, speeds)
     return PinocchioDynamics(model, constraint, friction, motors.inputs)
 
 
 def drives_known(urdf: Path, joints: Sequence[str]) -> bool:
-    """Return True if the settings of a URDF specify rotors or friction of these joints."""
+    """Return True if the settings of a URDF specify the rotors or the friction of the given joints."""
     drives = load_settings(urdf).joints
     return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in drives.items() if k in joints)

@@ -1,4 +1,4 @@
-"""A trained model for many calls: all that depends on the parameters only is computed once."""
+"""A trained model for many calls: quantities that depend on the parameters only are computed once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class State(NamedTuple):
-    """q and qd, (..., n), and the friction state z, (..., n, K)."""
+    """State of an arm: positions q and velocities qd, (..., n), and the friction state z, (..., n, K)."""
 
     q: Tensor
     qd: Tensor
@@ -30,15 +30,15 @@ class State(NamedTuple):
 class PreparedModel:
     """A copy of a model with constant parameters.
 
-    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is the friction state; by
-    default, the steady state of motion at qd. tip: kinematics of the tip, see
-    ``tip_kinematics``. elements: bristles per joint, K. dtype: of parameters and states.
+    Arguments q, qd, qdd and tau of the methods are (..., n), in rad and Nm, or m and N. The friction state z is
+    (..., n, K); its default is the steady state of motion at the velocity qd. tip: kinematics of the tip, see
+    ``tip_kinematics``. elements: number of bristles per joint, K. dtype: type of the parameters and states.
     """
 
     def __init__(
         self, model: PortHamiltonian, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
     ) -> None:
-        # networks that are zero would take most of the time
+        # Networks whose output is zero would take most of the time: remove them.
         reduced = without_idle_residuals(model)
         reduced.to(dtype=dtype).requires_grad_(False)
         self._model = reduced
@@ -47,11 +47,11 @@ class PreparedModel:
         self.elements: int = reduced.elements if isinstance(reduced, RigidBodyDynamics) else 0
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """Return M(q), (..., n, n) [kg m^2, kg m, kg]."""
+        """Return the mass matrix M(q), (..., n, n) [kg m^2, kg m, kg]."""
         return self._model.mass_matrix(self._at(q))
 
     def gravity(self, q: Tensor) -> Tensor:
-        """Return dV/dq, (..., n) [Nm, N]."""
+        """Return the gravity torque dV/dq, (..., n) [Nm, N]."""
         return self._model.gravity(self._at(q))
 
     def bias(self, q: Tensor, qd: Tensor) -> Tensor:
@@ -67,23 +67,23 @@ class PreparedModel:
         return sliding_memory(self._model, qd)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return z, (..., n, K), after a monotonic displacement of the joints, (..., n) [rad, m]."""
+        """Return the friction state z, (..., n, K), after a monotonic displacement of the joints, (..., n) [rad, m]."""
         return memory_after(self._model, z, displacement)
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return qdd, (..., n), under the input tau."""
+        """Return the accelerations qdd, (..., n), under the input tau."""
         return self._model.forward_dynamics(self._at(q, qd, tau), qd, tau, *known_past(self._model, z))
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the input, (..., n), that gives qdd."""
+        """Return the input tau, (..., n), that causes the accelerations qdd."""
         return self._model.inverse_dynamics(self._at(q, qd, qdd), qd, qdd, *known_past(self._model, z))
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return p = M(q) qd, (..., n) [Nm s, N s]."""
+        """Return the momenta p = M(q) qd, (..., n) [Nm s, N s]."""
         return self._model.momentum(self._at(q, qd), qd)
 
     def momentum_rate(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return p', (..., n) [Nm, N], under the input tau, for a momentum observer."""
+        """Return the rate dp/dt of the momenta, (..., n) [Nm, N], under the input tau, for a momentum observer."""
         past = known_past(self._model, z)
         p = self.momentum(q, qd)
         return self._model.port_hamiltonian_rhs(q, p, tau, self._weights, *past)[1]
@@ -91,9 +91,10 @@ class PreparedModel:
     def step(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
     ) -> State:
-        """Return q, qd and z after dt [s] under a constant tau, by ``substeps`` steps of the classical Runge-Kutta.
+        """Return q, qd and z after dt [s] under a constant input tau.
 
-        q, qd, tau: (..., n). z: (..., n, K), ``memory(qd)`` by default; its update is exact in the displacements.
+        The result is of ``substeps`` steps of the classical Runge-Kutta method. q, qd, tau: (..., n). z: friction
+        state, (..., n, K), by default ``memory(qd)``; its update is exact for a given displacement.
         """
         z = self.memory(qd) if z is None else z
 
@@ -102,14 +103,14 @@ class PreparedModel:
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
-            # velocities in place of momenta: control loops measure velocities
+            # The state has velocities, not momenta, since control loops measure velocities.
             q, qd, z, _ = runge_kutta(self._model, rhs, q, qd, z, dt / substeps)
         return State(q, qd, z)
 
     def rollout(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
     ) -> State:
-        """Return q and qd, (steps + 1, ..., n), and z; each tau of (steps, ..., n) is constant for dt [s]."""
+        """Return q and qd, (steps + 1, ..., n), and the last z; each tau of (steps, ..., n) is constant for dt [s]."""
         states = [State(q, qd, self.memory(qd) if z is None else z)]
         for held_tau in tau:
             q, qd, z = states[-1]
@@ -126,10 +127,10 @@ class PreparedModel:
         *,
         substeps: int = 1,
     ) -> tuple[Tensor, Tensor]:
-        """Return A, (..., 2 n, 2 n), and B, (..., 2 n, n): derivatives with respect to (q, qd) and tau.
+        """Return the linearization of the dynamics: A, (..., 2 n, 2 n), and B, (..., 2 n, n).
 
-        Without dt: derivatives of the rate (qd, qdd) at constant z. With dt [s]: derivatives of the result of
-        ``step``.
+        A is the derivative with respect to (q, qd), B with respect to tau. Without dt, they are derivatives of the rate
+        (qd, qdd) at constant z. With dt [s], they are derivatives of q and qd after ``step``.
         """
         n = self.n
         z = self.memory(qd) if z is None else z
@@ -138,7 +139,7 @@ class PreparedModel:
         vars(plain).pop("forward_dynamics", None)
 
         def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-            """Return the rate of the state (q, qd), or the state after dt, (2 n,)."""
+            """Return the rate of the state (q, qd), or the state after dt if dt is given, (2 n,)."""
             position, speed = state.split(n)
             if dt is None:
                 return torch.cat([speed, plain.forward_dynamics(position, speed, tau, z)])
@@ -155,20 +156,20 @@ class PreparedModel:
         return self._kinematics().pose(q)
 
     def jacobian(self, q: Tensor) -> Tensor:
-        """Return the Jacobian of the tip, (..., 6, n), linear rows first. Raises ValueError without a tip."""
+        """Return the Jacobian of the tip, (..., 6, n), linear velocity first. Raises ValueError without a tip."""
         return self._kinematics().jacobian(q)
 
     def compile(self) -> PreparedModel:
         """Return a copy whose forward and inverse dynamics are compiled by ``torch.compile`` at their first calls."""
         result = copy.copy(self)
         for method in (self.forward_dynamics, self.inverse_dynamics):
-            # asserts between the kernels would take a tenth of the time
+            # Assertions between the compiled kernels would take a tenth of the time: disable them.
             compiled = torch.compile(method, fullgraph=True, options={"size_asserts": False})
             vars(result)[method.__name__] = compiled
         return result
 
     def _at(self, q: Tensor, *others: Tensor) -> object:
-        """Return the configuration of the model at q; shapes of the other vectors are checked."""
+        """Return the configuration cache of the model at q, after a check of the shapes of all arguments."""
         return self._model.at(q, *others, prepared=self._weights)
 
     def _kinematics(self) -> TipKinematics:
@@ -178,12 +179,12 @@ class PreparedModel:
 
 
 def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: Tensor) -> tuple[Tensor, ...]:
-    """Return the Jacobians, (batch, m, n) each, of a function with respect to its first ``variables`` inputs."""
+    """Return the Jacobians, (batch, m, n), of a function with respect to each of its first ``variables`` inputs."""
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
     # torch 2.13: vmap of a derivative of linalg.solve is wrong in forward mode, or without autograd
     with torch.inference_mode(False), torch.enable_grad():
         jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
-        # clones: tensors of inference mode cannot be differentiated
+        # Tensors of inference mode cannot be differentiated, so the inputs are cloned.
         derivatives: tuple[Tensor, ...] = jacobian(*(x.clone() for x in states))
     return derivatives

@@ -1,4 +1,4 @@
-"""The interface of all dynamics of an arm: assembled models, models of Pinocchio, models of least squares."""
+"""The common interface of dynamics of an arm: trained models, Pinocchio, and least-squares parameters."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 class RigidDynamics(Protocol):
-    """M(q) qdd + h(q, qd) + friction(q, qd) = G tau of n joints; q, qd, qdd, tau are (..., n).
+    """Dynamics M(q) qdd + h(q, qd) + friction(q, qd) = G tau of n joints; q, qd, qdd and tau are (..., n).
 
-    Units: rad, m; Nm, N; kg m^2, kg m, kg.
+    Units: rad and Nm for revolute joints, m and N for prismatic joints; M in kg m^2, kg m and kg.
     """
 
     @property
@@ -25,10 +25,10 @@ class RigidDynamics(Protocol):
         """Number of joints."""
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """Return M, (..., n, n), with armature."""
+        """Return the mass matrix M, (..., n, n), armature included."""
 
     def gravity(self, q: Tensor) -> Tensor:
-        """Return dV/dq, (..., n)."""
+        """Return the gravity torque dV/dq, (..., n)."""
 
     def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return h, (..., n): Coriolis, centrifugal and gravity torques without friction."""
@@ -37,7 +37,7 @@ class RigidDynamics(Protocol):
         """Return the friction torque, (..., n)."""
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
-        """Return qdd, (..., n), under the inputs tau."""
+        """Return the accelerations qdd, (..., n), under the inputs tau."""
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Return the inputs, (..., n), for the accelerations qdd; at a passive joint, the torque required there."""
@@ -45,17 +45,17 @@ class RigidDynamics(Protocol):
 
 @runtime_checkable
 class FrictionState(Protocol):
-    """Friction that depends on the state z of bristles, (..., n, elements) [rad, m]."""
+    """Dynamics with a friction state: the deflections z of bristles, (..., n, elements) [rad, m]."""
 
     @property
     def elements(self) -> int:
-        """Bristles per joint."""
+        """Number of bristles per joint."""
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return z, (..., n, elements), of joints that have moved at qd for a long time."""
+        """Return the friction state z, (..., n, elements), of joints that have moved at qd for a long time."""
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return z after a monotonic displacement of the joints, (..., n)."""
+        """Return the friction state z after a monotonic displacement of the joints, (..., n) [rad, m]."""
 
 
 def residual_terms(model: object) -> ResidualTerms | None:
@@ -64,46 +64,50 @@ def residual_terms(model: object) -> ResidualTerms | None:
 
 
 def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
-    """Return True if friction depends on the state z of bristles, the last argument of all calls."""
+    """Return True if friction depends on the state z of bristles, which is then the last argument of all methods."""
     return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 
 
 def motors_of(model: Any) -> Tensor:
-    """Return C, (n, n): the motors rotate at C qd; the identity if each motor drives its own joint."""
+    """Return the matrix C, (n, n): the motor velocities are C qd; the identity if each motor drives its own joint."""
     return torch.eye(model.n).to(model.friction.nominal) if model.motors is None else model.motors
 
 
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
-    """Return z, (..., n, K), of joints that have moved at qd for a long time; K = 0 for friction without a state."""
+    """Return the friction state z, (..., n, K), of joints that have moved at qd for a long time.
+
+    K is 0 for friction without a state.
+    """
     if not is_stateful(dynamics):
         return qd.unsqueeze(-1)[..., :0]
     return dynamics.memory(qd)
 
 
 def memory_after(dynamics: object, z: Tensor, displacement: Tensor) -> Tensor:
-    """Return z after a monotonic displacement of the joints, (..., n)."""
+    """Return the friction state z after a monotonic displacement of the joints, (..., n) [rad, m]."""
     if not z.shape[-1] or not is_stateful(dynamics):
         return z
     return dynamics.memory_after(z, displacement)
 
 
 def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
-    """Return z, (W, K, n, elements), along the samples q and qd, (W, K, n), which are connected by straight lines.
+    """Return the friction state z, (W, K, n, elements), at K samples q and qd, (W, K, n), of W windows.
 
-    z: initial state, (W, n, elements); None: of joints that have moved at the first qd for a long time.
+    Between samples, q is interpolated linearly. z: initial state, (W, n, elements); None: the state of joints that have
+    moved at the first qd for a long time.
     """
     states = [sliding_memory(dynamics, qd[:, 0]) if z is None else z]
-    # the state after a sample depends on the state before it: no batch over samples
+    # The state at a sample depends on the state at the previous sample, so samples cannot be a batch.
     for moved in q.diff(dim=1).unbind(1):
         states.append(memory_after(dynamics, states[-1], moved))
     return torch.stack(states, dim=1)
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the arguments of the history of friction, the last of each call: z, if friction has a state, and the
-    direction.
+    """Return the last arguments of each method, which describe the history of friction: z and the direction.
 
-    direction: of dry friction without bristles, (..., n); required for a filtered tau, and filtered as tau is.
+    z is omitted if friction has no state. direction: direction in [-1, 1] of dry friction without bristles, (..., n).
+    It is required if tau was filtered, and must have passed the same filter.
     """
     if z is None or not is_stateful(dynamics):
         return ()
@@ -113,21 +117,21 @@ def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = No
 
 
 class VelocityState:
-    """Any dynamics with velocities in place of momenta, for rollouts."""
+    """Adapter for rollouts: dynamics without momenta, whose state has velocities in place of momenta."""
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        # the friction state is passed through: rollouts read it from these dynamics
+        # Rollouts call the methods of the friction state on this object, so they are forwarded.
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements
             self.memory, self.memory_after = dynamics.memory, dynamics.memory_after
 
     def prepare(self) -> None:
-        """Return None: there is no parameter cache."""
+        """Return None: these dynamics have no parameter cache."""
 
     def at(self, q: Tensor, prepared: None = None) -> Tensor:
-        """Return q, (..., n): there is no configuration cache."""
+        """Return q, (..., n): these dynamics have no configuration cache."""
         return q
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
@@ -147,5 +151,5 @@ class VelocityState:
 
 
 def integrable(dynamics: RigidDynamics) -> Any:
-    """Return the dynamics that a rollout integrates: in momenta if they have them, else in velocities."""
+    """Return dynamics for rollouts: the given ones if they have momenta, otherwise `VelocityState` of them."""
     return dynamics if isinstance(dynamics, PortHamiltonian | VelocityState) else VelocityState(dynamics)

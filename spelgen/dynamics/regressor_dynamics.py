@@ -1,4 +1,4 @@
-"""Regressor of the bodies of an arm, and dynamics of inertial parameters that need not be physically consistent."""
+"""Regressor of an arm's bodies, and dynamics for inertial parameters that need not be physically consistent."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,7 +19,7 @@ from spelgen.runtime.port_hamiltonian import applied
 
 
 def body_chain(arm: Chain, gravity: Row | None = None) -> BodyChain:
-    """Return the kinematics of the bodies of an arm; gravity [m/s^2]: by default the arm's."""
+    """Return the kinematics of the bodies of an arm; gravity: (3,) [m/s^2], by default the gravity of the arm."""
     rows: list[tuple[Any, ...]] = []
     for body in arm.bodies:
         placement = [(*_row(row), float(x)) for row, x in zip(body.rotation, body.translation, strict=True)]
@@ -29,7 +29,7 @@ def body_chain(arm: Chain, gravity: Row | None = None) -> BodyChain:
 
 
 def regressor(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-    """Return Y (T, n, 10 B) of the arm's B bodies at q, qd, qdd, each (T, n): tau = Y pi [Nm, N].
+    """Return the regressor Y (T, n, 10 B) of the arm's B bodies at q, qd and qdd, each (T, n): tau = Y pi [Nm, N].
 
     Column 10 b + i belongs to parameter i of ``arm.bodies[b]``, in the order of ``Body.inertia``.
     """
@@ -37,7 +37,7 @@ def regressor(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.
 
 
 def urdf_parameters(arm: Chain) -> np.ndarray:
-    """Return the inertial parameters of the URDF, (10 B,); zero for a body without inertial."""
+    """Return the inertial parameters of the URDF, (10 B,); zero for a body without <inertial>."""
     return np.array([body.inertia or (0,) * 10 for body in arm.bodies], dtype=float).ravel()
 
 
@@ -46,11 +46,12 @@ def _row(values: tuple[object, ...]) -> Row:
 
 
 class RegressorDynamics:
-    """An arm of n coordinates with these parameters (see ``RigidDynamics``).
+    """Dynamics of an arm of n coordinates and B bodies with given inertial parameters (see ``RigidDynamics``).
 
-    parameters: (10 B,), in the order of ``regressor``. armature: of the drives, (n,) [kg m^2, kg]. friction: function
-    of velocities (T, n) and of the state z (T, n, K), or None, which returns torques (T, n). bristle_reach: break-away
-    displacements, (n, K) [rad, m]; None: no state. drives: None: each input is the torque of its joint.
+    parameters: inertial parameters, (10 B,), in the order of ``regressor``. armature: armature of the drives, (n,)
+    [kg m^2, kg]. friction: function of velocities (T, n), and of the friction state z (T, n, K) or None, that returns
+    torques (T, n) [Nm, N]. bristle_reach: break-away displacements, (n, K) [rad, m]; None: friction has no state.
+    drives: None: each input is the torque of its joint.
     """
 
     def __init__(
@@ -62,7 +63,8 @@ class RegressorDynamics:
         drives: Drives | None = None,
         bristle_reach: np.ndarray | None = None,
     ) -> None:
-        # parameters by least squares may be inconsistent: a Cholesky factor, as in the models, may not exist
+        # Least-squares parameters may be physically inconsistent. The Cholesky factors that trained models use may
+        # then not exist.
         self.chain, self.friction = body_chain(arm), friction
         by_body = torch.from_numpy(parameters).double().reshape(-1, 10)
         self.inertia = torch.block_diag(*pseudo_inertia(by_body))
@@ -80,15 +82,15 @@ class RegressorDynamics:
 
     @property
     def elements(self) -> int:
-        """Bristles per joint, K."""
+        """Number of bristles per joint, K."""
         return self.bristle_reach.shape[1]
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """Return M, (..., n, n) [kg m^2, kg m, kg]."""
+        """Return the mass matrix M, (..., n, n) [kg m^2, kg m, kg]."""
         return self.equations_at(q).mass
 
     def gravity(self, q: Tensor) -> Tensor:
-        """Return dV/dq, (..., n) [Nm, N]."""
+        """Return the gravity torque dV/dq, (..., n) [Nm, N]."""
         return self.nonlinear_effects(q, torch.zeros_like(q))
 
     def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
@@ -97,34 +99,36 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the frames of the bodies, and their momenta per joint velocity, (..., n, 12 bodies)."""
-        # the columns of frames in place of points: M is linear in the pseudo-inertias between them
+        """Return the frames of the B bodies at q, and the momenta of the bodies per joint velocity, (..., n, 12 B)."""
+        # The columns of homogeneous transforms replace points of the bodies: M is linear in the pseudo-inertias.
         chain = self.chain.forward(q, torch.eye(len(self.inertia)).to(q))
         jacobian = torch.unflatten(self.chain.ratios.mT @ chain.jacobian, -1, (3, -1))
         return chain, (jacobian @ self.inertia).flatten(-2)
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return friction torque and torque offset, (..., n) [Nm, N]."""
+        """Return the sum of friction torque and torque offset, (..., n) [Nm, N]."""
         past = z.numpy() if z is not None and self.elements else None
         return torch.from_numpy(self.friction(qd.numpy(), past))
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return qdd, (..., n), under the inputs tau (..., n)."""
+        """Return the accelerations qdd, (..., n), under the inputs tau (..., n)."""
         equations = self.equations_at(q)
-        force = equations.force(qd, tau, z).unsqueeze(-1)  # (..., n, 1): M need not have the batch of tau
+        force = equations.force(qd, tau, z).unsqueeze(
+            -1
+        )  # (..., n, 1), so that M and tau may have different batch dimensions
         qdd: Tensor = torch.linalg.solve(equations.mass, force)
         return qdd.squeeze(-1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the inputs, (..., n), for the accelerations qdd; at a passive joint, the torque required there."""
         passive = (self.inputs == 0).all(dim=1).double()
-        # A passive joint has a zero row in G: a one on the diagonal makes G invertible, and the result at this
-        # joint is the torque required there.
+        # The row of a passive joint in G is zero. A one on its diagonal makes G invertible; the result for this
+        # joint is then the torque required there.
         inverse: Tensor = torch.linalg.inv(self.inputs + torch.diag(passive))
         return self.joint_torque(q, qd, qdd, z) @ inverse.mT
 
     def joint_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the torque of all joints, passive ones included, for qdd, (..., n) [Nm, N]."""
+        """Return the torques of all joints, passive ones included, for the accelerations qdd, (..., n) [Nm, N]."""
         equations = self.equations_at(q)
         return applied(equations.mass, qdd) - equations.force(qd, torch.zeros_like(qdd), z)
 
@@ -143,10 +147,10 @@ class RegressorDynamics:
         return MotionEquations(mass, force, partial(self.friction_torque, q))
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return z, (..., n, K), of drives that have moved at qd for a long time."""
+        """Return the friction state z, (..., n, K), of drives that have moved for a long time at velocities qd."""
         return (qd @ self.motors.mT.to(qd)).sign().unsqueeze(-1) * self.bristle_reach
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return z, (..., n, K), after a monotonic displacement of the joints, (..., n)."""
+        """Return the friction state z, (..., n, K), after a monotonic displacement of the joints, (..., n) [rad, m]."""
         moved = displacement @ self.motors.mT.to(displacement)
         return moved_bristles(z, moved.unsqueeze(-1), self.bristle_reach)

@@ -1,10 +1,11 @@
 """Rollouts of arms with position servos under their commands.
 
-Springs and dry friction are stiff, so both are integrated implicitly, with springs linearised at the start of a step
-(Rosenbrock; Hairer and Wanner, Solving ODEs II, IV.7, with the weights of the theta method): a few steps between
-samples are stable for any gain. Theta is fitted exponentially, so that decaying motion decays at its true rate to third
-order (Liniger and Willoughby, SIAM J. Numerical Analysis 7:47, 1970): 1/2 for slow motion, without numerical damping,
-and towards 1 for motion that is too fast for a step. The friction state is exact in the displacement of a step.
+The springs of the servos and dry friction are stiff, so both are integrated implicitly. Springs are linearised at the
+start of a step (Rosenbrock; Hairer and Wanner, Solving ODEs II, IV.7, with the weights of the theta method). A few
+steps between samples are then stable for any gain. Theta is fitted exponentially, so that decaying motion decays at its
+true rate to third order (Liniger and Willoughby, SIAM J. Numerical Analysis 7:47, 1970): 1/2 for slow motion, without
+numerical damping, and towards 1 for motion that is too fast for a step. The update of the friction state is exact for a
+given displacement.
 """
 
 from typing import NamedTuple
@@ -22,18 +23,18 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class ServoDrives(NamedTuple):
     """Constants of the servos and of friction, (..., n).
 
-    Bristles are (K, ..., n) here: contiguous memory of each element takes two thirds of the time of (..., n, K).
+    Constants of the K bristles are (K, ..., n): this layout takes two thirds of the time of (..., n, K).
     """
 
     servo: ServoConstants
     friction: FrictionConstants
     offset: Tensor  # torque offset [Nm, N]
     reach: Tensor  # break-away displacements, (K, ..., n) [rad, m]
-    steepness: Tensor  # change of the direction of dry friction per displacement, (K, ..., n) [1/rad, 1/m]
+    steepness: Tensor  # derivative of the direction of dry friction, (K, ..., n) [1/rad, 1/m]
 
 
 class ServoState(NamedTuple):
-    """q and qd, (..., n), and the friction state z, (K, ..., n)."""
+    """State of an arm: positions q and velocities qd, (..., n), and the friction state z, (K, ..., n)."""
 
     q: Tensor
     qd: Tensor
@@ -41,10 +42,10 @@ class ServoState(NamedTuple):
 
 
 class Load(NamedTuple):
-    """The load of the drives.
+    """Load of the drives in a step.
 
-    inertia: M, (..., n, n), or its diagonal, (..., n), if not ``coupled``. bias: Coriolis, centrifugal and gravity
-    torque, (..., n). gravity: gravity torque, (..., n).
+    inertia: mass matrix M, (..., n, n), or the diagonal of M, (..., n), if not ``coupled``. bias: Coriolis, centrifugal
+    and gravity torque, (..., n). gravity: gravity torque, (..., n).
     """
 
     inertia: Tensor
@@ -59,16 +60,17 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
-    batch = steepness.shape[1:-1] or (1,)  # batch of the constants
+    batch = steepness.shape[1:-1] or (1,)  # batch dimensions of the constants
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
     return ServoDrives(model.servo.prepare(), constants, model.torque_offset, reach.view(shape), steepness)
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return the state at rest, or of steady motion, in which friction balances the other torques as far as it can.
+    """Return the state whose bristles balance the other torques as far as their break-away torque allows.
 
-    q, qd, u: positions, velocities and commands, (..., n) [rad, m].
+    It is the state at rest, or of steady motion. q, u: positions and commands, (..., n) [rad, m]. qd: velocities, (...,
+    n) [rad/s, m/s].
     """
     servo = drives.servo
     torque = servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd
@@ -84,7 +86,7 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     strength = drives.friction.dry(qd, load.gravity) * drives.steepness
     spring = servo.kp * beyond(u - q, servo.dead_zone)
     torque = spring - servo.kd * qd
-    free = (torque.abs() < servo.limit).to(q)  # 0 where the servo is saturated: it neither stiffens nor damps
+    free = (torque.abs() < servo.limit).to(q)  # 0: the servo is saturated, without stiffness and damping
     servo_stiffness = free * servo.kp * (spring != 0)
     torque = torch.where(free > 0, spring, servo.limit * torque.sign())
     force = torque - drives.offset - load.bias - (strength * z).sum(dim=0)
@@ -93,15 +95,16 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     stiffness = (strength * (qd.sign() * z < drives.reach)).sum(dim=0)
     decay = h * (damping + h * (servo_stiffness / 2 + stiffness)) / inertia
     theta = (3 + decay) / (6 + decay)
-    # evaluated at the fraction theta of the step; bristles, which are the stiffest, at its end
+    # Springs are evaluated at the fraction theta of the step. Bristles, which are the stiffest, are evaluated at
+    # the end of the step.
     impulse, bristle_stiffness = theta * h * force, theta * h * h * strength
     damping = theta * h * (damping + h * theta * servo_stiffness)
-    # displacements are divided by h: the unknown is the mean velocity of the step
+    # The unknown is the mean velocity of the step, so displacements are divided by h.
     bent, reach = z / h, drives.reach / h
     velocity = slipped(inertia * qd + impulse, inertia + damping, bristle_stiffness, bent, reach)
     if load.coupled:
         momentum = applied(load.inertia, qd) + impulse
-        # the displacement of bristles depends on the other joints: two passes find the bristles that slide
+        # Which bristles slide depends on the displacements of the other joints: two passes suffice.
         for _ in range(2):
             rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
             secant = rise / torch.where(velocity == 0, 1.0, velocity)
@@ -118,28 +121,31 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
     """Return the displacement x, (..., n), that solves slope x + sum_k strength_k (z_k(x) - z_k) = push, (..., n).
 
     strength, z, reach: (K, ..., n), the shortest break-away displacement first. Bristles that are deflected in the same
-    direction begin to slide in this order, so x is the largest zero of K + 1 straight lines: in the k-th, k slide.
+    direction begin to slide in this order. With k sliding bristles the equation is a straight line; x is the largest
+    zero of these K + 1 lines.
     """
     direction, stiffness = push.sign(), slope + strength.sum(dim=0)
-    # running sums of the remaining push and of the stiffness, if k bristles slide
+    # Cumulative sums give the remaining push and the stiffness for each number k of sliding bristles.
     remaining = torch.cat([push.abs().unsqueeze(0), -strength * (reach - direction * z)]).cumsum(dim=0)
     resisting = torch.cat([stiffness.unsqueeze(0), -strength]).cumsum(dim=0)
     return direction * (remaining / resisting).amax(dim=0)
 
 
 def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:
-    """Return positions (W, K, n) after each interval dt (W, K) [s], from q and qd (W, n).
+    """Return the positions (W, K, n) [rad, m] after each of K intervals, for W windows.
 
-    commands: delayed, (W, K, S, n); S: steps per interval. M and the gravity torque are evaluated once per interval.
+    q, qd: initial positions and velocities, (W, n). commands: delayed commands, (W, K, S, n), with S steps per
+    interval. dt: durations of the intervals, (W, K) [s]. M and the gravity torque are evaluated once per interval.
     """
     with torch.no_grad():
         drives, prepared, positions = servo_drives(model), model.prepare(), []
         state, previous_bias = None, None
         for now, interval in zip(commands.unbind(1), dt.unbind(1), strict=True):
             pose = model.configuration(q, prepared)
-            # once per interval: M and gravity change slowly between samples, springs and friction do not
+            # Between samples M and gravity change slowly, in contrast to springs and friction: evaluate them once per
+            # interval.
             bias = middle_bias = model.nonlinear_effects(pose, qd)
-            # extrapolated to the middle of the interval: the bias is known at its start only
+            # The bias is known only up to the start of the interval: extrapolate it to the middle.
             if previous_bias is not None:
                 middle_bias = bias + (bias - previous_bias) / 2
             previous_bias = bias

@@ -20,35 +20,35 @@ if TYPE_CHECKING:
 class TipKinematics:
     """Pose and Jacobian of a link in the frame of the root link, as functions of q (..., n) [rad, m].
 
-    Mimic joints move with their leaders, all other joints are at zero. Angles are the unrounded angles of the URDF.
-    Results have the type of q.
+    Mimic joints are included; joints that are neither coordinates nor mimic joints are at zero. Angles of the URDF are
+    not rounded. Results have the dtype of q.
     """
 
     def __init__(self, robot: Robot, joints: Sequence[str], link: str) -> None:
         self.link = link
         path = robot.path_to(link)
-        # a chain of pytorch-kinematics has one type of numbers: both are made, as `q` decides
+        # A chain of pytorch-kinematics has one dtype, and results have the dtype of q: prepare a chain for each dtype.
         self._chains = {
             dtype: _serial_chain(robot.root, path, dtype) for dtype in (torch.float64, torch.float32)
         }
         constraint = mimic_constraint(robot, joints)
         rows = [constraint.names.index(joint.name) for joint in path if joint.moves]
-        self._jacobian = torch.from_numpy(constraint.jacobian[rows])  # (joints of the path, n)
+        self._jacobian = torch.from_numpy(constraint.jacobian[rows])  # (joints on the path to the link, n)
         self._offset = torch.from_numpy(constraint.offset[rows])
-        # a joint that does not move the link is a mistake of the caller, not a zero column
+        # A joint that does not move the link is probably a mistake of the caller: raise instead of a zero column.
         missing = [name for name, column in zip(joints, self._jacobian.T, strict=True) if not column.any()]
         if missing:
             raise ValueError(f"the joints {', '.join(missing)} do not lead to {link}")
 
     def pose(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the homogeneous transform, (..., 4, 4)."""
+        """Return the homogeneous transform from the link to the root frame, (..., 4, 4)."""
         poses: torch.Tensor = self._chains[q.dtype].forward_kinematics_tensor(
             self._rows(q), analytical_grad=False
         )[-1]
         return poses.reshape(*q.shape[:-1], 4, 4)
 
     def position(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the origin of the link, (..., 3) [m]."""
+        """Return the position of the link's origin in the root frame, (..., 3) [m]."""
         return self.pose(q)[..., :3, 3]
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
@@ -57,16 +57,17 @@ class TipKinematics:
         return jacobian.reshape(*q.shape[:-1], 6, q.shape[-1])
 
     def _rows(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the positions of the joints of the path, (states, joints)."""
+        """Return the positions of the joints on the path from the root to the link, (states, joints) [rad, m]."""
         return (q @ self._jacobian.to(q).mT + self._offset.to(q)).reshape(-1, len(self._offset))
 
 
 def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> SerialChain:
     """Return the chain of pytorch-kinematics for a path of joints from the root link.
 
-    Its frames are made from the values of the file: the URDF parser of pytorch-kinematics rounds them to float32.
+    The frames are built from spelgen's values of the URDF, since the URDF parser of pytorch-kinematics rounds to
+    float32.
     """
-    import pytorch_kinematics as pk  # imports matplotlib, which takes long
+    import pytorch_kinematics as pk  # imported here: it imports matplotlib, which takes long
     from pytorch_kinematics.frame import Frame, Joint, Link
 
     first = last = Frame(root, Link(root), Joint())
@@ -90,10 +91,10 @@ def tip_kinematics(
 ) -> TipKinematics:
     """Return the kinematics of ``link``.
 
-    By default it is the tip of the arm, or the link after the last joint or the end of the fixed links after that.
+    The default link is the tip of the arm, or else the result of `last_link`.
 
-    arm: result of ``load_arm``, or the path of a URDF, with the names of its ``joints``. Raises ValueError if the
-    joints do not lead to the link.
+    arm: result of ``load_arm``, or the path of a URDF together with the names of its ``joints``. Raises ValueError if
+    the link is not moved by these joints.
     """
     if isinstance(arm, str | Path):
         robot, names = read_urdf(Path(arm)), list(joints or ())
@@ -106,7 +107,7 @@ def tip_kinematics(
 
 
 def last_link(robot: Robot, joints: Sequence[str]) -> str:
-    """Return the link after the last of these joints, or the end of the fixed links after it."""
+    """Return the link after the last of the given joints, or the end of the fixed links that follow this link."""
     link = robot.joint[joints[-1]].child
     while True:
         fixed = [joint.child for joint in robot.joints_below[link] if joint.type == "fixed"]

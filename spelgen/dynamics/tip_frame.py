@@ -14,8 +14,9 @@ from spelgen.dynamics.tip import last_link
 class Tip:
     """The frame of the tip link.
 
-    carrier: index of the body that carries the link; -1: the root link. pose: (4, 4), in the frame of this body.
-    bodies: of the arm with the unrounded angles of the URDF, so that poses equal the ones of other URDF parsers.
+    carrier: index of the body that carries the link; -1: the root link. pose: pose of the link in the frame of this
+    body, (4, 4). bodies: bodies of the arm with the unrounded angles of the URDF, so that poses are equal to the ones
+    of other URDF parsers.
     """
 
     link: str
@@ -28,15 +29,15 @@ def tip_frame(loaded: Arm) -> Tip:
     """Return the frame of the tip link, with the unrounded angles of the URDF."""
     names = loaded.chain.joint_names
     link = loaded.tip or last_link(loaded.robot, names)
-    # rounded angles would move the tip by up to the tolerance times the extent of the arm
+    # Rounded angles would displace the tip by up to the tolerance of the rounding times the extent of the arm.
     bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
     return Tip(link, *link_poses(loaded)[link], bodies)
 
 
 def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
-    """Return, by link, the index of the body that carries it, -1: the root link, and the pose (4, 4) in its frame.
+    """Return a mapping from each link to the body that carries the link, and to the pose of the link in its frame.
 
-    Angles are the unrounded angles of the URDF.
+    The body is an index, -1 for the root link; the pose is (4, 4). Angles of the URDF are not rounded.
     """
     chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
     poses: dict[str, tuple[int, np.ndarray]] = {}

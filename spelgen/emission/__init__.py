@@ -1,1 +1,1 @@
-"""Structure -> specification of a model -> model in memory, or the source of a module."""
+"""Specification of a model from an arm's structure; model in memory, or source of a module, from a specification."""

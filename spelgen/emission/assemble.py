@@ -1,4 +1,4 @@
-"""ModelSpec -> a model in memory, of the classes of ``spelgen.runtime``."""
+"""Assembly of a model in memory from a ``ModelSpec``, with the classes of ``spelgen.runtime``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class ArmModel(PortHamiltonian):
-    """The model of an arm, assembled from its specification, and an instance of a class of the runtime."""
+    """Base class of the models of arms; a model is also an instance of a dynamics class of ``spelgen.runtime``."""
 
     spec: ModelSpec
 
@@ -50,22 +50,24 @@ class ArmModel(PortHamiltonian):
 
 
 def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
-    """Return the model that ``spec`` describes, with the initial weights of ``seed``.
+    """Return the model that ``spec`` describes; seed: seed of the random initial weights of networks.
 
-    Raises ModuleError for a specification of no model, such as a mass that is not positive.
+    Raises ModuleError if the specification has values that no model can have, such as a mass that is not positive.
     """
     assembly = model_parts(spec)
     names: dict[str, object] = {"generator": torch.Generator().manual_seed(seed)}
-    # In place of the function that the text of a module defines: the same operations in the same order.
+    # A module defines the function `mass_entries`. This replacement has the same operations in the same
+    # order.
     names["mass_entries"] = partial(_mass_entries, entry_sums(spec))
     try:
-        # the rows first: calls refer to them by name
+        # The rows are evaluated first, because calls refer to them by name.
         for name, rows in assembly.rows.items():
             names[name] = tuple(_value(row, names) for row in rows)
         arguments = {str(name): _value(item, names) for name, item in assembly.model.arguments}
         model = _model_class(base_class(spec))(**arguments)
     except (RuntimeError, ValueError, ArithmeticError, LookupError, TypeError) as problem:
-        # A specification may be edited by hand: any failure of a constructor is an error of its numbers.
+        # A user may have edited the specification, so a failure of a constructor is reported as an invalid
+        # number.
         reason = " ".join(str(problem).split())[:200]
         raise ModuleError(f"a specification of no model ({reason})", do="build it again") from problem
     model.spec = spec
@@ -73,9 +75,10 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
 
 
 def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
-    """Return the model of a module that `spelgen build` wrote, with the initial weights of ``seed``.
+    """Return the model of a module that `spelgen build` wrote; seed: seed of the initial weights of networks.
 
-    module: the file, or its text. Raises ModuleError for a file that was edited or is no such module.
+    module: path of the module, or its text. Raises ModuleError if the module was edited, or is not from `spelgen
+    build`.
     """
     is_text = isinstance(module, str) and "\n" in module
     file = None if is_text else Path(module)
@@ -84,21 +87,21 @@ def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
 
 
 def spec_of(model: object) -> ModelSpec | None:
-    """Return the specification that a model was assembled from; None of another model."""
+    """Return the specification that a model was assembled from; None if the object is not such a model."""
     return model.spec if isinstance(model, ArmModel) else None
 
 
 def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
-    """Return M, (..., n, n), linear in the terms (...,), equal to the function ``mass_entries`` of a module.
+    """Return M, (..., n, n), a linear function of terms (...,): the function ``mass_entries`` of a module.
 
-    rows: of the lower triangle. terms: functions of q, then constants.
+    rows: linear combinations per row of the lower triangle. terms: values of the functions of q, then the constants.
     """
     return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in rows))
 
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
-    """Return the linear combination of terms (...,) in the order of the module, with the same rounding errors."""
-    # subtractions, not sums of negative products: the module is written so
+    """Return a linear combination of terms (...,), in the order of operations of the module."""
+    # Negative terms are subtracted, as in the module's text, so that rounding errors are equal.
     total: Tensor | float = 0
     for position, (factor, index) in enumerate(sums):
         term = terms[index] if abs(factor) == 1 else abs(factor) * terms[index]
@@ -111,13 +114,14 @@ def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
 
 @cache
 def _model_class(base: str) -> Callable[..., ArmModel]:
-    """Return the class ``Model`` of models whose dynamics are a class of the runtime."""
-    # One class per class of the runtime: models of a kind have the same type.
+    """Return a class ``Model`` that derives from ``ArmModel`` and from this class of the runtime."""
+    # The cache makes one class per class of the runtime, so that models with equal dynamics have the same
+    # type.
     return cast("Callable[..., ArmModel]", type("Model", (ArmModel, vars(runtime)[base]), {}))
 
 
 def _value(item: object, names: dict[str, object]) -> object:
-    """Return the value of an argument: the result of a call, or the object with a name."""
+    """Return the value of an argument: calls are evaluated, and names are replaced by the objects in `names`."""
     if isinstance(item, Code):
         return names[item.text]
     if isinstance(item, tuple):

@@ -1,4 +1,4 @@
-"""From a URDF to a model in memory: the function ``build``."""
+"""The function ``build``: a model in memory from a URDF."""
 
 from pathlib import Path
 
@@ -23,9 +23,10 @@ def build(
     Args:
         arm: the result of ``load_arm``, or the path of a URDF.
         preset: name of a preset, path of a YAML file with a design, or a ``Design``.
-        width, depth: units of the hidden layers of networks, and their number.
-        assume: ``kinematics``: structure for any inertial parameters; ``inertials``: for the parameters of the URDF.
-        seed: of the initial weights of networks.
+        width, depth: number of units of each hidden layer of networks, and number of hidden layers.
+        assume: ``kinematics``: the structure is valid for any inertial parameters; ``inertials``: only
+            for the URDF's.
+        seed: seed of the random initial weights of networks.
 
     Raises the errors of ``load_arm``, and SettingsError for an inconsistent design.
     """

@@ -1,4 +1,4 @@
-"""ModelSpec -> the parts of a model: one table, from which a model is assembled and a module is written."""
+"""The parts of a model, from a ``ModelSpec``: the common source of models in memory and of the text of modules."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -17,17 +17,18 @@ FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code(
 
 @dataclass(frozen=True)
 class ModelParts:
-    """The rows of an arm by their name, and the call that makes its model from them.
+    """The rows of an arm (``JOINTS``, ``LINKS``, ...), and the call that makes the model from the rows.
 
-    Calls are to classes of ``spelgen.runtime``. Arguments are numbers, texts, tuples, calls and names: of the rows, of
-    ``mass_entries``, and of ``generator``, the random generator of initial weights, used in the order of the calls.
+    All calls are calls of classes of ``spelgen.runtime``. An argument is a number, a text, a tuple, a call or a name.
+    Names refer to the rows, to the function ``mass_entries``, and to ``generator``, the random generator of initial
+    weights, which is used in the order of the calls.
     """
 
     rows: dict[str, tuple[Call, ...]]
     model: Call
 
     def uses(self, name: Code) -> bool:
-        """Return True if the call refers to a name, for example to ``generator`` if the model has networks."""
+        """Return True if the call refers to this name; for example, models with networks refer to ``generator``."""
         return _names(self.model, name)
 
 
@@ -37,7 +38,7 @@ def model_parts(spec: ModelSpec) -> ModelParts:
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
     if spec.outputs and spec.links and spec.design.net != "none":
-        # Residual terms of rigid bodies start at zero: their functions need no mean.
+        # Residual functions of M start at zero, so the rows have neither mean nor scale.
         rows["FUNCTIONS"] = tuple(call("Function", _joint_names(spec, x.joints)) for x in spec.outputs)
     elif spec.design.mass == "derived":
         functions = [
@@ -55,7 +56,7 @@ def _inputs(spec: ModelSpec) -> Call:
     n = range(len(spec.joints))
     values = {(x.joint, x.motor): x.value for x in spec.inputs}
     matrix = tuple(tuple(values.get((joint, motor), 0.0) for motor in n) for joint in n)
-    # A mask marks the trained gains; the ratios of known gears are constants.
+    # Gains that are trained are marked by a mask; known gear ratios are constants.
     trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
     mask = tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
     return call("MotorInputs", matrix, **_unless({"trained": mask}, trained=not trained))
@@ -69,7 +70,7 @@ def base_class(spec: ModelSpec) -> str:
 
 
 def _names(value: object, name: Code) -> bool:
-    """Test whether a value refers to a name."""
+    """Return True if a value is this name, or contains it as an argument or item."""
     if isinstance(value, Call):
         return any(_names(item, name) for _, item in value.arguments)
     if isinstance(value, tuple):
@@ -78,14 +79,15 @@ def _names(value: object, name: Code) -> bool:
 
 
 def _unless(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
-    """Return the fields that are not at their default value: a row shows in which respect it is special."""
+    """Return the fields without those at their default value, so that the rows of a module are short."""
     return {name: value for name, value in fields.items() if not is_default.get(name)}
 
 
 def _joint(joint: JointSpec) -> Call:
     typical, limits = (joint.center, joint.half_range), None
     if joint.lower is not None and joint.upper is not None:
-        # as `runtime.rows.Joint` rounds them
+        # `runtime.rows.Joint` rounds center and half range in the same way, so equal values can be
+        # omitted.
         limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
     fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
     fields |= {"armature": joint.armature, "gear": joint.gear}
@@ -120,7 +122,7 @@ def _link(spec: ModelSpec, link: LinkSpec) -> Call:
 
 
 def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
-    """Return the arguments of a model of rigid bodies."""
+    """Return the keyword arguments of the class of a rigid-body model, without ``joints`` and ``inputs``."""
     arguments: dict[str, object] = {"links": LINKS, "gravity": spec.gravity, "friction": _friction_laws(spec)}
     if spec.motor_speeds:
         arguments["motor_speeds"] = spec.motor_speeds
@@ -129,7 +131,8 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
         arguments["servo"] = call("PositionServo", **columns)
     if spec.design.net != "none":
         terms: dict[str, object] = {"functions": len(spec.outputs), "constants": len(spec.constants)}
-        # the random generator is used in the order of the calls
+        # The order of `network` and `potential` determines their initial weights, since both use one
+        # generator.
         if spec.potential:
             terms["potential_scale"] = spec.potential_scale
         if spec.outputs:
@@ -143,18 +146,18 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
 def _friction_laws(spec: ModelSpec) -> Call:
     if spec.design.memory == "none":
         return call("SlidingFriction", JOINTS)
-    # only for joint types of the arm, in the order of BREAKAWAY: the emitted text is deterministic
+    # The rows of the arm's joint types, always in the order of BREAKAWAY, so that the text is deterministic.
     breakaway = {name: row for name, row in BREAKAWAY.items() if name in spec.joint_types}
     rounding = {"stribeck_rounding": SERVO_STRIBECK_ROUNDING} if spec.servos else {}
     return call("FrictionLaws", JOINTS, breakaway=breakaway, **rounding)
 
 
 def _networks(spec: ModelSpec) -> dict[str, object]:
-    """Return the arguments of a model of networks, in the order of their random initial weights."""
+    """Return the keyword arguments of the class of a network model; their order determines the initial weights."""
     n = len(spec.joints)
     ones = (1.0,) * n
     mass = _mass(spec)
-    # without gravity, one output that depends on no joint
+    # If V is constant, its network is one output that depends on no joint.
     potential = _potential(spec) if spec.potential else _network(spec, ((),), (ones, ones), width=1, depth=0)
     scale = spec.potential_scale if spec.potential else 1.0
     arguments: dict[str, object] = {"mass": mass, "potential": potential, "potential_scale": scale}
@@ -168,7 +171,7 @@ def _mass(spec: ModelSpec) -> Call:
     if spec.design.mass == "dense-3n":
         rows = 3 * len(spec.joints)
         outputs = (spec.joint_names,) * (rows * (rows + 1) // 2)
-        # The nominal mean of M, by its lower triangle: M is symmetric.
+        # M is symmetric, so the text has only the lower triangle of the nominal mean.
         mean = mean_mass(len(spec.joints), spec.outputs, spec.constants)
         triangle = tuple(tuple(row[: k + 1]) for k, row in enumerate(mean.tolist()))
         return call("DenseMass", JOINTS, mean=triangle, network=_network(spec, outputs, _mass_scales(spec)))
@@ -180,21 +183,21 @@ def _mass(spec: ModelSpec) -> Call:
 
 
 def _mass_network(spec: ModelSpec) -> Call:
-    """Return the network of the functions of M."""
-    # A unit of a KAN has a function per edge: fewer units suffice.
+    """Return the call that makes the network whose outputs are the functions of M."""
+    # Each edge into a unit of a Kolmogorov-Arnold network is a learned function, so fewer units suffice.
     min_units = TUNING.min_kan_units if spec.design.net == "kan" else TUNING.min_units
     return _network(spec, call("joints_of", FUNCTIONS), _mass_scales(spec), min_units=min_units)
 
 
 def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
-    """Return the scales of cos q, or the scaled q, and of sin q."""
+    """Return two rows of input scales per joint: of cos q (or the scaled q of a prismatic joint), and of sin q."""
     return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
 
 
 def _potential(spec: ModelSpec) -> Call:
-    # cos q and sin q of a joint have the same scale
+    # The inputs cos q and sin q of a joint have the same scale.
     scales = (tuple(joint.potential_sensitivity for joint in spec.joints),) * 2
-    # V is one output, M has many: a part of the units is enough.
+    # V is a single output, but M has many: a fraction of the units suffices for V.
     width = max(TUNING.min_units, round(TUNING.potential_fraction * units(spec)))
     return _network(spec, (_joint_names(spec, spec.potential),), scales, width=width)
 
@@ -204,12 +207,12 @@ def _friction(spec: ModelSpec) -> Call:
     scale, ones = (TUNING.position_sensitivity,) * n, (1.0,) * n
     if spec.design.dissipation == "per-joint":
         outputs = tuple((name,) for name in spec.joint_names)
-        # Velocities in units of the typical speed; qd / |qd| is scaled already.
+        # The velocity inputs are divided by the typical speed; the inputs qd / |qd| have magnitude one.
         speeds = tuple(rounded(1 / joint.speed, 4) for joint in spec.joints)
         width = TUNING.friction_units * n
         network = _network(spec, outputs, (scale, scale, speeds, ones), width=width, depth=1)
         return call("JointFriction", JOINTS, network=network)
-    # only one of the three axes of a joint moves, the others are part of the published model
+    # The published model has three axes per joint, of which only one moves.
     axes = 3 if spec.design.dissipation == "dense-3n" else 1
     rows = axes * n
     network = _network(spec, (spec.joint_names,) * (rows * (rows + 1) // 2), (scale, scale, ones))
@@ -225,7 +228,7 @@ def _network(
     depth: int | None = None,
     min_units: int = 1,
 ) -> Call:
-    """Return a network with these outputs: for each, the names of the joints that it depends on."""
+    """Return the call that makes a network; outputs: per output, the names of the joints that the output depends on."""
     options = {
         "scales": scales,
         "outputs": outputs,
@@ -238,7 +241,7 @@ def _network(
 
 
 def units(spec: ModelSpec) -> int:
-    """Return the units of a hidden layer: fewer of a Kolmogorov-Arnold network, which has a grid on every edge."""
+    """Return the number of units of a hidden layer; Kolmogorov-Arnold networks, with a grid per edge, have fewer."""
     width = spec.options.width
     return width if spec.design.net == "mlp" else max(TUNING.min_units, round(TUNING.kan_fraction * width))
 
@@ -248,33 +251,34 @@ def _joint_names(spec: ModelSpec, joints: Sequence[int]) -> tuple[str, ...]:
 
 
 def rounded(value: float, digits: int = 6) -> float:
-    """Return a value to significant digits."""
+    """Return a value, rounded to significant digits."""
     return float(f"{value:.{digits}g}")
 
 
 Sums = list[tuple[float, int]]
-"""Factors and indices of the terms of an entry: functions first, then constants; positive factors first."""
+"""The terms of an entry of M, positive factors first: factor, and index in the list of functions and constants."""
 
 
 def entry_sums(spec: ModelSpec) -> list[list[Sums]]:
-    """Return the terms of each entry of the lower triangle of M, row after row."""
+    """Return the linear combination of terms for each entry of the lower triangle of M, as a list per row."""
     cells: defaultdict[tuple[int, int], Sums] = defaultdict(list)
     terms: Sequence[OutputSpec | ConstantSpec] = (*spec.outputs, *spec.constants)
     for index, term in enumerate(terms):
         for row, column, factor in term.basis:
             cells[row, column].append((factor, index))
-    # no entry starts with a minus where another order has none
+    # Positive factors come first, so that an expression does not start with a minus sign unless all are
+    # negative.
     ordered = {entry: sorted(sums, key=lambda term: term[0] < 0) for entry, sums in cells.items()}
     return [[ordered.get((row, column), []) for column in range(row + 1)] for row in range(len(spec.joints))]
 
 
 def term_names(spec: ModelSpec) -> list[str]:
-    """Return the names of the terms: f1, f2, ... of functions and c1, c2, ... of constants."""
+    """Return the names of the terms of M: f1, f2, ... for functions, then c1, c2, ... for constants."""
     return [f"f{k + 1}" for k in range(len(spec.outputs))] + [f"c{k + 1}" for k in range(len(spec.constants))]
 
 
 def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
-    """Return the lower triangle of the nominal mean of M without armature, (n, n), to six digits."""
+    """Return the nominal mean of M without armature, (n, n), to six digits, with zeros above the diagonal."""
     mean = np.zeros((n, n))
     for constant in constants:
         for row, column, value in constant.basis:

@@ -1,4 +1,4 @@
-"""Arm, structure and nominal values -> ModelSpec: the function ``derive_spec``."""
+"""The function ``derive_spec``: the ``ModelSpec`` of an arm, from the arm's structure and nominal values."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -53,7 +53,8 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
             expected="a preset with bristle friction, which position servos need", do="--preset closed-form",
         )  # fmt: skip
     structure = derive(arm.chain, options.assume)
-    # Magnitudes of M, V and torques for the URDF's inertials, or for nominal ones: scales of networks and friction.
+    # Magnitudes of M, V and torques are the scales of networks and friction. They are computed with the
+    # URDF's inertials, or with nominal inertials.
     sizes = nominal(arm.chain, structure)
     coordinates = arm.chain.coordinates
     drives = [arm.settings.joint(x.name) for x in coordinates]
@@ -61,7 +62,7 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
     links: tuple[LinkSpec, ...] = ()
     outputs, constants = _outputs(structure, sizes, design), _constants(structure, sizes)
     if design.mass == "closed-form":
-        # Links need physically consistent inertials, which a URDF may not have.
+        # A URDF may have inertials that are not physically consistent; `_links` corrects them.
         links = _links(arm.chain, exact_inertias(arm.chain, sizes.from_urdf))
         joints = _with_armature(joints, np.diagonal(mean_mass(len(joints), outputs, constants)))
     x, y, z = map(float, arm.chain.gravity)
@@ -78,7 +79,7 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
         constants=constants,
         potential=tuple(range(len(joints))) if design.potential == "dense" else structure.potential,
         potential_scale=sizes.potential_scale,
-        # One digit: a bound need not change with rounding errors of the nominal values.
+        # The bound is rounded to one digit, so that rounding errors of nominal values do not change the text.
         margin=float(f"{max(TUNING.margin * sizes.min_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
         links=links,
@@ -89,7 +90,7 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
 
 
 def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
-    """Return the entries of G; empty if each input is the torque of its own joint, or if G is learned."""
+    """Return the nonzero entries of G; empty if each input is the torque of its own joint, or if a network gives G."""
     entries = actuation.entries
     if design.input != "derived" or (actuation.direct and len(entries) == actuation.joints):
         return ()
@@ -97,11 +98,11 @@ def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
 
 
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
-    """Return the functions of M, each with the joints that it depends on, its mean and its scale."""
+    """Return the functions of M: joints that the function depends on, entries of M, mean and scale."""
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
         joints = output.joints
-        # The paper's encoding has all joints as inputs of every function.
+        # With the encoding of the Lie group paper, every function depends on all joints.
         if design.encoding == "lie-group":
             joints = tuple(range(len(sizes.mass_sensitivities)))
         outputs.append(OutputSpec(joints, _entries(output.basis), mean, scale))
@@ -109,7 +110,7 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
-    """Return the constants of M, each with its initial value and its scale."""
+    """Return the constants of M: entries of M, initial value and scale."""
     values = zip(structure.constants, sizes.constants, sizes.constant_scales, strict=True)
     return tuple(
         ConstantSpec(_entries(constant.basis), initial, scale) for constant, initial, scale in values
@@ -117,24 +118,26 @@ def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]
 
 
 def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
-    """Return C, with which the motors rotate at C qd; empty if each motor moves its own joint only."""
+    """Return C as rows, where C qd are the motor velocities; empty if each motor moves its own joint only."""
     speeds = actuation.drives().speeds
-    # Uncoupled motors, as on most arms: the module has no matrix.
+    # Most arms have uncoupled motors, whose module needs no matrix.
     if np.array_equal(speeds, np.eye(actuation.joints)):
         return ()
     return tuple(map(tuple, speeds.tolist()))
 
 
 def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings) -> JointSpec:
-    # networks see the range in which the joint works, also if the file has no limits
+    # The inputs of networks are scaled with a working range, which exists even if the URDF has no limits.
     low, high = working_range(coordinate)
     limits = (None, None) if coordinate.continuous else (coordinate.lower, coordinate.upper)
     lower, upper = (None if x is None or not isfinite(x) else rounded(x) for x in limits)
     effort = _plausible(coordinate.effort, TUNING.largest_effort)
     speed = _plausible(coordinate.velocity, TUNING.largest_speed)
-    # Without data, the full effort accelerates the armature to full speed in ``rise`` seconds.
+    # Without a given rotor inertia, the armature is such that full effort accelerates it to full speed in
+    # ``rise`` seconds.
     armature = TUNING.rise * effort / speed if effort and speed else 0.0
-    # The torque of a wrist may be negligible, but the friction of its gear is similar to the friction of other gears.
+    # The torque of a wrist joint may be negligible, but its gear has friction: at least 1 % of the largest
+    # torque is assumed.
     torque = max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
     friction = TUNING.friction_of_effort * effort if effort else TUNING.friction_of_torque * torque
     default_speed = TUNING.angular_speed if coordinate.joint_type == "revolute" else TUNING.linear_speed
@@ -155,20 +158,20 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
 
 
 def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
-    """Return the servo of a joint; without a given kp, the effort is reached at `full_effort_at` from the command."""
+    """Return the servo of a joint; an unknown kp gives the full effort at the position error `full_effort_at`."""
     effort = _plausible(coordinate.effort, TUNING.largest_effort)
-    # a known gain is constant, a guessed one is trained
+    # A known kp stays constant; a guessed kp is trained.
     kp = drive.kp or rounded((effort or TUNING.servo_effort) / TUNING.full_effort_at, 3)
     return ServoSpec(kp, drive.kp is not None, rounded(TUNING.servo_lag * kp, 3), effort)
 
 
 def _plausible(limit: float | None, largest: float) -> float | None:
-    """Return a limit of the URDF; None for a placeholder: exporters write 0 or 1e16 for an unknown limit."""
+    """Return a limit of the URDF, or None for a placeholder: some tools write 0 or 1e16 for an unknown limit."""
     return limit if limit and limit <= largest else None
 
 
 def _with_armature(joints: Sequence[JointSpec], mass: np.ndarray) -> list[JointSpec]:
-    """Return the joints with a small armature for drives without data, from the diagonal of M (n,)."""
+    """Return the joints, with a small armature if it was unknown; mass: nominal diagonal of M, (n,) [kg m^2, kg]."""
     initial = [rounded(TUNING.min_armature * value, 3) for value in mass]
     return [replace(x, armature=x.armature or value) for x, value in zip(joints, initial, strict=True)]
 
@@ -184,7 +187,7 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
         arm: the arm.
         inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (10,).
     """
-    # Missing masses are small relative to the heaviest link, so that they do not dominate M.
+    # A link without mass gets a small fraction of the heaviest link's mass, which does not dominate M.
     heaviest = max(float(ten[0]) for ten in inertias)
     names = [body.link for body in arm.bodies]
     specs = []
@@ -192,7 +195,7 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
         mass, center, inertia = _about_center(_consistent(arm, index, ten, heaviest))
         first, second, third = map(_triple, body.rotation)
         spec = LinkSpec(
-            # repeated names get a number
+            # A link name that occurs again gets the body's index, so that names are unique.
             name=body.link if body.link not in names[:index] else f"{body.link} ({index})",
             parent=body.parent,
             joint=body.coordinate,
@@ -212,8 +215,9 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
 def _consistent(
     arm: Chain, index: int, ten: Sequence[Fraction | float], heaviest: float
 ) -> Sequence[Fraction | float]:
-    """Return physically consistent inertial parameters, (10,)."""
-    # A link without mass needs one, since its log-Cholesky parameters are logarithms: a ball up to the next joint.
+    """Return inertial parameters, (10,), changed if they are not physically consistent."""
+    # Log-Cholesky parameters contain the logarithm of the mass, so a link without mass gets one, as a ball
+    # that extends to the next joint.
     if ten[0] <= 0:
         distances = [float(np.linalg.norm(_triple(x.translation))) for x in arm.bodies if x.parent == index]
         mass = TUNING.default_mass * heaviest
@@ -223,11 +227,11 @@ def _consistent(
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
-    # With smaller moments, rounding of the digits could make the body inconsistent.
+    # Below this bound, rounding to `inertia_digits` could make the body inconsistent.
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten
-    # The principal directions are kept; only moments below the bound are raised.
+    # Only second moments below the bound are raised; the principal directions are unchanged.
     raised = np.maximum(values, 2 * TUNING.min_second_moment * values[-1])
     pseudo[:3, :3] += (vectors * (raised - values)) @ vectors.T
     return _significant(parameters_of(pseudo))
@@ -236,12 +240,12 @@ def _consistent(
 def _about_center(
     ten: Sequence[Fraction | float],
 ) -> tuple[float, Triple, tuple[float, float, float, float, float, float]]:
-    """Return mass, center of mass, and inertia about the center of mass: computed exactly, then rounded."""
+    """Return mass [kg], center of mass [m], and inertia about it [kg m^2]: computed exactly, then rounded."""
     m, hx, hy, hz, *tensor = [Fraction(value) for value in ten]
     x, y, z = hx / m, hy / m, hz / m
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
     inertia = [value - m * square for value, square in zip(tensor, steiner, strict=True)]
-    # rounding errors of an inertia that was made consistent
+    # `_consistent` computes in floating point: entries as small as its rounding errors become zero.
     noise = max(map(abs, inertia)) / 10 ** (TUNING.inertia_digits + 3)
     inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]
     mass, cx, cy, cz, xx, xy, xz, yy, yz, zz = _significant([m, x, y, z, *inertia])
@@ -249,7 +253,7 @@ def _about_center(
 
 
 def _significant(values: Iterable[Fraction | float]) -> list[float]:
-    """Return values with the significant digits of inertial parameters."""
+    """Return values rounded to the significant digits of inertial parameters."""
     return [rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values]  # no -0.0
 
 

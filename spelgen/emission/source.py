@@ -1,11 +1,11 @@
-"""Values -> source text: calls, tuples and assignments, laid out to be read."""
+"""Source text of values: calls, tuples and dictionaries, broken into readable lines."""
 
 import json
 from dataclasses import dataclass
 
 WIDTH = 110
 _STEP = 4  # blanks per level of indentation
-SKIP = "  # fmt: skip"  # for ruff: numbers are read row by row
+SKIP = "  # fmt: skip"  # ruff keeps the rows of numbers
 
 
 @dataclass(frozen=True)
@@ -17,27 +17,27 @@ class Code:
 
 @dataclass(frozen=True)
 class Call:
-    """A call; positional arguments have the name None."""
+    """A call in source code. arguments: name and value; a positional argument has the name None."""
 
     callee: str
     arguments: tuple[tuple[str | None, object], ...]
 
 
 def call(callee: str, *positional: object, **named: object) -> Call:
-    """Return the call of ``callee`` with these arguments."""
+    """Return a ``Call`` of ``callee`` with these positional and keyword arguments."""
     arguments: list[tuple[str | None, object]] = [(None, value) for value in positional]
     return Call(callee, (*arguments, *named.items()))
 
 
 def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
-    """Return ``start`` and ``value``, in one line if it and ``reserved`` characters fit, else in several."""
+    """Return ``start`` and ``value``, in one line if ``reserved`` more characters fit there, else in several lines."""
     text = start + flat(value)
     if indent + len(text) + reserved < WIDTH or not _items(value) or _alike(value):
         return text
     inner = " " * (indent + _STEP)
     opening, closing = "{}" if isinstance(value, dict) else "()"
     callee = value.callee if isinstance(value, Call) else ""
-    # as many items per line as fit: matrices stay readable as rows
+    # Each line has as many items as fit, so that the rows of a matrix are lines of text.
     lines = [f"{start}{callee}{opening}", inner]
     for key, item in _items(value):
         text = f"{filled(key, item, indent + _STEP)},"
@@ -52,14 +52,14 @@ def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
 
 
 def listed_call(start: str, value: Call, indent: int) -> str:
-    """Return ``start`` and a call with an argument per line."""
+    """Return ``start`` and the text of a call with one line per argument."""
     inner = " " * (indent + _STEP)
     lines = [f"{inner}{filled(key, item, indent + _STEP)}," for key, item in _items(value)]
     return "\n".join([f"{start}{value.callee}(", *lines, " " * indent + ")"])
 
 
 def flat(value: object) -> str:
-    """Return a value in one line. Any text from a file becomes a string literal of ASCII."""
+    """Return the source text of a value in one line; texts become string literals of ASCII characters."""
     if isinstance(value, Code):
         return value.text
     if isinstance(value, str):
@@ -74,12 +74,12 @@ def flat(value: object) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return a string literal in double quotes; JSON has no escape for characters beyond 16 bits."""
+    """Return a string literal with 32-bit escapes: JSON has none, and splits larger code points in two."""
     return '"' + "".join(rf"\U{ord(x):08x}" if not x.isascii() else json.dumps(x)[1:-1] for x in text) + '"'
 
 
 def _items(value: object) -> list[tuple[str, object]]:
-    """Return (prefix, item) for the items of a call ("key="), a dictionary ("key: ") or a tuple (""); else []."""
+    """Return (prefix, item) per item of a call ("key="), a dictionary ("key: ") or a tuple (""); else []."""
     if isinstance(value, Call):
         return [(f"{key}=" if key else "", item) for key, item in value.arguments]
     if isinstance(value, dict):
@@ -88,7 +88,7 @@ def _items(value: object) -> list[tuple[str, object]]:
 
 
 def _alike(value: object) -> bool:
-    """Test whether a value is a tuple of equal items, of which more than three are written as a product."""
+    """Return True for a tuple of more than three equal items, which is written as a product: ``(0.0,) * 6``."""
     return isinstance(value, tuple) and len(value) > 3 and value.count(value[0]) == len(value)
 
 

@@ -1,4 +1,4 @@
-"""From a URDF to the specification of a model, and to its module: the function ``generate``."""
+"""The specification of a model from a URDF, and the function ``generate``: the source of the model's module."""
 
 import os
 from dataclasses import replace
@@ -26,8 +26,9 @@ def generate(
     """Return the source of the module tailored to an arm; arguments and errors as for `build`.
 
     Args:
-        standalone: whether the module contains the runtime, and so depends on PyTorch only.
-        module: the file that the source is for; the path of the URDF in it is relative to that file.
+        standalone: whether the module contains the runtime classes that it needs, so that it imports PyTorch only.
+        module: path of the file that the source will be written to; the source has the URDF's path relative to this
+            file.
     """
     spec = make_spec(arm, preset, width=width, depth=depth, assume=assume, module=module)
     return module_text(spec, standalone=standalone)
@@ -42,10 +43,11 @@ def make_spec(
     assume: Assume = "kinematics",
     module: Path | None = None,
 ) -> ModelSpec:
-    """Return the specification of the model tailored to an arm; arguments and errors as for ``generate``."""
+    """Return the specification of the model of an arm; arguments and errors as for ``generate``."""
     arm = arm if isinstance(arm, Arm) else load_arm(arm)
     name, design = str(preset), None
-    # A design of the user is part of the options, so that the module can be made again without its file.
+    # The options contain the content of a user's design file, so that the module can be rebuilt without the
+    # file.
     if preset not in PRESET_NAMES:
         name = "own" if isinstance(preset, Design) else Path(preset).stem
         design = load_design(preset)
@@ -60,18 +62,18 @@ def make_spec(
         depth=depth,
     )
     spec = derive_spec(arm, options)
-    # Relative paths, so that a project with its URDF can be moved.
+    # The path is relative, so that a project folder with module and URDF can be moved.
     return spec if module is None else replace(spec, urdf=_path_of_urdf(module, arm.robot.path))
 
 
 def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> Arm:
-    """Return the arm of a specification from its URDF, with the options that the specification was made with."""
+    """Return the arm of a specification, read from this URDF with the options in the specification."""
     return load_arm(urdf, spec.options.joints, spec.options.tip, spec.options.angle_tolerance)
 
 
 def find_urdf(module: Path, name: str) -> Path:
-    """Return the URDF ``name`` in the folder of a module, the current one or ``robots/``. Raises ModuleError."""
-    # the folder of the module first: a project has its URDF next to the module
+    """Return the URDF ``name`` in the module's folder, the current one, or robots/ of either. Raises ModuleError."""
+    # The folder of the module is searched first, since most projects have the URDF there.
     folders = [module.parent, Path(), Path("robots"), module.parent / "robots"]
     for folder in folders:
         if (folder / name).is_file():
@@ -84,7 +86,7 @@ def find_urdf(module: Path, name: str) -> Path:
 
 
 def _path_of_urdf(module: Path, urdf: Path) -> str:
-    """Return the name of a URDF if ``find_urdf`` finds the file by this name, else its path relative to the module."""
+    """Return the URDF's file name if ``find_urdf`` finds this file by name, else its path relative to the module."""
     try:
         if find_urdf(module, urdf.name).samefile(urdf):
             return urdf.name

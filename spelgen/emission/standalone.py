@@ -1,4 +1,4 @@
-"""The part of ``spelgen.runtime`` that a standalone module contains, and the imports that it needs."""
+"""The definitions of ``spelgen.runtime`` that a standalone module contains, and the import statements they need."""
 
 import ast
 from collections import defaultdict
@@ -13,19 +13,20 @@ _OURS = "spelgen.runtime."
 
 
 class Definition(NamedTuple):
-    """A class, function or constant of the runtime: its text with comments, and the names that it uses."""
+    """A class, function or constant of the runtime: source text with comments, and names that occur in it."""
 
     text: str
     uses: frozenset[str]
-    is_block: bool  # a class or function, not a constant
+    is_block: bool  # True for a class or function, False for a constant
 
 
 @dataclass(frozen=True)
 class Runtime:
     """The source of the runtime.
 
-    definitions: by name, each after the definitions that its execution needs. imports: statements from outside. rows:
-    names of the definitions that the rows of an arm need. public: names that a module imports.
+    definitions: definitions by name, in an order in which they can be executed. imports: import statements of other
+    packages. rows: names of the definitions in the file rows.py, which the rows of an arm need. public: names that a
+    module can import from ``spelgen.runtime``.
     """
 
     definitions: dict[str, Definition]
@@ -35,16 +36,16 @@ class Runtime:
 
 
 class Bundle(NamedTuple):
-    """The runtime that a standalone module contains: import statements, definitions before and after the arm."""
+    """The parts of a standalone module that come from the runtime: source text, before and after the arm."""
 
     imports: str
     rows: str
     runtime: str
-    contents: tuple[str, ...]  # names of the classes and functions of the runtime
+    contents: tuple[str, ...]  # names of the classes and functions in `runtime`
 
 
 def bundle(arm: str, model: str) -> Bundle:
-    """Return the part of the runtime that the source texts of an arm and its model need."""
+    """Return the definitions of the runtime that the source texts of an arm and its model need, directly or not."""
     runtime = load_runtime()
     used = names_in(ast.parse(f"{arm}\n{model}"))
     pending = list(used)
@@ -55,7 +56,7 @@ def bundle(arm: str, model: str) -> Bundle:
             used |= new
             pending += new
     needed = {name: definition for name, definition in runtime.definitions.items() if name in used}
-    # classes of the rows are defined before the rows, all other definitions after the arm
+    # The classes of the rows must be defined before the rows; all other definitions follow after the arm.
     rows = [definition for name, definition in needed.items() if name in runtime.rows]
     definitions = {name: definition for name, definition in needed.items() if name not in runtime.rows}
     blocks = tuple(name for name, definition in definitions.items() if definition.is_block)
@@ -63,7 +64,7 @@ def bundle(arm: str, model: str) -> Bundle:
 
 
 def _joined(definitions: Iterable[Definition]) -> str:
-    """Return these definitions, constants on consecutive lines."""
+    """Return the text of definitions: blank lines separate classes and functions, but not constants."""
     text, previous_is_block = "", True
     for definition in definitions:
         separate = definition.is_block or previous_is_block
@@ -74,13 +75,13 @@ def _joined(definitions: Iterable[Definition]) -> str:
 
 @cache
 def load_runtime() -> Runtime:
-    """Read the source of the runtime."""
+    """Return the definitions and imports of all files of ``spelgen.runtime``."""
     texts = {
         path.name.removesuffix(".py"): path.read_text(encoding="utf-8")
         for path in (files("spelgen") / "runtime").iterdir()
         if path.name.endswith(".py")
     }
-    # sorted: the order of files differs between file systems, and the text of a module must not
+    # File systems list files in different orders; sorting makes the text of a module the same everywhere.
     trees = {name: ast.parse(texts[name]) for name in sorted(texts)}
     public = [alias.name for node in _imported(trees.pop("__init__")) for alias in node.names]
     order: TopologicalSorter[str] = TopologicalSorter()
@@ -104,17 +105,17 @@ def load_runtime() -> Runtime:
 
 
 def names_in(tree: ast.AST) -> set[str]:
-    """Return every name that is used in a tree, annotations included."""
+    """Return all names that occur in a syntax tree, including names in annotations."""
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
 
 
 def _imported(tree: ast.Module) -> list[ast.Import | ast.ImportFrom]:
-    """Return the imports at the top of a file."""
+    """Return the import statements at the top level of a file."""
     return [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
 
 
 def _defined(node: ast.stmt) -> str | None:
-    """Return the name that a statement at the top of a file defines; None for other statements."""
+    """Return the name of the class, function or constant that a statement defines; None for other statements."""
     if isinstance(node, ast.ClassDef | ast.FunctionDef):
         return node.name
     if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
@@ -123,7 +124,7 @@ def _defined(node: ast.stmt) -> str | None:
 
 
 def _text(node: ast.stmt, source: str) -> str:
-    """Return the lines of a statement and the comment above it; no definition of the runtime has a decorator."""
+    """Return the source text of a definition, with the comment above it; decorators are not supported."""
     lines = source.splitlines()
     first = node.lineno - 1
     while first and lines[first - 1].startswith("#"):
@@ -132,7 +133,7 @@ def _text(node: ast.stmt, source: str) -> str:
 
 
 def _imports(used: set[str], runtime: Runtime) -> str:
-    """Return the imports of the used names, from the standard library and then torch, sorted as ruff sorts them."""
+    """Return the import statements of the used names: standard library, then torch, each in ruff's order."""
     plain: set[str] = set()
     members: defaultdict[str, set[str]] = defaultdict(set)
     for node in runtime.imports:

@@ -1,7 +1,7 @@
-"""ModelSpec -> the text of a module, and back. Pure: the same specification gives the same bytes.
+"""The text of a module from a ``ModelSpec``, and the reverse. Equal specifications give equal bytes.
 
-Text from a URDF becomes string literals and JSON strings in docstrings, never code. Nothing of a module's file is
-executed.
+Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. A module that is
+read is parsed, but not executed.
 """
 
 import ast
@@ -47,7 +47,7 @@ _EXAMPLE = """\
     tau = model.inverse_dynamics(q, qd, qdd)
     V = model.potential_energy(q)  # (100,) [J]
     H = model.hamiltonian(q, model.momentum(q, qd))"""
-# Largest module that is read [bytes]: the largest that `spelgen build` writes has a tenth.
+# [bytes] Largest module that is read, ten times the size of the largest that `spelgen build` writes.
 MAX_MODULE = 2**22
 _EXPECTED = "a module written by this version of `spelgen build`"
 
@@ -55,7 +55,8 @@ _EXPECTED = "a module written by this version of `spelgen build`"
 def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     """Return the Python source of the module that ``spec`` describes.
 
-    It imports torch and ``spelgen.runtime``; a standalone one imports torch only and contains the runtime.
+    The module imports torch and ``spelgen.runtime``. A standalone module contains the runtime's definitions and imports
+    torch only.
     """
     assembly = model_parts(spec)
     arm = "\n\n\n".join(x for x in ("\n\n".join(_rows(spec, assembly)), _mass_entries(spec, assembly)) if x)
@@ -70,15 +71,15 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     context = {"title": title, "header": header(spec), "arm": arm, "model": model, "spec": spec.to_json()}
     if standalone:
         return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
-    # The names that the texts use: a module imports no more than it needs.
+    # A module imports only the names that occur in its text.
     used = set(re.findall(r"\w+", f"{arm}\n{model}")) & load_runtime().public
-    # As ruff sorts members: classes first.
+    # ruff's order of imported names: classes first.
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
     return render("module.py.jinja", names=ordered, has_tensor=assembly.uses(MASS_ENTRIES), **context)
 
 
 def class_summary(spec: ModelSpec) -> str:
-    """Return the model in a line."""
+    """Return a description of the model in one line."""
     if spec.links:
         residual = ", and residual terms" if spec.design.net != "none" else ""
         return (
@@ -95,8 +96,8 @@ def _functions(spec: ModelSpec) -> str:
 
 
 def header(spec: ModelSpec) -> str:
-    """Return the documentation of the module: the arm, an example, the structure of M, and the joints."""
-    # A docstring of the module: names from the URDF are JSON strings in it, see `_quoted`.
+    """Return the docstring of the module: arm, example, structure of M, and table of joints."""
+    # Names from the URDF are quoted, see `_quoted`, so that they cannot end the docstring.
     example = _EXAMPLE.format(module=module_name(spec), n=len(spec.joints))
     about = fill(description(spec), WIDTH, break_long_words=False, break_on_hyphens=False)
     return "\n\n".join([about, example, _picture(spec), _joint_table(spec)])
@@ -127,7 +128,7 @@ def module_name(spec: ModelSpec) -> str:
 
 
 def _picture(spec: ModelSpec) -> str:
-    """Return the lower triangle of M as text: the joints that each entry depends on."""
+    """Return a picture of the lower triangle of M as text: per entry, the joints that the entry depends on."""
     cells, width = {}, 2
     for row, column, kind, joints in spec.entries:
         cell = {"varying": joint_ranges(joints), "constant": "C", "zero": "0"}[kind]
@@ -141,7 +142,7 @@ def _picture(spec: ModelSpec) -> str:
 
 
 def _joint_table(spec: ModelSpec) -> str:
-    """Return numbers, names, types, units and limits of the joints."""
+    """Return a text table of the joints: number, name, type, limits and units."""
     lines = ["Joints, in the order of q, qd and tau", ""]
     names = [_quoted(joint.name) for joint in spec.joints]
     width = max(map(len, names))
@@ -156,12 +157,12 @@ def _joint_table(spec: ModelSpec) -> str:
 
 
 def _quoted(name: str) -> str:
-    """Return a name as a JSON string, which ends no docstring."""
+    """Return a name as a JSON string: its quotes are escaped, so that it cannot end a docstring."""
     return json.dumps(name)
 
 
 def _rows(spec: ModelSpec, assembly: ModelParts) -> list[str]:
-    """Return the statements that define the rows, with their units above them."""
+    """Return the statements that define the rows, each with a comment about units above it."""
     statements = []
     for name, rows in assembly.rows.items():
         about = _term_descriptions(spec) if name in ("FUNCTIONS", "CONSTANTS") else {}
@@ -175,13 +176,13 @@ def _rows(spec: ModelSpec, assembly: ModelParts) -> list[str]:
 
 
 def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
-    """Return the entries of M that each function and constant contributes to, with the unit of the first."""
+    """Return a text per term name: entries of M that the term contributes to, and the unit of the first entry."""
     descriptions = {}
     bases = [x.basis for x in spec.outputs] + [x.basis for x in spec.constants]
     for name, basis in zip(term_names(spec), bases, strict=True):
         entries = [entry_name(row, column) for row, column, _ in basis]
         row, column, _ = basis[0]
-        # An entry of two revolute joints has kg m^2; each prismatic joint divides by m.
+        # An entry for two revolute joints is in kg m^2; each prismatic joint divides the unit by m.
         slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
         suffix = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
         descriptions[name] = f"{', '.join(entries[:2])}{suffix} [{('kg m^2', 'kg m', 'kg')[slides]}]"
@@ -189,7 +190,7 @@ def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
 
 
 def _mass_entries(spec: ModelSpec, assembly: ModelParts) -> str:
-    """Return the function that makes M from its functions and constants; empty if M is made in another way."""
+    """Return the source of ``mass_entries``, M from functions and constants; empty if the model does not use it."""
     if not assembly.uses(MASS_ENTRIES):
         return ""
     names = term_names(spec)
@@ -204,7 +205,8 @@ def _mass_entries(spec: ModelSpec, assembly: ModelParts) -> str:
     for row, cells in enumerate(entry_sums(spec)):
         texts = [_sum(sums, names) for sums in cells]
         for column, text in enumerate(texts):
-            # A single term is used in place; sums get a name, so that a row of M fits on a line.
+            # Sums are assigned to variables, so that a row of M fits on a line; single terms are used
+            # directly.
             if " " in text or text.startswith("-"):
                 texts[column] = entry_name(row, column).lower().replace(",", "_")
                 body.append(f"    {texts[column]} = {text}")
@@ -216,7 +218,7 @@ def _mass_entries(spec: ModelSpec, assembly: ModelParts) -> str:
 
 
 def _sum(sums: Sums, names: list[str]) -> str:
-    """Return a linear combination as an expression; ``0`` for none."""
+    """Return the expression of a linear combination of terms; ``0`` if there are no terms."""
     text = ""
     for factor, index in sums:
         term = names[index] if abs(factor) == 1 else f"{_number(abs(factor))} * {names[index]}"
@@ -228,14 +230,14 @@ def _sum(sums: Sums, names: list[str]) -> str:
 
 
 def _number(value: float) -> str:
-    """Return the shortest text of a number."""
-    # Six digits if they are exact: URDFs have few digits.
+    """Return the shortest text that gives exactly this number."""
+    # Most numbers of a URDF have at most six digits.
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
 
 
 def read_source(path: Path) -> str:
-    """Return the text of the module at ``path``. Raises ModuleError."""
+    """Return the text of the module at ``path``. Raises ModuleError if the file cannot be read as a module."""
     if not path.exists():
         raise ModuleError("no such file", file=path, do="build it with `spelgen build`")
     content = read_bytes(path, ModuleError, _EXPECTED, MAX_MODULE)
@@ -246,12 +248,12 @@ def read_source(path: Path) -> str:
 
 
 def read_spec(path: Path | str) -> ModelSpec:
-    """Return the specification in the module at ``path``. Raises ModuleError."""
+    """Return the specification in the module at ``path``. Raises ModuleError if the file has none."""
     return parse_spec(read_source(Path(path)), Path(path))
 
 
 def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
-    """Return the specification in the text of a module, which may be edited. Raises ModuleError."""
+    """Return the specification in a module's text, which may have been edited. Raises ModuleError if it has none."""
     values = {}
     try:
         for node in ast.parse(text).body:
@@ -270,9 +272,10 @@ def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
 
 
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
-    """Return the specification in the text of a module. Raises ModuleError if the text differs from its module."""
+    """Return the specification in a module's text. Raises ModuleError if ``module_text`` gives another text for it."""
     spec = parse_spec(text, file)
-    # the whole text is compared: an edit anywhere would be lost without a word
+    # The whole text is compared, since a model is assembled from the specification only: any other edit would
+    # be ignored.
     if text in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         return spec
     raise ModuleError(

@@ -1,4 +1,4 @@
-"""Constants of models: initial values without data in the URDF, and sizes of networks."""
+"""Constants of untrained models: initial values that the URDF does not contain, and sizes of networks."""
 
 from dataclasses import dataclass
 
@@ -7,48 +7,51 @@ from dataclasses import dataclass
 class ModelTuning:
     """Initial values of drives, servos and friction, and sizes of networks, of an untrained model."""
 
-    # [1] Lower bound of the eigenvalues of M, as a fraction of the smallest nominal eigenvalue over the workspace.
+    # [1] Lower bound of the eigenvalues of M, divided by the smallest nominal eigenvalue over the workspace.
     margin: float = 0.1
-    # [1] Typical friction as a fraction of the effort of a drive: gears lose some per cent.
+    # [1] Typical friction, divided by the effort limit of the drive: gears lose some per cent of the torque.
     friction_of_effort: float = 0.02
-    # [1] Typical friction as a fraction of the torques of the nominal arm, for a URDF without efforts.
+    # [1] Typical friction, divided by the torque of the nominal arm, for joints without an effort limit.
     friction_of_torque: float = 0.1
-    # [Nm, N] A larger effort in a URDF is a placeholder.
+    # [Nm, N] A larger effort limit in a URDF is regarded as a placeholder for an unknown limit.
     largest_effort: float = 1e4
-    # [rad/s, m/s] A larger velocity in a URDF is a placeholder.
+    # [rad/s, m/s] A larger velocity limit in a URDF is regarded as a placeholder for an unknown limit.
     largest_speed: float = 100.0
-    # [1] Significant digits of inertial parameters: more than the accuracy of a URDF, and few enough to reproduce its
-    # decimals.
+    # [1] Significant digits of inertial parameters: more than the accuracy of a URDF, and few enough that the
+    # decimals of a URDF are reproduced.
     inertia_digits: int = 12
-    # [1] Smallest second moment of mass about the center of mass, relative to the largest: above the error of rounding.
+    # [1] Smallest principal second moment of mass about the center of mass, divided by the largest: above
+    # rounding errors.
     min_second_moment: float = 1e-10
-    # [1] Mass of a link without mass, as a fraction of the heaviest link.
+    # [1] Initial mass of a link without mass in the URDF, divided by the mass of the heaviest link.
     default_mass: float = 0.01
-    # [rad/s] Speed of a revolute joint without a velocity limit.
+    # [rad/s] Typical speed of a revolute joint without a velocity limit.
     angular_speed: float = 2.0
-    # [m/s] Speed of a prismatic joint without a velocity limit.
+    # [m/s] Typical speed of a prismatic joint without a velocity limit.
     linear_speed: float = 0.5
-    # [s] Time in which the full effort accelerates the armature to full speed.
+    # [s] Time in which the full effort accelerates an armature of unknown size to full speed.
     rise: float = 0.02
-    # [Nm, N] Effort of a servo without data.
+    # [Nm, N] Full effort of a servo without an effort limit, which determines the initial kp.
     servo_effort: float = 5.0
-    # [rad, m] Distance from the command at which a servo without data has its full effort.
+    # [rad, m] Position error at which a servo with unknown kp initially has its full effort.
     full_effort_at: float = 0.5
-    # [s] Initial ratio kd / kp.
+    # [s] Initial ratio kd / kp of a servo.
     servo_lag: float = 0.05
-    # [1] Armature of a drive without data, as a fraction of the diagonal entry of M.
+    # [1] Armature of a drive without data, divided by the joint's diagonal entry of the nominal M.
     min_armature: float = 0.01
-    # [1] Scale of positions as inputs of friction networks, relative to velocities.
+    # [1] Factor on the encoded positions that are inputs of friction networks; velocity inputs are of the
+    # order of one.
     position_sensitivity: float = 0.1
-    # [1] Hidden units per joint of the friction networks.
+    # [1] Number of hidden units per joint of the friction networks.
     friction_units: int = 8
-    # [1] Smallest number of hidden units of the outputs that depend on the same joints.
+    # [1] Smallest number of hidden units per group of outputs that depend on the same joints.
     min_units: int = 4
-    # [1] Smallest number of hidden units of these outputs in Kolmogorov-Arnold networks.
+    # [1] The same number for Kolmogorov-Arnold networks, whose units have a learned function per edge.
     min_kan_units: int = 2
-    # [1] Units of Kolmogorov-Arnold networks as a fraction of the width: each edge has a grid of weights.
+    # [1] Units of Kolmogorov-Arnold networks, divided by the width in the options: each edge has a grid of
+    # weights.
     kan_fraction: float = 0.25
-    # [1] Units of the network of V, which has one output, as a fraction of the width.
+    # [1] Units of the network of V, which has one output, divided by the width of the networks of M.
     potential_fraction: float = 0.5
 
 

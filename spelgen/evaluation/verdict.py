@@ -69,11 +69,13 @@ def verdict(
     if not uses.proofs:
         return Verdict("No verdict: no horizon and no torque was evaluated.", "")
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
-    if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):
-        sentence = f"Evaluated on training logs: {sentence[0].lower()}{sentence[1:]}"
     elastic = next((x for x in results.diagnostics if x.code == ELASTIC), None)
     if elastic is not None:
-        sentence = f"Below the resonance of an elastic joint only: {sentence[0].lower()}{sentence[1:]}"
+        # a rigid model is not called good where its structure is wrong
+        band = f"; below it, usable for {listed(uses.good)}" if uses.good else ""
+        sentence = f"Not valid near the resonance of an elastic joint{band}"
+    if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):
+        sentence = f"Evaluated on training logs: {sentence[0].lower()}{sentence[1:]}"
     if uses.good and uses.bad:
         sentence += f", not for {listed(uses.bad)}"
     joint, speed, proof = _worst_joint(results)

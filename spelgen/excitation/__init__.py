@@ -1,1 +1,1 @@
-"""Motions that excite the parameters of an arm."""
+"""Design of motions that excite the dynamic parameters of an arm."""

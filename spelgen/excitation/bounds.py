@@ -1,4 +1,4 @@
-"""Bounds of a motion: ranges of the joints, and the surroundings of an arm, from a YAML file."""
+"""Bounds of a motion: limits of the joints, and the surroundings of an arm, which are read from a YAML file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,11 @@ SPEEDS = {"revolute": TUNING.revolute_speed, "prismatic": TUNING.prismatic_speed
 
 @dataclass(frozen=True, eq=False)
 class MotionBounds:
-    """Bounds of a motion, (n,) each: lowest and highest position [rad, m], speed, acceleration (by default none)."""
+    """Bounds of the motion of n joints, (n,) each.
+
+    low, high: lowest and highest position [rad, m]. speed: largest speed [rad/s, m/s]. acceleration: largest
+    acceleration [rad/s^2, m/s^2]; None: unlimited.
+    """
 
     low: np.ndarray
     high: np.ndarray
@@ -31,7 +35,7 @@ class MotionBounds:
     acceleration: np.ndarray | None = None
 
     def narrowed(self, factor: float) -> MotionBounds:
-        """Return bounds with a fraction of the position ranges about the same middle."""
+        """Return bounds whose position ranges are multiplied by a factor, with unchanged middles."""
         middle, half = (self.low + self.high) / 2, factor * (self.high - self.low) / 2
         return replace(self, low=middle - half, high=middle + half)
 
@@ -43,18 +47,19 @@ def motion_bounds(
     joints: Mapping[str, UrdfJoint] | None = None,
     ranges: Mapping[str, tuple[float, float]] | None = None,
 ) -> MotionBounds:
-    """Return the central fraction of the position ranges, and a fraction of the velocity limits.
+    """Return bounds with the central fraction of the position ranges, and a fraction of the velocity limits.
 
-    joints: of the URDF by name, so that <mimic> joints keep their own limits. ranges: of joints by name, in place of
-    their limits; continuous joints without a range move by half a turn to both sides. Raises ArmError for a joint
-    without a range, or whose limits are not increasing.
+    joints: joints of the URDF by name; <mimic> joints among them then keep their own limits. ranges: position ranges by
+    name of the joint, in place of its limits. The default range of continuous joints is -pi to pi. Raises ArmError for
+    a joint without a range, or whose limits are not increasing.
     """
     limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
     for k, coordinate in enumerate(arm.coordinates):
         default = (-pi, pi) if coordinate.continuous else (nan, nan)
         limits[k] = sorted((ranges or {}).get(coordinate.name) or coordinate.limits or default)
         speeds[k] = coordinate.velocity or SPEEDS[coordinate.joint_type]
-    # a mimic joint moves by a multiple of its coordinate, whose range shrinks to keep the limits of both
+    # A mimic joint is a linear function of its coordinate: narrow the range of the coordinate to keep the limits
+    # of both joints.
     for body in arm.bodies:
         k, factor = body.coordinate, float(body.multiplier)
         mimic = (joints or {}).get(body.name)
@@ -83,7 +88,7 @@ def motion_bounds(
 
 
 class Box(Group):
-    """A box. size: edges [m]. xyz [m], rpy [rad]: pose of its centre in the frame of the root link, as in a URDF."""
+    """A box. size: edge lengths [m]. xyz [m], rpy [rad]: pose of the centre in the root link's frame, as in a URDF."""
 
     size: tuple[Positive, Positive, Positive]
     xyz: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
@@ -105,6 +110,6 @@ class Surroundings(Group):
 
 
 def read_surroundings(path: Path) -> Surroundings:
-    """Return the surroundings in a YAML file. Raises SettingsError, or SpelgenErrors for several errors."""
+    """Read surroundings from a YAML file. Raises SettingsError, or SpelgenErrors for several errors."""
     document = read_document(path)
     return validated(Surroundings, document.value(), document)

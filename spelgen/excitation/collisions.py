@@ -1,7 +1,7 @@
 """Collisions of an arm with itself and its surroundings, by the collision models of Pinocchio and Coal.
 
-The shapes are the <collision> elements of the URDF; a mesh is replaced by its convex hull, which contains it, so that
-signed distances are exact and have a gradient, and no contact is overlooked.
+The shapes are the <collision> elements of the URDF. A mesh is replaced by its convex hull: signed distances of convex
+shapes are exact and have a gradient. The hull contains the mesh, so that no contact is overlooked.
 """
 
 from collections.abc import Iterator
@@ -43,9 +43,9 @@ class Contact:
 class Collisions:
     """Distances of the links of an arm to each other, and to floor and boxes.
 
-    Links of one body and of bodies that one joint connects are not compared, because shapes of neighbours overlap. Nor
-    are pairs that are too close at nearly all random positions; ``ignored`` lists these pairs. unread: names of the
-    links with shapes that cannot be read. clearance: smallest allowed distance [m].
+    Links of the same body, or of two bodies connected by a joint, are not compared, because their shapes overlap. Pairs
+    that are too close at nearly all random positions are not compared either; ``ignored`` lists these pairs. unread:
+    names of the links whose shapes cannot be read. clearance: smallest allowed distance [m].
     """
 
     def __init__(self, arm: Arm, surroundings: Surroundings, bounds: MotionBounds) -> None:
@@ -60,8 +60,8 @@ class Collisions:
         frames = lump_links(robot, choose_chain(robot, chain.joint_names, None), arm.angle_tolerance).frames
         self._model, self._constraint = kinematic_model(chain), body_constraint(chain)
         self._geometry = pin.GeometryModel()
-        self._bodies: list[int] = []  # body of each object, -1: the root link
-        # largest distance of a shape from the origin of its body [m]
+        self._bodies: list[int] = []  # index of the body of each object; -1: the root link
+        # largest distance of a shape from the origin of each body [m]
         self._extents = np.zeros(len(chain.bodies))
         for shape in shapes.shapes:
             frame = frames[shape.link]
@@ -87,7 +87,7 @@ class Collisions:
 
     @property
     def statement(self) -> str:
-        """Statement of the checked and unchecked collisions, in sentences."""
+        """Text for users: which collisions are checked, and which are not."""
         pairs = counted(self.pairs, "pair")
         clearance = f"approach included; all keep {1e3 * self.clearance:g} mm"
         text = f"Checked: {pairs} of links{self._surroundings}, {clearance}."
@@ -98,20 +98,21 @@ class Collisions:
         return text
 
     def distances(self, q: np.ndarray) -> np.ndarray:
-        """Return the signed distance of each pair, (pairs,) [m], at q (n,)."""
+        """Return the signed distance of each pair of objects, (pairs,) [m], at q (n,) [rad, m]."""
         positions = self._constraint.jacobian @ q + self._constraint.offset
         pin.computeDistances(self._model, self._data, self._geometry, self._found, positions)
         return np.array([result.min_distance for result in self._found.distanceResults])
 
     def contact(self, motion: Motion) -> Contact | None:
-        """Return the first contact of a motion; None if every distance exceeds zero at all times.
+        """Return the first contact of a motion; None guarantees that every distance is positive at all times.
 
-        Distances are computed at positions between which no point moves, relative to any other, by more than 1.5 times
-        the clearance. Each position of the motion is within half of this of such a position.
+        Distances are computed at selected positions. Between two successive ones the distance of any two points changes
+        by at most 1.5 times the clearance, so between any position of the motion and the nearest selected one by at
+        most 0.75 times the clearance.
         """
         lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
         path = np.concatenate([[0.0], np.cumsum(lengths)])
-        # equal steps of the path, not of time: a slow part needs no more positions than a fast one
+        # Steps are equal in path length, not in time: slow motion needs no more positions than fast motion.
         points = np.linspace(0.0, path[-1], ceil(path[-1] / (1.5 * self.clearance)) + 1)
         for point in points:
             q = np.array([np.interp(point, path, column) for column in motion.q.T])
@@ -121,7 +122,7 @@ class Collisions:
         return None
 
     def contact_at(self, q: np.ndarray, time: float = 0.0) -> Contact | None:
-        """Return the nearest pair at q (n,) if it is closer than the clearance."""
+        """Return the nearest pair at q (n,) [rad, m] if it is closer than the clearance, otherwise None."""
         distances = self.distances(q)
         nearest = int(distances.argmin()) if self.pairs else 0
         if not self.pairs or distances[nearest] >= self.clearance:
@@ -129,9 +130,10 @@ class Collisions:
         return Contact(time, float(distances[nearest]), *self._names(nearest))
 
     def penalty(self, q: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the squared violations of a margin, summed over pairs and positions q (T, n), and the gradient (T, n).
+        """Return the sum of squared violations of a margin over pairs and positions q (T, n), and its gradient (T, n).
 
-        The margin is ``TUNING.margin`` times the clearance. Violations are relative to the margin.
+        The margin is ``TUNING.margin`` times the clearance. The violation of a pair is 1 - distance / margin, if
+        positive.
         """
         value, gradient, margin = 0.0, np.zeros_like(q), TUNING.margin * self.clearance
         for row, position in enumerate(q):
@@ -147,7 +149,10 @@ class Collisions:
         return value, gradient
 
     def _distance_gradient(self, pair: int) -> np.ndarray:
-        """Return the derivative of the distance of a pair, (n,), after ``distances`` and the joint Jacobians."""
+        """Return the derivative of the distance of a pair with respect to q, (n,).
+
+        ``distances`` and the joint Jacobians must have been computed at q.
+        """
         result, objects = self._found.distanceResults[pair], self._geometry.collisionPairs[pair]
         gradient = np.zeros(self._model.nv)
         for index, point, sign in (
@@ -158,14 +163,15 @@ class Collisions:
             if joint:
                 frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
                 jacobian = pin.getJointJacobian(self._model, self._data, joint, frame)
-                # velocity of the nearest point along the normal, which points from the first to the second object
+                # The derivative is the velocity of the nearest points along the normal, which points from the first to
+                # the second object.
                 arm = np.cross(point - self._data.oMi[joint].translation, result.normal)
                 gradient += sign * (result.normal @ jacobian[:3] + arm @ jacobian[3:])
         derivative: np.ndarray = gradient @ self._constraint.jacobian
         return derivative
 
     def _add(self, name: str, body: int, pose: np.ndarray, geometry: coal.CollisionGeometry) -> None:
-        """Add an object that a body carries. pose: (4, 4), in the frame of the body."""
+        """Add an object that a body carries. pose: pose of the object in the frame of the body, (4, 4)."""
         unique = f"{len(self._bodies)} {name}"
         placed = pin.GeometryObject(unique, body + 1, pin.SE3(pose), geometry)
         self._geometry.addGeometryObject(placed)
@@ -186,7 +192,7 @@ class Collisions:
         """Yield the pairs of objects to be compared; the first `links` objects are shapes of links."""
         neighbour: dict[int, int] = {}
         for index, body in enumerate(chain.bodies):
-            # beyond bodies without a shape
+            # The neighbour of a body is its nearest ancestor that has a shape.
             parent = body.parent
             while parent >= 0 and parent not in self._bodies:
                 parent = chain.bodies[parent].parent
@@ -198,15 +204,14 @@ class Collisions:
                     yield index, k
 
     def _largest_displacements(self, chain: Chain, bounds: MotionBounds) -> np.ndarray:
-        """Return an upper bound of the displacement of any point of the arm per displacement of each coordinate, (n,)
-        [m/rad, 1].
+        """Return an upper bound of the displacement of any point per displacement of each coordinate, (n,) [m/rad, 1].
 
-        The distance from a joint to any point that it carries is at most the length of the chain from there on.
+        The distance from a joint to any point of the arm beyond it is at most the length of the chain beyond the joint.
         """
         extents, weights = self._extents.copy(), np.zeros(len(chain.coordinates))
-        # of prismatic joints, whose links move apart
+        # largest displacement of a coordinate from zero: a prismatic joint lengthens the chain by it
         travel = np.maximum(np.abs(bounds.low), np.abs(bounds.high))
-        # from the tip to the root, so that an extent includes all bodies that a body carries
+        # Bodies are visited from the tip to the root, so that the extent of a body includes all bodies beyond it.
         for index, body in reversed(list(enumerate(chain.bodies))):
             k, ratio = body.coordinate, abs(float(body.multiplier))
             length = float(np.linalg.norm(np.array(body.translation, dtype=float)))
@@ -220,14 +225,15 @@ class Collisions:
         return weights
 
     def _remove_overlapping(self, bounds: MotionBounds, links: int) -> tuple[str, ...]:
-        """Remove the pairs that are too close at nearly all random positions within bounds; return their names."""
+        """Remove the pairs that are too close at nearly all random positions within bounds; return the removed ones."""
         generator = np.random.default_rng(0)
         random = generator.uniform(bounds.low, bounds.high, (TUNING.positions, len(bounds.low)))
         share = np.mean([self.distances(q) < self.clearance for q in random], axis=0)
         names: dict[str, None] = {}
         for pair in reversed(range(self.pairs)):
             objects = self._geometry.collisionPairs[pair]
-            # floor and boxes: only links that no joint moves away
+            # Pairs with floor or boxes are removed only if they are too close at all positions: no joint can separate
+            # them.
             if share[pair] >= (TUNING.overlap if objects.second < links else 1.0):
                 names[" and ".join(self._names(pair))] = None
                 self._geometry.removeCollisionPair(objects)
@@ -243,12 +249,12 @@ def _pose(rotation: ArrayLike, position: ArrayLike) -> np.ndarray:
 
 
 def _geometry(shape: LinkShape) -> coal.CollisionGeometry:
-    """Return a shape for Coal, of a mesh its convex hull."""
+    """Return the Coal geometry of a shape; a mesh is replaced by its convex hull."""
     if shape.mesh is None:
         kinds = {"box": coal.Box, "cylinder": coal.Cylinder, "sphere": coal.Sphere}
         return kinds[shape.kind](*shape.size)
     points = coal.StdVec_Vec3s()
     for vertex in shape.mesh[0]:
         points.append(vertex)
-    # Qt: triangles only. QJ: flat meshes have a hull, too
+    # Options of Qhull. Qt: triangulated facets. QJ: joggled input, so that flat meshes have a hull, too.
     return coal.Convex.convexHull(points, False, "Qt QJ")

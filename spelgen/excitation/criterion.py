@@ -1,8 +1,9 @@
 """Criterion of exciting motions.
 
 It is the logarithm of the condition number of the base regressor with columns of unit length (Swevers et al., IEEE T-RA
-13:730, 1997), plus penalties on violated effort limits, on distances below a margin and on reduced amplitudes. Unit
-columns do not depend on the amplitude of the motion, but the signal-to-noise ratio of the torque does.
+13:730, 1997), plus penalties on violated effort limits, on distances below a margin and on reduced amplitudes. The
+last penalty is needed because columns of unit length hide the amplitude of the motion, while the signal-to-noise ratio
+of the torque depends on it.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Criterion:
         count = TUNING.samples_per_harmonic * trajectory.harmonics + 1
         self.times = torch.linspace(0.0, trajectory.duration, count, dtype=torch.float64)
         self.inertial = torch.from_numpy(urdf_parameters(arm))
-        # without inertials the torque is unknown, and effort limits are ignored
+        # Without <inertial> elements the torque is unknown, so effort limits are ignored.
         is_known = all(body.inertia for body in arm.bodies)
         efforts = [(is_known and coordinate.effort) or torch.inf for coordinate in arm.coordinates]
         self.limits = torch.tensor(efforts, dtype=torch.float64)
@@ -55,8 +56,9 @@ class Criterion:
         return float(self._log_condition(self._rows(states)).exp())
 
     def largest_efforts(self, states: Tensor) -> np.ndarray:
-        """Return the largest rigid-body torques divided by the effort limits, (n,), for states (3, T, n); NaN without
-        a limit.
+        """Return the largest rigid-body torques divided by the effort limits, (n,), for states (3, T, n).
+
+        The result is NaN for a joint without an effort limit.
         """
         largest = self._efforts(self._rows(states)).abs().amax(dim=0)
         return np.asarray(torch.where(self.limits.isinf(), torch.nan, largest).numpy())
@@ -73,7 +75,7 @@ class Criterion:
         return value.item(), gradient.numpy()
 
     def _value(self, parameters: Tensor) -> Tensor:
-        """Return the criterion, (), for parameters (size,)."""
+        """Return the criterion as a differentiable scalar for parameters (size,)."""
         states = self.trajectory.states(parameters, self.times)
         rows = self._rows(states)
         overrun = (self._efforts(rows).abs() - TUNING.effort).clamp(min=0.0)
@@ -81,13 +83,13 @@ class Criterion:
         penalties = TUNING.penalty * overrun.square().sum() + reduction
         if self.collisions is not None:
             value, gradient = self.collisions.penalty(states[0].detach().numpy())
-            # a linear function of q with the value and the gradient of the penalty
+            # Distances are not differentiable by torch: add a linear function of q with their value and gradient.
             change = torch.from_numpy(gradient) * (states[0] - states[0].detach())
             penalties = penalties + TUNING.collision_penalty * (value + change.sum())
         return self._log_condition(rows) + penalties
 
     def _rows(self, states: Tensor) -> Tensor:
-        """Return the regressor (T, n, K) of bodies, then armature and friction in the order of `FRICTION.columns`."""
+        """Return the regressor (T, n, K): columns of bodies, then armature and friction as in `FRICTION.columns`."""
         q, qd, qdd = states
         direction = (qd / FRICTION.coulomb_smoothing_velocity).tanh()
         effects = torch.stack([qdd, qd, direction, torch.ones_like(qd)])
@@ -102,7 +104,7 @@ class Criterion:
         """Return the logarithm of the condition number, (), from the regressor (T, n, K)."""
         columns = rows[:, :, self.columns].flatten(0, 1)
         length = columns.norm(dim=0)
-        # a parameter that the motion does not excite
+        # the column of a parameter that the motion does not excite is zero
         if not length.all():
             return torch.tensor(torch.inf, dtype=torch.float64)
         condition: Tensor = torch.linalg.cond(columns / length)

@@ -1,4 +1,7 @@
-"""Design of exciting motions: the best of random motions, improved by L-BFGS, until one has no contact."""
+"""Design of exciting motions: L-BFGS improves the best of several random motions.
+
+If the result has a contact, the design is repeated with another seed and a smaller position range.
+"""
 
 from __future__ import annotations
 
@@ -42,13 +45,14 @@ def excite(
 ) -> Excitation:
     """Return an exciting motion, which starts and ends at rest; the same arguments give the same motion.
 
-    The motion keeps effort limits too if the URDF has limits and inertials, and if any motion that was found keeps
-    them. <mimic> joints keep their own limits. If the URDF has collision geometry and Pinocchio is installed, the
-    motion and the approach to it keep a clearance between links, and to the surroundings.
+    The motion keeps the limits of position and velocity, also of <mimic> joints. It keeps effort limits, too, if the
+    URDF has effort limits and inertials and the optimizer finds a motion that keeps them. If the URDF has collision
+    geometry and Pinocchio is installed, the motion and the approach to it keep a clearance between links, and to the
+    surroundings.
 
     Args:
         arm: configured arm.
-        duration: of the motion, its period [s].
+        duration: duration of the motion, which is one period [s].
         sample_rate: approximate sample rate [Hz].
         harmonics: number of harmonics; default: 0.4 per second, at least 5.
         reach: fraction of the position ranges that is used.
@@ -59,8 +63,8 @@ def excite(
             otherwise the middle of the range.
         surroundings: floor, boxes and clearance, or the path of a YAML file; default: a clearance of 10 mm.
         trials: evaluations of the criterion by the optimizer, in addition to 40 random motions.
-        seed: of the random motions.
-        progress: is called with the numbers of finished and of all trials.
+        seed: seed of the random motions.
+        progress: function that is called with the number of finished trials and the number of all trials.
 
     Raises SettingsError for an invalid value, ArmError for a joint whose limits are not increasing and if no motion
     without a contact was found.
@@ -69,7 +73,7 @@ def excite(
     ranges = arm.robot.joint, arm.settings.simulation.positions
     limits = motion_bounds(arm.chain, 1.0, 1.0, *ranges)
     bounds = motion_bounds(arm.chain, reach, speed, *ranges)
-    strongest = bounds.speed  # without limits, the approach reaches its speed in one second
+    strongest = bounds.speed  # without a limit, the approach reaches its largest speed in one second
     if acceleration is not None:
         strongest = _joint_values("acceleration", acceleration, arm.chain, positive=True)
         bounds = replace(bounds, acceleration=strongest)
@@ -80,7 +84,7 @@ def excite(
         fraction = TUNING.range_factor**attempt
         trajectory = ExcitationTrajectory(duration, harmonics, bounds.narrowed(fraction))
         criterion = Criterion(arm.chain, trajectory, collisions)
-        # another seed as well as a smaller range: the same first motion would lead to the same contact
+        # The seed changes as well as the range: the same random motions would probably lead to the same contact.
         starts = np.random.default_rng(seed + attempt).standard_normal((TUNING.starts, trajectory.size))
         best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
         motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
@@ -108,7 +112,7 @@ def excite(
 
 
 def _other_designs(seed: int, attempt: int, reach: float) -> str:
-    """Return a sentence about the designs before an attempt, which had contacts; "" for the first attempt."""
+    """Return a sentence about the designs of earlier attempts, which had contacts; "" for the first attempt."""
     if attempt == 0:
         return ""
     return (
@@ -138,7 +142,7 @@ def _checked_harmonics(
 
 
 def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, positive: bool) -> np.ndarray:
-    """Return one number per joint, (n,). Raises SettingsError."""
+    """Return an argument of `excite` as one number per joint, (n,). Raises SettingsError if it is invalid."""
     count = len(arm.coordinates)
     array = np.atleast_1d(np.array(values, dtype=float))
     if positive and array.shape == (1,):
@@ -153,11 +157,11 @@ def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, pos
 def _collisions(
     arm: Arm, surroundings: Surroundings | Path | str | None, limits: MotionBounds
 ) -> tuple[Collisions | None, str]:
-    """Return distances of links and surroundings, None if they are unknown, and a statement of the checks."""
+    """Return the `Collisions` of an arm, or None if they cannot be computed, and a text about the checks for users."""
     if not isinstance(surroundings, Surroundings):
         surroundings = Surroundings() if surroundings is None else read_surroundings(Path(surroundings))
     try:
-        # imported here: Pinocchio is an extra
+        # imported here, since Pinocchio is an optional dependency
         from spelgen.excitation.collisions import Collisions
 
         collisions = Collisions(arm, surroundings, limits)
@@ -176,12 +180,12 @@ def _start(
     """Return the position from which the approach starts, (n,). Raises SettingsError, ArmError for a contact."""
     if start is None:
         middle = (limits.low + limits.high) / 2
-        # controllers of most arms start at zero
+        # The default is zero if possible, since the controllers of most arms start at zero.
         position = np.where((limits.low <= 0) & (limits.high >= 0), 0.0, middle)
         if collisions is not None and collisions.contact_at(position):
             position = middle
     else:
-        position = _joint_values("start", start, arm, positive=False)
+        position = _joint_values("start (--from)", start, arm, positive=False)
     for joint, value, low, high in zip(arm.joint_names, position, limits.low, limits.high, strict=True):
         if not low <= value <= high:
             element = f"excite: start of {joint!r}"
@@ -196,7 +200,7 @@ def _start(
 def _improved(
     criterion: Criterion, initial: np.ndarray, trials: int, progress: Callable[[int, int], None]
 ) -> np.ndarray:
-    """Return the best parameters (size,) of `trials` evaluations by L-BFGS, from initial parameters (size,).
+    """Minimize the criterion by L-BFGS from initial parameters (size,); return the best of `trials` evaluated ones.
 
     The criterion is not differentiable if singular values are equal, or if two samples have the largest speed. L-BFGS
     is efficient for such functions (Lewis and Overton, Math. Program. 141:135, 2013). Its last iterate need not be the
@@ -207,7 +211,7 @@ def _improved(
         return initial
 
     def evaluate(parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return criterion and gradient (size,), and keep the best parameters (size,)."""
+        """Return the criterion and its gradient (size,), and store the parameters if they are the best ones so far."""
         nonlocal best, lowest, done
         value, gradient = criterion.value_and_gradient(parameters)
         done += 1
@@ -216,7 +220,8 @@ def _improved(
         progress(min(done, trials), trials)
         return value, gradient
 
-    # no tolerance of the cost: the trials are the budget, and a flat step may be followed by a steep one
+    # No tolerance of the cost ends the search: a step with a small decrease may be followed by one with a large
+    # decrease. Only the number of trials is limited.
     options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.history, "ftol": 0.0}
     minimize(evaluate, initial, jac=True, method="L-BFGS-B", options=options)
     return best

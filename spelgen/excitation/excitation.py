@@ -1,4 +1,4 @@
-"""A proposed motion and its quality: for a terminal, a notebook, as CSV, and as a message for ROS 2 controllers."""
+"""A proposed motion and its quality, with output as text, table of ranges, CSV, and message for ROS 2 controllers."""
 
 import csv
 import io
@@ -19,10 +19,11 @@ ADVICE = "View the motion, then run it slowly: a load, cables and anything else 
 class Excitation:
     """A proposed motion and its quality.
 
-    The motion starts and ends at rest. approach: motion to its first position. collisions: statement of the
-    checks. parameters: number of base parameters, friction and armature included. condition: condition number of their
-    regressor with unit columns; first: of the first random motion. efforts: (n,) largest torque of the URDF's bodies,
-    divided by the effort limit; NaN without limit or inertials. first_efforts: of the first random motion.
+    The motion starts and ends at rest. approach: motion from the start position to the first position of the motion.
+    collisions: text about the checked collisions. parameters: number of base parameters, friction and armature
+    included. condition: condition number of the base regressor with columns of unit length. first: the same condition
+    number for the first random motion. efforts: (n,) largest torque of the URDF's bodies divided by the effort limit;
+    NaN without limit or inertials. first_efforts: the same ratios for the first random motion.
     """
 
     arm: Chain
@@ -36,7 +37,7 @@ class Excitation:
     first_efforts: np.ndarray
 
     def text(self) -> str:
-        """Return the quality of the motion and its use of the limits, in 80 columns."""
+        """Return a text of at most 80 columns about the quality of the motion and its use of the limits."""
         overran = " (which overran effort limits)" if (self.first_efforts > 1).any() else ""
         head = (
             f"{self.arm.name}: {self.motion.t[-1]:g} s, {len(self.motion.t)} samples\n"
@@ -46,7 +47,7 @@ class Excitation:
         paragraphs = [head, self.listing().text()]
         if (self.efforts > 1).any():
             paragraphs.append("warning: effort limits are overrun: no motion was found that keeps them")
-        # the default may be wrong for this robot: the user should set the limit
+        # A default speed limit may be wrong for this robot, so the text names it: the user should set the limit.
         lacking = [c.name for c in self.arm.coordinates if not c.velocity]
         if lacking:
             summary = f"no velocity limit, 1 rad/s or 0.25 m/s taken: {', '.join(lacking)}"
@@ -54,7 +55,7 @@ class Excitation:
         return "\n\n".join(paragraphs)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the numbers of `text`; None for unknown efforts."""
+        """Return the numbers that `text` shows; unknown efforts are None."""
         efforts = [None if np.isnan(effort) else float(effort) for effort in self.efforts]
         return {
             "robot": self.arm.name,
@@ -70,7 +71,7 @@ class Excitation:
         }
 
     def listing(self) -> Listing:
-        """Return the ranges of position, velocity, acceleration and effort per joint."""
+        """Return a table with the ranges of position, velocity, acceleration and effort of each joint."""
         motion, rows = self.motion, []
         for k, coordinate in enumerate(self.arm.coordinates):
             q, speed = motion.q[:, k], np.abs(motion.qd[:, k]).max()
@@ -89,7 +90,7 @@ class Excitation:
         return Listing("Ranges [rad or m, s]; effort by the URDF's inertials", head, tuple(rows), note)
 
     def csv(self) -> str:
-        """Return the columns t, q_<joint>, qd_<joint> and qdd_<joint> with nine decimals."""
+        """Return the motion as CSV with the columns t, q_<joint>, qd_<joint> and qdd_<joint>, with nine decimals."""
         head = ["t"]
         for quantity in ("q", "qd", "qdd"):
             head += [f"{quantity}_{coordinate.name}" for coordinate in self.arm.coordinates]
@@ -102,7 +103,7 @@ class Excitation:
     def joint_trajectory(self) -> str:
         """Return a message of ROS 2, trajectory_msgs/JointTrajectory, with the approach and then the motion.
 
-        The text is valid JSON and YAML, with a line per point.
+        The text is valid JSON and valid YAML, with one line per point of the trajectory.
         """
         motion = self.approach.then(self.motion)
         points = []
@@ -127,5 +128,5 @@ class Excitation:
 
 
 def _numbers(values: np.ndarray) -> str:
-    """Return a list of numbers (n,) with nine decimals and no exponent, which YAML would read as text."""
+    """Return a list of numbers (n,) as text, with nine decimals. YAML would read numbers with an exponent as text."""
     return f"[{', '.join(f'{x:.9f}' for x in np.round(values, 9) + 0.0)}]"  # adding zero turns -0 into 0

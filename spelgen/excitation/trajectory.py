@@ -1,4 +1,4 @@
-"""Excitation trajectories (Fourier series from rest to rest within the limits of an arm), and approaches to them.
+"""Excitation trajectories, which are Fourier series from rest to rest within bounds, and approaches to their start.
 
 Swevers et al., Optimal robot excitation and identification, IEEE T-RA 13:730 (1997).
 """
@@ -15,13 +15,13 @@ from torch import Tensor
 from spelgen.excitation.bounds import MotionBounds
 from spelgen.excitation.tuning import TUNING
 
-# Smallest ratio of the maximum of a series on the grid to its maximum over time.
+# [1] Lower bound of the ratio between the maximum of a Fourier series on the grid and its maximum over time.
 GRID_RATIO = cos(pi / TUNING.grid)
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """q, qd and qdd (T, n) at times t (T,) from 0 to the duration [s]."""
+    """A motion: q, qd and qdd, (T, n) [rad, m, s], at times t (T,) from 0 to the duration [s]."""
 
     t: np.ndarray
     q: np.ndarray
@@ -29,9 +29,9 @@ class Motion:
     qdd: np.ndarray
 
     def then(self, later: Motion) -> Motion:
-        """Return this motion and a later one, which begins at the last position of this one."""
+        """Return this motion followed by a later one, which must begin at the last position of this motion."""
         second = later.t + self.t[-1], later.q, later.qd, later.qdd
-        # the later motion repeats the position
+        # The first sample of the later motion is omitted: it repeats the last position of this motion.
         pairs = zip((self.t, self.q, self.qd, self.qdd), second, strict=True)
         return Motion(*(np.concatenate([ours, theirs[1:]]) for ours, theirs in pairs))
 
@@ -41,16 +41,16 @@ def approach(
 ) -> Motion:
     """Return the fastest motion from rest at `start` to rest at `end` by a polynomial of degree 5.
 
-    All joints move at the same time.
+    All joints start and stop at the same times.
 
     Args:
-        start, end: (n,) [rad, m].
+        start, end: first and last positions, (n,) [rad, m].
         speed: largest speeds, (n,) [rad/s, m/s].
         acceleration: largest accelerations, (n,) [rad/s^2, m/s^2].
-        sample_rate: approximate [Hz].
+        sample_rate: approximate sample rate [Hz].
     """
     distance = end - start
-    # the largest derivatives of 10 s^3 - 15 s^4 + 6 s^5 over s in 0..1 are 1.875 and 10 / sqrt(3)
+    # The largest first and second derivatives of 10 s^3 - 15 s^4 + 6 s^5 for s in 0..1 are 1.875 and 10 / sqrt(3).
     by_speed = (1.875 * np.abs(distance) / speed).max()
     by_acceleration = np.sqrt(10 / sqrt(3) * np.abs(distance) / acceleration).max()
     duration = float(max(by_speed, by_acceleration))
@@ -66,12 +66,13 @@ def approach(
 
 @dataclass(frozen=True, eq=False)
 class ExcitationTrajectory:
-    """A family of motions of n joints with H harmonics of one period, all of which keep the bounds.
+    """Parametrized motions of n joints: Fourier series of H harmonics over one period that keep given bounds.
 
-    Any parameters (size,) are valid, so the design needs no constraints. The parameters of each joint are H sine and
-    H cosine coefficients, of which only the ratios count, the offset of the motion in the range, and the reduction of
-    the amplitude from the largest one that the bounds allow. Velocity and acceleration are zero at both ends: sine
-    coefficients are projected to be orthogonal to (1, 2, ..., H), cosine coefficients to (1, 4, ..., H^2).
+    Any real parameters (size,) give a valid motion, so the design needs no constraints. The parameters of each joint
+    are H sine and H cosine coefficients (only their ratios matter), the offset of the motion within the position range,
+    and the reduction of the amplitude from the largest one that the bounds allow. Velocity and acceleration are zero at
+    both ends: sine coefficients are projected to be orthogonal to (1, 2, ..., H), cosine coefficients to (1, 4, ...,
+    H^2).
     """
 
     duration: float
@@ -111,9 +112,9 @@ class ExcitationTrajectory:
         if self.bounds.acceleration is not None:
             strongest = accelerations.abs().amax(dim=0) / GRID_RATIO
             largest = torch.minimum(largest, torch.from_numpy(self.bounds.acceleration) / strongest)
-        # at most the largest amplitude, for any parameter
+        # any parameter gives an amplitude between zero and the largest one
         amplitude = largest * (-self.amplitude_reduction(parameters)).exp()
-        free = room - 2 * amplitude * half  # range of the offset
+        free = room - 2 * amplitude * half  # width of the range in which the offset is free
         # tanh: any parameter gives an offset within the free range
         offset = low - amplitude * (middle - half) + free * (1 + offsets.tanh()) / 2
         q, qd, qdd = amplitude * self._signals(coefficients, t)
@@ -124,7 +125,7 @@ class ExcitationTrajectory:
         return parameters.reshape(self.joints, -1)[:, -1].square() / 4
 
     def _coefficients(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the coefficients (2, H, n) of sines and cosines, and of offsets (n,), from parameters (size,)."""
+        """Return the sine and cosine coefficients (2, H, n) and the offset parameters (n,) for parameters (size,)."""
         rows = parameters.reshape(self.joints, 2 * self.harmonics + 2)
         sines_cosines = rows[:, :-2].reshape(self.joints, 2, self.harmonics).permute(1, 2, 0)
         k = self._numbers()
@@ -136,7 +137,7 @@ class ExcitationTrajectory:
 
     def _signals(self, coefficients: Tensor, t: Tensor) -> Tensor:
         """Return position, velocity and acceleration, (3, T, n), of coefficients (2, H, n) at times t (T,)."""
-        frequencies = self._numbers() * 2 * pi / self.duration  # angular
+        frequencies = self._numbers() * 2 * pi / self.duration  # angular frequencies [rad/s]
         angles = torch.outer(t, frequencies)
         sine, cosine = angles.sin(), angles.cos()  # (T, H)
         a, b = coefficients
@@ -147,5 +148,5 @@ class ExcitationTrajectory:
         return torch.stack([position, velocity, acceleration])
 
     def _numbers(self) -> Tensor:
-        """Return 1, ..., H, (H,)."""
+        """Return the numbers of the harmonics, 1 to H, (H,)."""
         return torch.arange(1, self.harmonics + 1, dtype=torch.float64)

@@ -1,1 +1,1 @@
-"""A trained model -> files that other tools read."""
+"""Export of a trained model to the file formats of other tools."""

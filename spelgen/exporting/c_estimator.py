@@ -1,6 +1,7 @@
-"""The estimator in C: a header and a source in addition to the model, with the noise levels of the run.
+"""The estimator of payload, friction drift and external torques in C, a header and a source besides the model's files.
 
-The functions of the model that only the estimator calls are CasADi expressions, equal to `live.momentum`.
+The noise levels of the run are constants of the C code. The model's functions that only the estimator calls are CasADi
+expressions of the same formulas as `live.momentum`.
 """
 
 import math
@@ -32,14 +33,15 @@ payload_torque(q, qd, qdd, load) -> tau [Nm, N]
 
 
 def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFunction]:
-    """Return the functions of the model that only the estimator calls."""
+    """Return the C functions of the model that only the estimator calls, with the noise levels of the run."""
     n, bodies = model.n, model.arm.bodies
     sizes = {"q": n, "qd": n, "qdd": n, "tau": n, "load": 10, "low": model.memory, "high": model.memory}
     inputs = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     q, qd, qdd, tau, load, low, high = inputs.values()
     residuals, still = residual_symbols(model), ca.SX(n, 1)
     arm = RigidBodies(model.arm, q, model.inertias)
-    # a payload is a second set of bodies, of which only the last has an inertia: its terms are linear in the load
+    # The payload is a second set of bodies, in which only the last body has an inertia. The momentum and
+    # torque of this set are linear in the payload's ten inertial parameters.
     payload = RigidBodies(model.arm, q, [ca.SX(10, 1)] * (len(bodies) - 1) + [load])
     momentum, kinetic_gradient = arm.momentum(qd)
     momentum += joint_mass(model, residuals) @ qd
@@ -47,14 +49,16 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     gradient = kinetic_gradient + residuals["kinetic"] - gravity - residuals["gravity"] - residuals["torque"]
     applied = constant(model.inputs) @ (tau - model.torque_offset)
     torque = applied + constant(model.friction_compensation) * qd + gradient
-    # the friction state is known up to an interval: its middle is the friction, half its width the uncertainty
+    # The friction state z is only known to lie in [low, high]. The estimate of friction is the mean of the
+    # friction torques at both ends, its uncertainty half their difference.
     first, second = (drive_friction(model, residuals, qd, gravity, z) for z in (high, low))
-    # of the last body's frame, in root axes: linear, then angular rows
+    # pose and Jacobian of the last body's frame in the root frame; linear rows first, then angular rows
     pose, jacobian = frame_kinematics(bodies, len(bodies) - 1, np.eye(4), q)
     rotation, weight = pose[:3, :3], load[0] * constant(model.arm.gravity)
     load_momentum, load_gradient = payload.momentum(qd)
     moment = ca.cross(rotation @ load[1:4], constant(model.arm.gravity))
-    # not by Newton-Euler: with its rounding errors, log odds differ 40 times as much from Python's
+    # The payload's gravity torque is J^T times its weight. Newton-Euler has larger rounding errors: the log
+    # odds then differ 40 times as much from the Python estimator's.
     load_gradient += jacobian.T @ ca.vertcat(weight, moment)
     at_point = jacobian[:3, :] - ca.skew(rotation @ levels.point) @ jacobian[3:, :]
     outputs = {
@@ -73,8 +77,8 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
 
 
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
-    """Return header and source of the estimator, by name of the file."""
-    # C has no empty arrays
+    """Return the texts of the estimator's header and source by file name."""
+    # C has no empty arrays, so a model without bristles gets one unused zero.
     breakaway = model.breakaway.ravel() if model.memory else [0.0]
     tables: dict[str, Iterable[float]] = {
         "load_prior": TUNING.load_prior,
@@ -102,7 +106,8 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, model.input_inverse)),
     }
-    # a saved state belongs to one estimator
+    # The generated code contains this checksum of all constants, so that it can refuse a state that another
+    # estimator saved.
     identity = zlib.crc32(repr(sorted((name, str(value)) for name, value in values.items())).encode())
     files: dict[str, str] = {}
     for suffix in (".h", ".c"):
@@ -112,5 +117,5 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
 
 
 def _numbers(values: Iterable[float]) -> list[str]:
-    """Return numbers as C constants, all digits."""
+    """Return C literals that give exactly the same doubles as these values."""
     return ["INFINITY" if math.isinf(value) else repr(float(value)) for value in values]

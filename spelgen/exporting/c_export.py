@@ -18,12 +18,12 @@ from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
-# warnings are errors: users compile with the flags of their own projects
+# Warnings are errors here, because users compile the files with the strict flags of their own projects.
 _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 
 
 def export_c(trained: Trained) -> Exported:
-    """Return the C files of a trained model. Raises RunError if they differ from the model."""
+    """Return the C files of a trained model. Raises RunError if their results differ from the model's."""
     files, checked = c_files(trained)
     name = trained.described.name
     use = (
@@ -35,7 +35,7 @@ def export_c(trained: Trained) -> Exported:
 
 
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
-    """Return header and source by name, and a sentence with the result of the parity check."""
+    """Return header and source by file name, and a sentence with the result of the parity check."""
     model, levels = trained.described, trained.levels
     entries, texts = dict(trained.entry_points), {}
     if levels is not None:
@@ -44,7 +44,7 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
     if levels is not None:
         functions += estimator_c_functions(model, levels)
         texts = estimator_texts(model, levels)
-    # the files themselves are compiled and compared, not a second rendering of them
+    # The parity check compiles exactly the bytes that the user gets.
     with tempfile.TemporaryDirectory() as folder:
         write_c(model, functions, Path(folder))
         for name, text in texts.items():
@@ -64,11 +64,11 @@ def compiler() -> str | None:
 
 
 def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -> Path:
-    """Compile C files to a shared library. Raises RunError with the messages of the compiler."""
+    """Compile C files to a shared library and return its path. Raises RunError with the compiler's messages."""
     sources = [sources] if isinstance(sources, Path) else sources
     library = sources[0].with_suffix(".so")
     command = [program, *_FLAGS, *flags, *map(str, sources), "-o", str(library), "-lm"]
-    # no shell: the folder's name is never parsed
+    # The compiler is run without a shell, so that special characters in the folder's name cannot be executed.
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         raise RunError(f"{Path(program).name} refuses the exported C", do=result.stderr.strip()[:500])
@@ -78,10 +78,10 @@ def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -
 def called_by_c(
     library: Path, functions: Sequence[CFunction], dtype: type[np.floating] = np.float64
 ) -> Called:
-    """Return a function that calls a compiled export for arrays of states; its outputs are float64."""
+    """Return a function that calls a compiled export for arrays of states and returns float64 arrays."""
     loaded = ctypes.CDLL(str(library))
     by_name = {function.entry.name: function for function in functions}
-    # the friction state is always double
+    # The friction state is double even if all other arrays are float.
     dtypes = dict.fromkeys(FRICTION_STATES, np.float64)
 
     def called(name: str, inputs: Values) -> Values:
@@ -94,10 +94,10 @@ def called_by_c(
             arguments.append(np.ascontiguousarray(inputs[key], dtype=dtypes.get(key, dtype)))
         outputs: Values = {}
         for key, shape in function.shapes.items():
-            # NaN fails the parity check if the function does not write a number
+            # Outputs start as NaN, so that the parity check fails if a function does not write an entry.
             outputs[key] = np.full((states, *shape), np.nan, dtypes.get(key, dtype))
         arguments += outputs.values()
-        # state by state, as a control loop calls it
+        # The functions are called once per state, as by a control loop.
         for state in range(states):
             rows = [array[state : state + 1] for array in arguments]
             call(*(row.ctypes.data_as(ctypes.c_void_p) for row in rows))

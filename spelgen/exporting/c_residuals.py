@@ -1,7 +1,8 @@
 """Residual terms of a model in C: networks as loops over tables, and functions of single joints.
 
-Splines are tables of polynomials, one per interval; harmonics are powers of a phasor. An entry point calls the
-functions that compute the symbols of its expressions (see `residual_expressions`).
+Splines are tables with a polynomial per interval; harmonics are powers of a phasor exp(i f q). The C
+code of an entry point first calls functions that compute its residual terms (see
+`residual_expressions`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,7 @@ from spelgen.exporting.model_expressions import RESIDUAL
 from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.templates import render
 
-_WIDTH = 112  # characters of a line
+_WIDTH = 112  # maximum length of a line
 
 _CALLS = (
     (("first", "second"), "mass_jets(q", ("mass", "first", "second")),
@@ -32,7 +33,7 @@ _CALLS = (
 
 
 def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return variables and calls that compute the symbols of residual terms with these names."""
+    """Return the C variables of these residual terms, and the C calls that compute them."""
     uncomputed = set(names)
     symbols = residual_symbols(model)
     variables: list[str] = []
@@ -46,7 +47,7 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
             variables.append(f"{RESIDUAL}{name}[{symbols[name].numel()}]")
             arguments.append(RESIDUAL + name)
         calls.append(f"{call}, {', '.join(arguments)});")
-    # cos q and sin q are shared by the networks of M and V
+    # The networks of M and V have the same inputs, so cos q and sin q are computed once.
     if "(encoded" in "".join(calls):
         variables.insert(0, "encoded[ENCODED]")
         calls.insert(0, "encode(q, encoded);")
@@ -54,7 +55,7 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
 
 
 def network_source(model: TrainedModel) -> list[str]:
-    """Return the C text of all networks; an empty list without networks."""
+    """Return the C text of all networks in a list; the list is empty if the model has no networks."""
     n, residuals = model.n, model.residuals
     named = {"mass": residuals.mass, "potential": residuals.potential}
     networks = {name: network for name, network in named.items() if network is not None}
@@ -70,7 +71,7 @@ def network_source(model: TrainedModel) -> list[str]:
         "networks.c.jinja",
         n=n,
         hidden=max(map(len, shapes.values())) - 1,
-        # the size of buffers, for the widest layer: one array serves all networks
+        # All networks use the same buffers, so the buffers have the size of the widest layer.
         width=max(max(shape) for layers in shapes.values() for shape in layers),
         encoded=3 * n,
         lanes=1 + n + n * (n + 1) // 2,
@@ -82,15 +83,15 @@ def network_source(model: TrainedModel) -> list[str]:
 
 
 def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
-    """Return the tables of a layer: biases, weights, and the first and last outputs that each input affects.
+    """Return the C tables of a layer: biases, weights, and the first and last output that each input affects.
 
-    Masked networks are block structured: only the weights from the first to the last nonzero one of an input are
-    stored.
+    Masked networks have blocks of zero weights: of each input, only the weights between the first and the last nonzero
+    weight are stored.
 
     Args:
-        name: prefix of the tables.
-        weight: (outputs, inputs).
-        bias: (outputs,).
+        name: prefix of the names of the tables.
+        weight: weights of the layer, (outputs, inputs).
+        bias: biases of the layer, (outputs,).
     """
     spans: list[tuple[int, int]] = []
     for column in weight.T:
@@ -103,7 +104,7 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
 
 
 def joint_function_source(model: TrainedModel) -> list[str]:
-    """Return the C text of all functions of single joints; an empty list without them."""
+    """Return the C text of all residual functions of single joints in a list, empty if the model has none."""
     residuals = model.residuals
     torque, factor = residuals.torque, residuals.friction
     if not (residuals.has_torque or factor):
@@ -116,7 +117,7 @@ def joint_function_source(model: TrainedModel) -> list[str]:
             intervals = len(polynomials[0])
             tables.append(_table(f"{name}_pieces", np.concatenate(polynomials)))
     if torque:
-        # the energy at the start of each interval
+        # The C code integrates the torque within one interval, from the energy at the start of this interval.
         energies = [spline_energy(spline)(spline.t[3:-4]) for spline in torque.values()]
         tables.append(_table("torque_energy", np.concatenate(energies)))
     for k, ripple in enumerate(residuals.ripple, start=1):
@@ -134,28 +135,29 @@ def joint_function_source(model: TrainedModel) -> list[str]:
 
 
 def _polynomials(spline: BSpline) -> np.ndarray:
-    """Return the coefficients of 1, s, s^2, s^3 per interval, (intervals, 4); s is 0 to 1 in the interval."""
+    """Return the coefficients of 1, s, s^2, s^3 per interval, (intervals, 4); s rises from 0 to 1 in the interval."""
     curve = PPoly.from_spline((np.arange(len(spline.t)), spline.c, 3))
-    # without the intervals outside of the knots of the curve
+    # The intervals of the three additional knots at each end are outside of the curve's range and are
+    # removed.
     return np.asarray(curve.c[::-1, 3 : len(spline.c)].T)
 
 
 def _spline_fields(splines: Mapping[int, BSpline]) -> list[str]:
-    """Return joint, first knot and spacing of each spline, as initialisers of C."""
+    """Return C initialisers: the joint, first knot and knot spacing of each spline."""
     spacings = [float(np.ptp(spline.t) / (len(spline.t) - 1)) for spline in splines.values()]
     firsts = [float(spline.t[3]) for spline in splines.values()]
     return [f"{joint}, {x!r}, {h!r}" for joint, x, h in zip(splines, firsts, spacings, strict=True)]
 
 
 def _table(name: str, values: np.ndarray) -> str:
-    """Return a constant C array with values (rows,) or (rows, columns), all digits."""
+    """Return the definition of a constant C array with these values, (rows,) or (rows, columns), without rounding."""
     scalar = "short" if values.dtype.kind == "i" else "real"
-    # repr keeps all digits, so that C reads the same double
+    # repr keeps all digits, so that the C compiler gets the same double.
     size = ""
     numbers = ", ".join(map(repr, values.tolist()))
     if values.ndim == 2:
         size = f"[{values.shape[1]}]"
-        # a pair of braces per row
+        # In C, braces enclose each row of a matrix.
         numbers = numbers.replace("[", "{").replace("]", "}")
     lines = wrap(numbers, _WIDTH, initial_indent="    ", subsequent_indent="    ")
     return "\n".join([f"static UNUSED const {scalar} {name}[]{size} = {{", *lines, "};"])

@@ -13,10 +13,11 @@ from spelgen.exporting.description import EntryPoint, TrainedModel
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.templates import render
 
-_WIDTH = 118  # characters of a line
+_WIDTH = 118  # maximum length of a line
 FRICTION_STATES = ("z", "z_next", "z_start", "low", "high")
 """Inputs and outputs that are friction states, of type double; all others are of type ``real``."""
-# tanh occurs in friction states only
+# tanh, unlike SIN and COS, has no float version, because only functions of the friction state call it, in
+# double.
 _FORMS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
@@ -40,7 +41,7 @@ _FORMS = {
 
 @dataclass(frozen=True)
 class CFunction:
-    """An entry point in C. shapes: of its outputs, (rows,) or (rows, columns). operations: upper bound."""
+    """An entry point in C. shapes: (rows,) or (rows, columns) per output. operations: upper bound of their number."""
 
     entry: EntryPoint
     symbol: str
@@ -52,7 +53,7 @@ class CFunction:
 
 
 def c_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> list[CFunction]:
-    """Return entry points of a model in C."""
+    """Return the C functions of the entry points of a model."""
     expressions = expression_functions(model, entries)
     return [c_function(model, entry, expressions[name]) for name, entry in entries.items()]
 
@@ -66,8 +67,8 @@ def write_c(model: TrainedModel, functions: Sequence[CFunction], folder: Path) -
 
 
 def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, str]:
-    """Return the texts of header and source, by suffix."""
-    # the time is bounded: no branch depends on data
+    """Return the texts of header and source by file name suffix: ``.h`` and ``.c``."""
+    # The header states the number of operations, an upper bound since no branch of the code depends on data.
     longest = max(functions, key=lambda function: function.operations)
     facts = [f"At most {longest.operations} operations, in {longest.entry.name}, without networks."]
     if model.servos is not None:
@@ -94,14 +95,14 @@ def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, st
 
 
 def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
-    """Return a function of an entry point in C."""
-    # the statements use the residual terms
+    """Return the C function of an entry point, which computes the outputs of a CasADi function."""
+    # The residual terms are computed first, since the statements refer to them.
     residuals, calls = residual_calls(model, residuals_needed(function))
     variables, lines = _statements(function, list(entry.outputs))
-    # casts to void avoid warnings of unused parameters
+    # Casts to void prevent compiler warnings about unused parameters.
     body = [" ".join(f"(void){name};" for name in (*entry.inputs, *entry.outputs))]
     if residuals or variables:
-        # in single precision a small displacement would be lost in the sum with z
+        # In single precision the sum z + dq would lose small displacements dq.
         scalar = "double" if entry.name == "friction_step" else "real"
         body.append(f"{scalar} {', '.join((*residuals, *variables))};")
     sizes = dict.fromkeys(entry.inputs, f"{model.name.upper()}_N") | {"load": "10"}
@@ -113,7 +114,7 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
         shapes[name] = (rows, columns) if columns > 1 else (rows,)
         parameters.append(_parameter(model, name, str(rows * columns)))
         results.append(f"{name} ({', '.join(map(str, shapes[name]))}) [{unit}]")
-    # the line of the header: the results of the function, with shapes and units
+    # the comment above the function in the header: results with shapes and units
     about = f"{entry.about[0].upper()}{entry.about[1:]}: {', '.join(results)}."
     symbol = f"{model.name}_{entry.name}"
     signature = f"void {symbol}(\n    " + ",\n    ".join(parameters) + ")"
@@ -132,19 +133,20 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
 
 
 def _parameter(model: TrainedModel, name: str, size: str) -> str:
-    """Return the declaration of an array of a C function."""
-    # friction states are pointers, NULL without bristles: C has no empty arrays
+    """Return the declaration of an array parameter of a C function; size: number of its entries, a C expression."""
+    # C has no arrays of length zero: z is a pointer, which may be NULL for a model without bristles.
     return f"double *{name}" if name in FRICTION_STATES else f"{model.name}_real {name}[{size}]"
 
 
 def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the variables of a C function and its statements, one per CasADi instruction.
+    """Return the variables and the statements of a C function, one statement per CasADi instruction.
 
-    Arrays have the names of the inputs of `function` and of ``outputs``, and are row-major. Outputs are dense, so that
-    each number is written once. A variable is a slot of CasADi's work vector, which is reused.
+    Arrays are row-major and have the names of the inputs of `function` and of ``outputs``. Outputs are dense, so that
+    each number is written once. A variable is a slot of CasADi's work vector; several results use the same slot in
+    turn.
     """
     inputs = function.name_in()
-    # CasADi numbers the entries of a matrix in column-major order
+    # CasADi numbers the entries of a matrix in column-major order, the C arrays are row-major.
     shapes = [function.size_out(k) for k in range(function.n_out())]
     variables: dict[str, None] = {}
     lines: list[str] = []
@@ -154,16 +156,17 @@ def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str
         if operation == ca.OP_OUTPUT:
             output, index = writes
             rows, columns = shapes[output]
-            row_by_row = index % rows * columns + index // rows  # from CasADi's column-major order
+            row_by_row = index % rows * columns + index // rows  # CasADi's order is column-major
             lines.append(f"{outputs[output]}[{row_by_row}] = a{reads[0]};")
             continue
         if operation == ca.OP_INPUT:
             value = f"{inputs[reads[0]]}[{reads[1]}]"
         elif operation == ca.OP_CONST:
-            value = f"R({function.instruction_constant(k)!r})"  # all digits
+            value = f"R({function.instruction_constant(k)!r})"  # repr keeps all digits
         else:
             value = _FORMS[operation].format(*(f"a{slot}" for slot in reads))
-        # a dict: unique names in the order of their first assignment
+        # The keys of a dict are unique and keep the order of the first assignments; a set would lose this
+        # order.
         variables[f"a{writes[0]}"] = None
         lines.append(f"a{writes[0]} = {value};")
     return list(variables), lines

@@ -26,7 +26,7 @@ from spelgen.exporting.tuning import TUNING
 
 
 def export_casadi(trained: Trained) -> Exported:
-    """Return a file for each entry point. Raises RunError if a function differs from the model."""
+    """Return a file for each entry point. Raises RunError if the results of a function differ from the model's."""
     model = trained.described
     functions = casadi_functions(model, trained.entry_points)
     parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
@@ -41,11 +41,13 @@ def export_casadi(trained: Trained) -> Exported:
 
 
 def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
-    """Return functions by name: SX expressions of bodies and friction, MX expressions of residual terms."""
-    # without residual terms all is scalar: SX takes less time than calls within MX
+    """Return CasADi functions by name, with SX expressions of bodies and friction, and MX of residual terms."""
+    # Without residual terms all expressions are scalar, and SX is faster than MX with calls of SX
+    # functions.
     if not model.residuals:
         return expression_functions(model, entries)
-    # derivatives are taken of the function with its residual terms, not of its symbols
+    # The function that is differentiated includes the residual terms as functions of q. In the SX function
+    # they are symbols, whose dependence on q a derivative would omit.
     bases = {name: ENTRY_POINTS[name.removesuffix("_derivatives")] for name in entries}
     expressions = expression_functions(model, {base.name: base for base in bases.values()})
     functions: dict[str, ca.Function] = {}
@@ -57,7 +59,7 @@ def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> 
 
 
 def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
-    """Return a function of the states only, with the residual terms computed inside."""
+    """Return a function of the states, without inputs for residual terms: it computes these terms from q and qd."""
     needed = residuals_needed(function)
     if not needed:
         return function
@@ -69,16 +71,16 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
-    """Return the derivatives of a function with respect to its first inputs, one per output of the entry point."""
+    """Return the Jacobians of a function with respect to its first inputs; output k is the Jacobian for input k."""
     arguments = function.mx_in()
     (output,) = function.call(arguments)
-    # dense: callers expect n x n numbers
+    # Jacobians are dense: callers expect n x n numbers, including structural zeros.
     derivatives = [ca.densify(ca.jacobian(output, x)) for x in arguments[: len(entry.outputs)]]
     return ca.Function(entry.name, arguments, derivatives, list(entry.inputs), list(entry.outputs))
 
 
 def _saved(function: ca.Function) -> bytes:
-    # CasADi can write to files only
+    # CasADi cannot serialise a function to memory, only to a file.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "function.casadi")
         function.save(str(path))
@@ -86,17 +88,17 @@ def _saved(function: ca.Function) -> bytes:
 
 
 def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
-    """Return a function that calls CasADi functions, state by state."""
+    """Return a function that calls a CasADi function by name, once per state, and stacks the results."""
 
     def called(name: str, inputs: Values) -> Values:
         function = functions[name]
         states = zip(*(inputs[key] for key in function.name_in()), strict=True)
-        # a loop: a map over states would be another function than the exported one
+        # A loop over states calls the exported function itself; CasADi's `map` would make another function.
         results = [function.call(list(map(ca.DM, state))) for state in states]
         outputs: Values = {}
         for key, values in zip(function.name_out(), zip(*results, strict=True), strict=True):
             array = np.array([value.full() for value in values])
-            # CasADi's vectors are columns
+            # CasADi returns vectors as columns: the second axis, of length one, is removed.
             outputs[key] = array[..., 0] if array.shape[-1] == 1 else array
         return outputs
 
@@ -104,7 +106,7 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
 
 
 def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return expressions for the symbols, without derivatives, at q and qd (n, 1); qd: None if not needed."""
+    """Return expressions in q and qd, (n, 1) each, for the symbols of the residual terms; qd: None if not needed."""
     residuals = model.residuals
     values: dict[str, ca.MX] = {}
     encoded = ca.vertcat(ca.cos(q), ca.sin(q), q)
@@ -115,9 +117,9 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
             values["kinetic"] = ca.jtimes(mass, q, in_kinetic_energy(model, qd), True)
     if residuals.potential is not None:
         values["energy"] = _network(residuals.potential, encoded)
-        # reverse mode: takes about the time of the network
+        # Reverse mode takes about the time of one evaluation of the network.
         values["gravity"] = ca.gradient(values["energy"], q)
-    # its derivative is the torque: both stay consistent
+    # The torque is computed as the derivative of this energy, so that both are consistent.
     if residuals.has_torque:
         values["torque_energy"] = _torque_energy(residuals, q)
         values["torque"] = ca.gradient(values["torque_energy"], q)
@@ -128,10 +130,10 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
 
 
 def _network(network: SigmoidNetwork, encoded: ca.MX) -> ca.MX:
-    """Return the outputs, (outputs, 1), for inputs (3 n, 1)."""
+    """Return the outputs of a network, (outputs, 1), for the inputs cos q, sin q and q, (3 n, 1)."""
     layer = encoded
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
-        # the sigmoid, which CasADi does not have
+        # CasADi has no sigmoid function.
         layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))
     return constant(network.weights[-1]) @ layer + network.biases[-1]
 
@@ -150,8 +152,8 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
 
 
 def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
-    """Return the value at q, (1, 1); outside of the knots it is constant."""
+    """Return the value of a spline at q, (1, 1); outside of the knots the value is constant."""
     knots, degree = spline.t, spline.k
-    # bspline extrapolates its last polynomial, the model does not
+    # CasADi's bspline extrapolates the last polynomial, but the model's splines are constant there.
     inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])
     return ca.bspline(inside, ca.DM(spline.c), [knots.tolist()], [degree], 1, {})

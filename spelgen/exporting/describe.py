@@ -1,4 +1,4 @@
-"""A trained model with its arm, the argument of every exporter, and its description as plain numbers."""
+"""The argument of every exporter, a trained model with its arm; and the conversion of this model to plain numbers."""
 
 from __future__ import annotations
 
@@ -46,10 +46,11 @@ if TYPE_CHECKING:
 class Trained:
     """A trained model and its arm.
 
-    entries: names of the functions to export, for formats of functions; empty: all functions except derivatives.
-    intervals: tables of the 95 % intervals of a fit, for the README.
-    float32: numbers of ONNX and torch programs; otherwise float64.
-    levels: noise levels of the estimator; None: it is not exported.
+    entries: names of the functions to export, for formats that consist of functions; empty: all except derivatives.
+    intervals: tables of the fitted parameters with 95 % intervals, for the README.
+    float32: whether ONNX and torch programs compute in float32; otherwise in float64.
+    levels: noise levels of the estimator of payload and external torques; None: no estimator is
+    exported.
     """
 
     model: ArmModel
@@ -61,12 +62,12 @@ class Trained:
 
     @cached_property
     def described(self) -> TrainedModel:
-        """The model as plain numbers. Raises RunError for a preset without rigid bodies."""
+        """The model as plain numbers. Raises RunError for a model without rigid bodies."""
         return describe(self.model, self.arm)
 
     @cached_property
     def entry_points(self) -> dict[str, EntryPoint]:
-        """The functions to export from the description, by name. Raises RunError for unknown names."""
+        """The entry points to export, by name. Raises RunError for unknown names in ``entries``."""
         return entry_points(self.described, self.entries)
 
     @property
@@ -85,20 +86,20 @@ class Trained:
         return self.arm.tip or last_link(self.arm.robot, self.joint_names)
 
     def prepared(self) -> PreparedModel:
-        """Return the model and the kinematics of its tip for programs of torch and ONNX."""
+        """Return a copy of the model with constant parameters and tip kinematics, for torch and ONNX programs."""
         dtype = torch.float32 if self.float32 else torch.float64
         return self.model.prepared(tip_kinematics(self.arm), dtype=dtype)
 
     @property
     def memory(self) -> int:
-        """Size of the friction state z of all joints."""
+        """Number of values in the friction state z of all joints; 0 for a model of networks."""
         model = self.model
         return model.n * model.elements if isinstance(model, RigidBodyDynamics) else 0
 
 
 def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
-    """Return the description of a trained model. Raises RunError for a preset without rigid bodies."""
-    # In double precision: the model may be in single precision or on another device.
+    """Return a trained model as plain numbers. Raises RunError for a model without rigid bodies."""
+    # A copy in double precision on the CPU: the user's model may be in single precision or on a GPU.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
         preset = model.spec.options.preset
@@ -110,7 +111,8 @@ def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
     weights = exact.prepare()
     constant_mass = array(weights.armature)
     residuals = Residuals((), None, None, {}, (), {})
-    # a constant residual of M needs no evaluation: it is added to the armature
+    # The part of the residual of M that is constant is added to the armature, so that exports need not
+    # evaluate it.
     if residual_terms(exact) is not None:
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
@@ -134,7 +136,7 @@ def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
 
 
 def identifier(text: str) -> str:
-    """Return a name of ASCII letters, digits and underscores, which is valid in all languages of the exports."""
+    """Return an identifier, made from a text, that is valid in all exported languages: ASCII letters, digits and _."""
     plain = _letters_and_digits(text)
     if not plain or plain[0].isdigit() or keyword.iskeyword(plain):
         return f"arm_{plain}".rstrip("_")
@@ -142,15 +144,15 @@ def identifier(text: str) -> str:
 
 
 def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
-    """Return a different identifier for each joint, similar to its name."""
-    # names of joints become fields and comments of the emitted code
+    """Return an identifier for each joint, similar to the joint's name; all identifiers differ."""
+    # The identifiers become names and comments of the exported code, so they must be valid there.
     identifiers: list[str] = []
     for number, name in enumerate(names, start=1):
         plain = _letters_and_digits(name)
         if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
             plain = f"joint_{plain or number}"
         unique, count = plain, 2
-        # Two names may differ only in characters that identifiers cannot have.
+        # Two joint names that differ only in invalid characters would give the same identifier.
         while unique in identifiers:
             unique, count = f"{plain}_{count}", count + 1
         identifiers.append(unique)
@@ -158,13 +160,13 @@ def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _letters_and_digits(text: str) -> str:
-    # all functions and macros of an export start with it: 40 characters keep their lines readable
+    # All functions and macros of an export start with this name: at most 40 characters keep lines readable.
     return re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:40]
 
 
 def array(value: Tensor) -> np.ndarray:
     """Return a copy of a tensor (...,) as a float64 array of the same shape."""
-    return np.array(value.detach().double().cpu())
+    return np.array(value.detach().double().cpu().numpy())
 
 
 def servos_of(model: ArmModel) -> Servos | None:
@@ -176,10 +178,11 @@ def servos_of(model: ArmModel) -> Servos | None:
 
 
 def _residuals(model: ArmModel) -> Residuals:
-    """Return the residual terms that are not zero."""
+    """Return the residual terms of a model, without the terms that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
-    # Only entries of the lower triangle that any function contributes to: all others would be computed zeros.
+    # Entries of the lower triangle of M without a contribution of any function are zero, and are
+    # omitted.
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
@@ -197,22 +200,23 @@ def _residuals(model: ArmModel) -> Residuals:
 def _network(
     layers: Layers | None, encoding: JointEncoding, functions: np.ndarray | None = None
 ) -> SigmoidNetwork | None:
-    """Return a network y(q), or tanh(y(q)) @ functions; None if it has no layers or its last layer is zero.
+    """Return the network y(q), or tanh(y(q)) @ functions; None if there are no layers or the last layer is zero.
 
-    tanh(x) = 2 sigmoid(2 x) - 1: units become sigmoids, which take less time in C. Factors and shifts are moved into
-    the weights and biases of the neighbouring layers.
+    Units become sigmoids, which take less time in C: tanh(x) = 2 sigmoid(2 x) - 1. The factors and the shift of this
+    formula are included in the weights and biases of the layers before and after the unit.
 
     Args:
-        layers: weights and biases of tanh layers; the last layer is linear.
-        encoding: of q, (2 n,): cos q and sin q of a revolute joint, (q - center) slope and zero of a prismatic one.
-        functions: (outputs of the last layer, outputs).
+        layers: weights and biases of tanh layers, of which the last is linear.
+        encoding: the inputs of the network, (2 n,): cos q and sin q of a revolute joint, (q - center) slope and zero of
+            a prismatic joint.
+        functions: linear map of tanh(y), (outputs of the last layer, outputs); None: the result is y.
     """
     if layers is None or not any(tensor.any() for tensor in layers[-1]):
         return None
     weights, biases = (list(map(array, tensors)) for tensors in zip(*layers, strict=True))
-    # inputs become (cos q, sin q, q) of all joints
+    # The exported network has the inputs (cos q, sin q, q) of all joints.
     first, second = np.hsplit(weights[0], 2)
-    # a prismatic input (q - center) slope is a weight of q and a part of the bias
+    # The input (q - center) slope of a prismatic joint becomes a weight of q and a contribution to the bias.
     slopes, revolute = first * array(encoding.slope), array(encoding.revolute)
     weights[0] = np.hstack([first * revolute, second * revolute, slopes])
     biases[0] -= slopes @ array(encoding.center)
@@ -220,17 +224,18 @@ def _network(
         weights.append(functions.T)
         biases.append(np.zeros(functions.shape[1]))
     for k in range(1, len(weights)):
-        # tanh(x) = 2 sigmoid(2 x) - 1: twice the layer before, and twice minus the sum in the layer after.
+        # tanh(x) = 2 sigmoid(2 x) - 1: weights and biases before the unit are doubled. After it the weights
+        # are doubled, and their original sum is subtracted from the bias.
         weights[k - 1], biases[k - 1] = 2 * weights[k - 1], 2 * biases[k - 1]
         weights[k], biases[k] = 2 * weights[k], biases[k] - weights[k].sum(axis=1)
     return SigmoidNetwork(tuple(weights), tuple(biases))
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
-    """Return the spline of each joint whose weights, (n, splines), are not all zero."""
+    """Return a spline per index of a joint, from weights (n, splines); joints with only zero weights have none."""
     splines = {}
     for joint in torch.nonzero(weights.any(dim=1)).flatten().tolist():
-        # three zero weights at both ends: the curve is zero there, with two continuous derivatives
+        # Three zero weights at each end make the curve and its first two derivatives zero at the ends.
         padded = np.pad(array(weights[joint]), 3)
         steps = np.arange(len(padded) + 4) - 5
         knots = float(terms.middles[joint, 0]) + float(terms.spacing[joint, 0]) * steps
@@ -239,21 +244,22 @@ def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
 
 
 def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
-    """Return the torque ripple for weights (n, 2 H): of each joint the harmonics of its own revolution, then of the
-    motor's.
+    """Return the torque ripple for weights (n, 2 H): harmonics of the joint's revolution, then of the motor's.
 
-    A phasor computes the harmonics k = 1, 2, ... of one frequency: trailing zeros are removed, zeros between are kept.
+    An export computes harmonics k = 1, 2, ... of one frequency by a rotating phasor, in sequence. Harmonics with zero
+    amplitude are therefore only removed after the last nonzero one.
     """
     ripple: list[Harmonics] = []
     cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
-        # number of leading frequencies 1, 2, ...; frequencies of the motor are multiples of its gear ratio
+        # number of harmonics of the joint, with frequencies 1, 2, ...; the motor has multiples of the gear
+        # ratio
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]
             used = np.flatnonzero((c != 0) | (s != 0))
-            # without trailing zeros: each harmonic costs a rotation of the phasor
+            # Each further harmonic costs a rotation of the phasor, so trailing zeros are removed.
             if used.size:
                 last = used[-1] + 1
                 ripple.append(Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))

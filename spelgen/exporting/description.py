@@ -1,4 +1,4 @@
-"""A trained model for exporters of source code, as plain numbers, and the functions of an export by entry points."""
+"""A trained model as plain numbers, for exporters of source code, and the entry points: the functions of an export."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -10,14 +10,14 @@ from scipy.interpolate import BSpline
 
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.tip_frame import Tip
-from spelgen.errors import RunError, suggestion
+from spelgen.errors import RunError
 
 
 @dataclass(frozen=True, eq=False)
 class SigmoidNetwork:
-    """A network with the inputs cos q, sin q and q: layers of sigmoids, then a linear layer.
+    """A network with inputs cos q, sin q and q of all joints: layers of sigmoids, then a linear layer.
 
-    weights: of each layer, (units, units of the layer before). biases: (units,).
+    weights: weights per layer, (units, units of the previous layer). biases: biases per layer, (units,).
     """
 
     weights: tuple[np.ndarray, ...]
@@ -38,9 +38,10 @@ class Harmonics:
 class Residuals:
     """The residual terms of a model that are not zero.
 
-    entries: row and column of the entries of M's lower triangle that ``mass`` is added to, one per output. potential:
-    is added to V, one output. torque, ripple: contributions to dV/dq [Nm, N] per joint. friction: logarithm of a factor
-    on the friction of a drive, per joint. Splines are cubic, and zero outside of their knots.
+    mass: network whose outputs are added to entries of M's lower triangle. entries: row and column of the entry, per
+    output. potential: network whose output is added to V. torque, ripple: contributions to dV/dq [Nm, N] per joint.
+    friction: logarithm of the factor on a drive's friction, per joint. Splines are cubic, and zero outside of their
+    knots.
     """
 
     entries: tuple[tuple[int, int], ...]
@@ -60,7 +61,7 @@ class Residuals:
 
 
 def spline_energy(spline: BSpline) -> BSpline:
-    """Return the integral of a torque spline; as in the runtime, its values at both ends have the same magnitude."""
+    """Return the integral of a torque spline, with opposite values at both ends of the range, as in the runtime."""
     energy = spline.antiderivative()
     count = len(energy.t) - energy.k - 1
     half = energy(spline.t[-4]) / 2
@@ -69,7 +70,7 @@ def spline_energy(spline: BSpline) -> BSpline:
 
 @dataclass(frozen=True, eq=False)
 class Servos:
-    """Constants of ``runtime.position_servo``, (n,), and the delay [s]. limit: infinite without an effort limit."""
+    """Constants of ``runtime.PositionServo``, (n,), and the delay [s]; limit: infinite if there is none."""
 
     kp: np.ndarray
     kd: np.ndarray
@@ -80,13 +81,14 @@ class Servos:
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """A trained model of an arm with n joints, in rad and Nm, or m and N.
+    """A trained model of an arm with n joints: rad and Nm for revolute joints, m and N for prismatic joints.
 
-    name, identifiers: of the robot and of the joints, for code. inertias: (bodies, 10) inertial parameters in the
-    frames of the joints. constant_mass: (n, n) part of M that does not depend on q, armature included. motors: C, (n,
-    n), motor velocities per joint velocities. friction: the ``FrictionConstants`` of the runtime, as arrays. breakaway:
-    (n, K) break-away displacements of the bristles [rad, m]. inputs: G, (n, n). actuated: (n,), 0 for a passive joint.
-    torque_offset: (n,). friction_compensation: (n,) torque per velocity that the drives add and do not measure.
+    name, identifiers: identifiers of the robot and of the joints in code. inertias: inertial parameters in the frames
+    of the joints, (bodies, 10). constant_mass: armature and constant residual terms of M, (n, n). motors: C, (n, n),
+    motor velocities per joint velocities. friction: the ``FrictionConstants`` of the runtime, as arrays. breakaway:
+    break-away displacements of the bristles, (n, K) [rad, m]. inputs: G, (n, n), joint torque per motor torque.
+    actuated: 0 for a passive joint, otherwise 1, (n,). torque_offset: measured torque at zero torque, (n,).
+    friction_compensation: torque per velocity that the drives add but do not report, (n,).
     """
 
     name: str
@@ -117,15 +119,16 @@ class TrainedModel:
 
     @property
     def input_inverse(self) -> np.ndarray:
-        """Inputs per generalised force, (n, n); at a passive joint, the torque required there."""
+        """G^-1, (n, n): motor torque per joint torque; at a passive joint, the joint torque itself."""
         return np.linalg.inv(self.inputs + np.diag(1 - self.actuated))
 
 
 @dataclass(frozen=True)
 class EntryPoint:
-    """A function of an export.
+    """A function that exports contain, and the names of its arguments and results.
 
-    inputs: names among q, qd, qdd, tau, u, dq (n numbers each) and z (the friction state). outputs: units by name.
+    inputs: names of arguments: q, qd, qdd, tau, u, dq (n numbers each) and z (the friction state). outputs: units by
+    name.
     """
 
     name: str
@@ -135,7 +138,7 @@ class EntryPoint:
 
 
 def read_entries(text: str) -> dict[str, EntryPoint]:
-    """Return entry points by name: of each, a line ``name(inputs) -> output [unit], ...``, then its description."""
+    """Return entry points by name, from a text with ``name(inputs) -> output [unit], ...`` and a description each."""
     entries = {}
     lines = text.strip().splitlines()
     for signature, about in zip(lines[::2], lines[1::2], strict=True):
@@ -178,26 +181,26 @@ forward_dynamics_derivatives(q, qd, tau, z) -> dqdd_dq [1/s^2], dqdd_dqd [1/s], 
 servo_torque(u, q, qd) -> tau [Nm, N]
     the torques of position servos under a command u, which the caller delays
 """)
-"""All functions by name."""
+"""All entry points by name."""
 
 
 def entry_points(model: TrainedModel, names: Sequence[str] = ()) -> dict[str, EntryPoint]:
-    """Return entry points of a model by name; no names: all except derivatives. Raises RunError for unknown names."""
+    """Return the selected entry points by name; no names: all except derivatives. Raises RunError for unknown names."""
     available = list(ENTRY_POINTS)
     if model.servos is None:
         available.remove("servo_torque")
     if not names:
-        # derivatives are two thirds of the code, and rarely needed
+        # Derivatives are rarely needed, but would be two thirds of the code.
         names = [name for name in available if not name.endswith("_derivatives")]
     return {name: ENTRY_POINTS[name] for name in select_names(names, available)}
 
 
 def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
-    """Return the names in the order of those available; no names: all. Raises RunError for unknown names."""
+    """Return the selected names in the order of `available`; no names: all. Raises RunError for unknown names."""
     options = list(available)
     for name in names:
         if name not in options:
             expected = f"one of {', '.join(options)}"
-            raise RunError(f"the function {name!r}", expected=expected, do=suggestion(name, options))
-    # in a fixed order: the same names give the same files
+            raise RunError(f"the function {name!r}", expected=expected)
+    # The order does not depend on the user's order, so that the same selection gives the same files.
     return [name for name in options if name in names or not names]

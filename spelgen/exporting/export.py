@@ -31,18 +31,18 @@ def export(
     entries: Sequence[str] = (),
     float32: bool = False,
 ) -> Exported:
-    """Return a trained model in the format of another tool, after a comparison with the model.
+    """Return a trained model in the format of another tool; results of the export are compared with the model's.
 
     Args:
         trained: a fit, the folder of a run, or a model.
         to: ``urdf``: FILE.urdf, with settings and friction in further files; ``mjcf``: FILE.xml for MuJoCo; ``c``: a
             folder with a C99 header and source; ``ros2``: a colcon package with the C files; ``casadi``, ``onnx``,
             ``torch``: a folder with a file for each function.
-        path: is written to; None: nothing is written.
-        arm: from ``load_arm``, or the path of a URDF; default: the arm of the fit.
+        path: file or folder to write; None: nothing is written.
+        arm: result of ``load_arm``, or the path of a URDF; default: the arm of the fit.
         force: replace existing files.
         entries: names of the functions for c, casadi, onnx and torch; default: all except derivatives.
-        float32: numbers of onnx and torch programs, for accelerators; default: float64.
+        float32: whether onnx and torch programs compute in float32, for accelerators; default: float64.
 
     Raises RunError without an arm, for a preset or a path that the format does not allow, if the comparison fails, and
     if a file exists without ``force``.
@@ -50,14 +50,14 @@ def export(
     if to not in EXPORTERS:
         do = suggestion(to, EXPORTERS)
         raise RunError(f"the format {to!r}", expected=f"one of {', '.join(EXPORTERS)}", do=do)
-    # checked first: loading and exporting a run takes seconds
+    # The path is checked first, because loading and exporting a run takes seconds.
     if path is not None:
         require_fitting(to, Path(path))
     if isinstance(trained, str | Path):
         trained = load_run(trained)
     intervals: tuple[Listing, ...] = ()
     levels = None
-    # a model that is not a fit has neither intervals nor noise levels
+    # Only a fit has intervals and noise levels; a model has neither.
     if isinstance(trained, Fit):
         levels = stored_levels(trained)
         if trained.checkpoint.posterior:
@@ -75,7 +75,7 @@ def export(
         raise RunError("no robot.urdf", element="export", expected=expected)
     if not isinstance(arm, Arm):
         arm = arm_of_spec(required_spec(trained), arm)
-    # imported here: the packages of a format may be extras that are not installed
+    # The exporter is imported here, because packages of other formats may not be installed.
     exported: Exported = pkgutil.resolve_name(exporter.function_name)(
         Trained(trained, arm, tuple(entries), intervals, float32, levels)
     )

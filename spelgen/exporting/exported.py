@@ -14,7 +14,7 @@ from spelgen.labels import printable
 if TYPE_CHECKING:
     from spelgen.exporting.describe import Trained
 
-# of all formats: an export has no other units than the model
+# The README of every format states these units, since every export has the model's units.
 UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 
 
@@ -22,9 +22,10 @@ UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 class Exporter:
     """A format of exports.
 
-    function_name: module and name of a function from ``Trained`` to ``Exported``, imported on use, because most formats
-    need packages that are extras. title: end of the title of the README. suffix: of the file; empty for a format that
-    is a folder. choice: whether the functions can be selected. float32: whether numbers can be float32.
+    function_name: module and name of the function that makes an ``Exported`` from a ``Trained``. It is imported on use,
+    because most formats need optional packages. title: end of the README's title. suffix: file name suffix, empty for a
+    format that is a folder. choice: whether a user can select functions. float32: whether programs can compute in
+    float32.
     """
 
     function_name: str
@@ -44,7 +45,7 @@ EXPORTERS = {
     "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2", "for ROS 2"),
 }
 """The formats, by the values of --to."""
-# only formats of one file are recognised by the name of the output
+# A file name specifies a format only if the format is a single file: folders have no suffix.
 _BY_SUFFIX = {exporter.suffix: name for name, exporter in EXPORTERS.items() if exporter.suffix}
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ else:
 class Exported:
     """A trained model in the format of another tool.
 
-    files: contents, by path in the folder, or by the end of the name after the stem for a format of one file. summary:
+    files: contents by path in the folder; for a format of one file, by the part of the name after the stem. summary:
     sentences for the user.
     """
 
@@ -67,7 +68,7 @@ class Exported:
     summary: tuple[str, ...]
 
     def write(self, path: Path | str, *, force: bool = False) -> tuple[Path, ...]:
-        """Write the files and return their paths.
+        """Write the files to a file name or folder, and return the paths of all files.
 
         Raises RunError for a path that contradicts the format, and for existing files without ``force``.
         """
@@ -75,7 +76,7 @@ class Exported:
         require_fitting(self.to, path)
         is_folder = not EXPORTERS[self.to].suffix
         paths = [path / name if is_folder else path.with_name(path.stem + name) for name in self.files]
-        # an existing folder is not replaced either
+        # Without `force`, a folder must not exist: the files could be mixed with other files.
         for output in [path] if is_folder else paths:
             if output.exists() and not force:
                 raise RunError("this output exists already", file=output, do="force replaces it")
@@ -88,14 +89,14 @@ class Exported:
 
 
 def format_by_extension(path: Path) -> str:
-    """Return the format of files with this extension. Raises RunError if there is none."""
+    """Return the name of the format with this file name extension. Raises RunError if no format has it."""
     if path.suffix not in _BY_SUFFIX:
         raise RunError(f"the name {path.name!r}", expected="FILE.urdf, FILE.xml or --to FORMAT")
     return _BY_SUFFIX[path.suffix]
 
 
 def require_fitting(to: str, path: Path) -> None:
-    """Raise RunError for a path whose extension contradicts the format."""
+    """Raise RunError if the extension of a path contradicts the format."""
     suffix = EXPORTERS[to].suffix
     if path.suffix == suffix or (not suffix and path.is_dir()):
         return
@@ -119,15 +120,16 @@ def with_readme(
     """Return an export with a README.
 
     Args:
-        trained: model and arm.
-        to: format.
-        files: contents by name.
-        use: first line after the title.
-        about: follows the units and the tip in the conventions.
-        summary: sentences without full stops.
+        trained: the model and its arm.
+        to: name of the format.
+        files: contents by file name.
+        use: first line after the title, how the export is used.
+        about: end of the line of conventions, after the units and the tip.
+        summary: results of the checks, sentences without full stops.
         example: lines of Python that run in the folder of the README.
     """
-    # five lines that a user needs before the first call; the rest is in docs/deploy.md
+    # The README has only the five lines that a user needs before the first call; details are in
+    # docs/deploy.md.
     exporter, conventions = EXPORTERS[to], f"{UNITS}; the tip is the link {trained.tip}; {about}"
     title, result = f"Dynamics of {trained.robot} {exporter.title}", f"{'; '.join(summary)}."
     name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"
@@ -141,6 +143,6 @@ def with_readme(
 
 def readme(title: str, use: str, joints: Sequence[str], conventions: str, checked: str) -> bytes:
     """Return the five lines of a README: title, use, order of the joints, conventions, result of the parity check."""
-    # names come from an untrusted file
+    # Names come from an untrusted URDF, so characters that are not printable are replaced.
     lines = [f"# {title}", use, f"Joints, in this order: {', '.join(joints)}.", conventions, checked]
     return ("\n".join(map(printable, lines)) + "\n").encode()

@@ -40,11 +40,12 @@ overlap, and the model has no contacts."""
 
 
 def export_mjcf(trained: Trained) -> Exported:
-    """Return the MJCF of a trained model, with its rigid bodies or the nearest ones.
+    """Return the MJCF of a trained model, with the model's rigid bodies, or with the nearest ones for networks.
 
-    Raises RunError if M, bias and forward dynamics of these bodies differ in MuJoCo.
+    Raises RunError if MuJoCo computes another M, bias or forward dynamics for these bodies.
     """
-    # MuJoCo has rigid bodies only: residual terms and networks are projected onto them
+    # MuJoCo simulates rigid bodies only, so residual terms are omitted and networks are projected onto rigid
+    # bodies.
     projection = rigid_body_projection(trained.model, trained.arm)
     text, omitted = mjcf_text(projection)
     parity = check_mjcf(text, projection)
@@ -71,20 +72,20 @@ def export_mjcf(trained: Trained) -> Exported:
 
 
 def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNING.states) -> Parity:
-    """Compare M, bias and forward dynamics without friction in MuJoCo with the model of the bodies. Raises RunError.
+    """Compare MuJoCo's M, bias and forward dynamics without friction with the rigid-body model. Raises RunError.
 
-    Inputs of the actuators are torques, or commands of position servos.
+    The controls of the actuators are torques, or commands of position servos.
     """
     arm, servos = projection.arm.chain, projection.servos
     random = random_inputs(arm.coordinates, states)
     controls = torques = random["tau"]
     if servos is not None:
-        # without dead zone, as MuJoCo's position actuators
+        # The dead zone is omitted, since MuJoCo's position actuators have none.
         controls = random["u"]
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
     q = torch.from_numpy(random["q"])
-    # the file has the URDF's angles, the model rounded ones: M would differ by their tolerance
+    # The file has the URDF's unrounded angles, but the model has rounded angles, which would change M.
     bodies = _with_exact_angles(projection)
     mass = bodies.mass_matrix(q)
     bias = bodies.nonlinear_effects(q, torch.from_numpy(random["qd"]))
@@ -96,7 +97,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
 
 
 def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
-    """Return the rigid bodies with the unrounded angles of the URDF, which the file has."""
+    """Return the rigid-body model with the unrounded angles of the URDF, the angles of the MJCF."""
     arm, bodies = projection.arm, copy.deepcopy(projection.bodies)
     chain = make_arm(
         arm.robot, joints=arm.chain.joint_names, angle_tolerance=0.0, gravity=arm.settings.gravity
@@ -109,27 +110,29 @@ def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
 
 
 def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:
-    """Return M, bias and, without mimic joints, accelerations in MuJoCo, in the coordinates of the arm.
+    """Return MuJoCo's M, bias and accelerations in the coordinates of the arm; no accelerations with mimic joints.
 
     Args:
-        text: MJCF.
-        arm: with n coordinates.
-        q, qd: (states, n).
+        text: content of the MJCF file.
+        arm: arm with n coordinates.
+        q, qd: positions and velocities of the coordinates, (states, n) [rad, m] and [rad/s, m/s].
         controls: inputs of the actuators, (states, n).
     """
     model = mujoco.MjModel.from_xml_string(text.decode())
-    # without limits of torques, and without friction, which has another form in MuJoCo
+    # Torque limits and friction are switched off: the forces are compared without them, and MuJoCo has
+    # another friction model.
     model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
-    # positions and velocities of all joints, mimic joints included, from the coordinates
+    # This linear map gives the positions and velocities of all joints, including mimic joints, from the
+    # coordinates.
     constraint = body_constraint(arm)
-    # MuJoCo orders joints by the tree of bodies
+    # The map's rows are sorted in MuJoCo's order of joints, which is the order of the tree of bodies.
     order = np.argsort([model.joint(name).dofadr[0] for name in constraint.names])
     jacobian, offset = constraint.jacobian[order], constraint.offset[order]
     driven = [arm.joint_names.index(model.actuator(k).name) for k in range(model.nu)]
     data = mujoco.MjData(model)
-    # MuJoCo stores a sparse M: it is expanded into this array
+    # MuJoCo stores a sparse M, which mj_fullM expands into this array.
     full = np.zeros((model.nv, model.nv))
     values: dict[str, list[np.ndarray]] = {"mass_matrix": [], "bias": [], "forward_dynamics": []}
     for position, velocity, control in zip(q, qd, controls, strict=True):
@@ -141,25 +144,26 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         values["mass_matrix"].append(jacobian.T @ full @ jacobian)
         values["bias"].append(jacobian.T @ data.qfrc_bias)
         values["forward_dynamics"].append(jacobian.T @ data.qacc)
-    # mimic joints are soft constraints in MuJoCo
+    # MuJoCo's mimic joints are soft constraints, so its accelerations are not those with exact mimic
+    # joints.
     if model.nv > len(arm.coordinates):
         del values["forward_dynamics"]
     return {name: np.array(rows) for name, rows in values.items()}
 
 
 def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
-    """Return the MJCF of a projection, and the links whose shapes are omitted.
+    """Return the content of the MJCF of a projection, and the names of links with omitted shapes.
 
-    Angles are the unrounded angles of the URDF, so that the tip is where other readers of the file have it. Actuators
-    are motors, one per nonzero column of G, or a position actuator per joint with a position servo.
+    The file has the unrounded angles of the URDF, so that the tip has the same pose as in other tools that read the
+    URDF. The actuators are one motor per nonzero column of G, or one position actuator per joint for position servos.
     """
     arm = projection.arm.chain
     root = etree.Element("mujoco", model=arm.name)
-    # the default is degrees; autolimits: a given range is a limit
+    # MuJoCo's default unit is degrees. With autolimits each given range is a limit.
     _add(root, "compiler", angle="radian", autolimits="true")
     _add(root, "option", gravity=arm.gravity)
     world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in _SECTIONS)
-    # a motor that rotates with several joints cannot be the armature of one of them
+    # If a motor rotates with several joints, its inertia is the armature of a tendon and not of a joint.
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
     elements, tip = [world], tip_frame(projection.arm)
     for body, inertia in zip(tip.bodies, projection.inertias, strict=True):
@@ -168,7 +172,7 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
         element = _add(elements[body.parent + 1], "body", name=name, **pose)
         elements.append(element)
         mass, center, tensor = about_center(inertia)
-        # the order of MuJoCo: xx, yy, zz, xy, xz, yz
+        # MuJoCo's order of the moments is xx, yy, zz, xy, xz, yz.
         moments = tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         _add(element, "inertial", mass=mass, pos=center, fullinertia=moments)
         joint_type = "hinge" if body.joint_type == "revolute" else "slide"
@@ -177,8 +181,8 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
         if leader.name == body.name:
             _add(element, "joint", **joint, **_drive(projection, body.coordinate, is_coupled))
             continue
-        # a mimic joint has no motor, friction and limits; in MuJoCo it is a soft constraint, with a polynomial of the
-        # leader's position
+        # A mimic joint has no motor, friction or limits. In MuJoCo its position is a polynomial of the
+        # leader's position, enforced by a soft constraint.
         _add(element, "joint", **joint)
         polynomial = body.offset, body.multiplier, 0, 0, 0
         _add(equality, "joint", joint1=body.name, joint2=leader.name, polycoef=polynomial)
@@ -195,18 +199,18 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
         if not len(section):
             root.remove(section)
     omitted = _add_shapes(root, elements, projection.arm)
-    # indented for people
+    # Indentation makes the file readable.
     etree.indent(root)
     return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8")) + b"\n", omitted
 
 
 def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> dict[str, object]:
-    """Return motor and friction attributes of joint k, which is no mimic joint; is_coupled: (n,)."""
+    """Return attributes of joint k, not a mimic joint; is_coupled: motors that several joints rotate, (n,)."""
     friction, joint = projection.friction, projection.arm.chain.coordinates[k]
-    # position servos have the learned limit of their torque
+    # The torque of position servos is limited by the actuator, with the learned limit.
     effort = joint.effort if projection.servos is None else None
     return {
-        # the rotor of a motor that several joints rotate is the armature of a tendon
+        # The armature of a coupled motor is an attribute of a tendon, see `mjcf_text`.
         "armature": 0.0 if is_coupled[k] else projection.armature[k],
         "damping": friction.viscous[k],
         "frictionloss": friction.coulomb[k],
@@ -217,7 +221,7 @@ def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> d
 
 
 def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: RigidBodyProjection) -> None:
-    """Add a motor for each input: at a joint, or at a tendon if it acts on several joints."""
+    """Add a motor for each input: at a joint, or at a tendon if the motor acts on several joints."""
     joints = projection.arm.chain.coordinates
     for k, column in enumerate(projection.inputs.T):
         name, driven = joints[k].name, np.flatnonzero(column)
@@ -230,10 +234,10 @@ def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: 
 
 
 def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos: Servos) -> None:
-    """Add a position actuator for each joint, whose control is the delayed command."""
+    """Add a position actuator for each joint; a user delays the command before setting the actuator's control."""
     for k, joint in enumerate(joints):
         limit = servos.limit[k]
-        # an infinite force range is an error in MuJoCo, an absent one is unlimited
+        # MuJoCo refuses an infinite force range; without the attribute the force is unlimited.
         force = (-limit, limit) if np.isfinite(limit) else None
         gains = {"kp": servos.kp[k], "kv": servos.kd[k]}
         _add(actuators, "position", name=joint.name, joint=joint.name, **gains, forcerange=force)
@@ -242,7 +246,7 @@ def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos:
 def _add_tendon(
     tendons: etree._Element, name: str, joints: Sequence[Coordinate], coefficients: np.ndarray
 ) -> etree._Element:
-    """Add a tendon whose length is the sum of joint positions times coefficients (n,)."""
+    """Add a tendon and return it: its length is the sum of the joint positions times coefficients (n,)."""
     tendon = _add(tendons, "fixed", name=name)
     for joint, coefficient in zip(joints, coefficients, strict=True):
         if coefficient:
@@ -254,11 +258,11 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
     """Add the shapes of all links to a model.
 
     Args:
-        root: of the model, which gets the meshes.
-        elements: of the world and of the bodies, in the order of the arm.
-        arm: with the URDF.
+        root: root element of the model, to which meshes are added.
+        elements: elements of the world and of the bodies, in the order of the arm.
+        arm: arm whose URDF has the shapes.
 
-    Returns the links with shapes that are omitted, since they cannot be read or are flat; empty without any.
+    Returns the names of links whose shapes are omitted because they are flat or cannot be read, separated by commas.
     """
     names = [link.name for link in arm.robot.links]
     assets = etree.SubElement(root, "asset")
@@ -276,7 +280,7 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
             carrier, pose = poses[shape.link]
             pose = pose @ shape.pose
             form = _form(shape, assets) | {"pos": pose[:3, 3], "quat": quaternion(pose[:3, :3])}
-            # the <inertial> of the body has the mass
+            # Shapes have no mass, since the <inertial> of the body has the whole mass.
             _add(elements[carrier + 1], "geom", **form, **attributes, mass=0)
     if not len(assets):
         root.remove(assets)
@@ -284,32 +288,32 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
 
 
 def _form(shape: LinkShape, assets: etree._Element) -> dict[str, object]:
-    """Return type and size of a geom; a mesh is added to the assets."""
+    """Return type and size of a geom as attributes; a mesh is also added to the assets."""
     if shape.mesh is None:
         sizes = {"box": [x / 2 for x in shape.size], "cylinder": [shape.size[0], shape.size[-1] / 2]}
         return {"type": shape.kind, "size": sizes.get(shape.kind, shape.size)}
     vertices, faces = shape.mesh
-    # six digits: a mesh has thousands of numbers
+    # Vertices have six digits only, since a mesh has thousands of numbers.
     rows, name = " ".join(f"{x:.6g}" for x in vertices.ravel().tolist()), f"mesh{len(assets) + 1}"
     _add(assets, "mesh", name=name, vertex=rows, face=faces, inertia="shell")
     return {"type": "mesh", "mesh": name}
 
 
 def _is_flat(vertices: np.ndarray) -> bool:
-    """True if a mesh with vertices (V, 3) has no convex hull in three dimensions."""
-    # singular values: a flat mesh may lie in any plane
+    """Whether the vertices (V, 3) of a mesh lie in a plane, so that the convex hull has no volume."""
+    # A flat mesh may lie in any plane, so its thickness is the smallest singular value.
     extents = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
     return len(extents) < 3 or bool(extents[2] <= TUNING.flat * extents[0])
 
 
 def _add(parent: etree._Element, tag: str, **attributes: object) -> etree._Element:
-    """Add an element; attributes that are None are omitted."""
+    """Add an element and return it; attributes that are None are omitted."""
     texts = {name: _text(value) for name, value in attributes.items() if value is not None}
     return etree.SubElement(parent, tag, texts)
 
 
 def _text(value: object) -> str:
-    """Return a text unchanged, or numbers with all digits."""
+    """Return the value of an attribute: a text unchanged, numbers with all digits and separated by blanks."""
     if isinstance(value, str):
         return value
     return " ".join(f"{float(number):.17g}" for number in np.ravel(value))  # type: ignore[call-overload]

@@ -1,4 +1,4 @@
-"""Entry points of a trained model as CasADi expressions of q, qd, the friction state and symbols of residual terms."""
+"""Entry points of a trained model as CasADi expressions of the state, the inputs and symbols for residual terms."""
 
 from collections.abc import Mapping
 
@@ -22,14 +22,14 @@ Outputs = dict[str, tuple[ca.SX, ...]]
 
 
 def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
-    """Return entry points as functions of their inputs and of the residual terms that they need; outputs are dense."""
+    """Return CasADi functions of entry points, whose inputs include the needed residual terms; outputs are dense."""
     names = ("q", "qd", "qdd", "tau", "dq", "u")
     inputs = {name: ca.SX.sym(name, model.n) for name in names}
     inputs["z"] = ca.SX.sym("z", model.memory)
-    # all entry points share their subexpressions, so they are built together
+    # The expressions of all entry points are built together, since they share subexpressions.
     residuals = residual_symbols(model)
     expressions = _expressions(model, inputs, residuals)
-    # the derivatives take most of the time of an export
+    # Derivatives take most of the time of an export and are built only if selected.
     if any(name.endswith("_derivatives") for name in entries):
         expressions |= _derivatives(model, inputs, residuals)
     functions: dict[str, ca.Function] = {}
@@ -41,34 +41,35 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
 def named_function(
     entry: EntryPoint, expressions: tuple[ca.SX, ...], inputs: Symbols, residuals: Symbols
 ) -> ca.Function:
-    """Return the function of an entry point, of its inputs and the residual terms that it needs; outputs are dense."""
+    """Return the CasADi function of an entry point; its inputs include the needed residual terms, outputs are dense."""
     outputs = list(map(ca.densify, expressions))
     arguments = {key: inputs[key] for key in entry.inputs}
     for key, symbols in residuals.items():
         if symbols.nnz() and ca.depends_on(ca.veccat(*outputs), symbols):
             arguments[RESIDUAL + key] = symbols
     labels = list(arguments), list(entry.outputs)
-    # cse: common subexpressions are computed once
+    # With cse, common subexpressions are computed once.
     return ca.Function(entry.name, list(arguments.values()), outputs, *labels, {"cse": True})
 
 
 def residuals_needed(function: ca.Function) -> list[str]:
-    """Return the names of the residual terms among the inputs of a function of ``expression_functions``."""
+    """Return the names of the residual terms that are inputs of a function made by ``expression_functions``."""
     return [name.removeprefix(RESIDUAL) for name in function.name_in() if name.startswith(RESIDUAL)]
 
 
 def _expressions(
     model: TrainedModel, inputs: Symbols, residuals: Symbols, *, derivatives: bool = False
 ) -> Outputs:
-    """Return all entry points except derivatives, of M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation.
+    """Return the expressions of all entry points except derivatives, and of ``force``.
 
-    ``force`` is M qdd + h + friction - compensation, (n, 1).
+    The model is M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation, and ``force`` is M qdd + h + friction
+    - compensation, (n, 1).
 
     Args:
-        model: description.
+        model: the model as plain numbers.
         inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1).
-        residuals: symbols of the residual terms.
-        derivatives: whether the residual terms are given with their derivatives with respect to q.
+        residuals: symbols of the residual terms, see ``residual_symbols``.
+        derivatives: whether the symbol ``first`` replaces ``rate`` and ``kinetic``, for derivatives with respect to q.
     """
     q, qd, qdd, tau, dq, u, z = inputs.values()
     standstill = ca.SX(model.n, 1)
@@ -84,11 +85,12 @@ def _expressions(
     bias = bodies.torque(qd, standstill) + added_bias
     friction = drive_friction(model, residuals, qd, rigid_gravity, z)
     compensation = constant(model.friction_compensation) * qd
-    # one recursive Newton-Euler pass; M qdd + h would take two
+    # Newton-Euler gives the sum M qdd + h of the rigid bodies in one pass; M qdd and h separately would take
+    # two.
     force = bodies.torque(qd, qdd) + added_mass @ qdd + added_bias + friction - compensation
     to_inputs = constant(model.input_inverse)
     applied = constant(model.inputs) @ (tau - model.torque_offset)
-    # Half of qd times it is the kinetic energy: M is used once.
+    # The kinetic energy is 1/2 qd . momentum, so that the product with M is computed once.
     momentum = mass @ qd
     potential = rigid_potential + residuals["energy"] + residuals["torque_energy"]
     pose, jacobian = frame_kinematics(model.tip.bodies, model.tip.carrier, model.tip.pose, q)
@@ -113,14 +115,15 @@ def _expressions(
 
 
 def joint_mass(model: TrainedModel, residuals: Symbols) -> ca.SX:
-    """Return M of the motors' rotors and of the residual terms, (n, n)."""
+    """Return the part of M that is due to rotors and residual terms, (n, n)."""
     return constant(model.constant_mass) + symmetric(model, residuals["mass"])
 
 
 def drive_friction(model: TrainedModel, residuals: Symbols, qd: ca.SX, gravity: ca.SX, z: ca.SX) -> ca.SX:
-    """Return the friction torque of the joints, (n, 1) [Nm, N]; gravity: of the rigid bodies, (n, 1)."""
+    """Return joint friction torques, (n, 1) [Nm, N]; gravity: gravity torques of the rigid bodies, (n, 1) [Nm, N]."""
     motors = constant(model.motors)
-    # Power is equal on both sides of the gears: C^T drive_load = joint_load.
+    # Motors and joints transmit equal power, so gravity torques at motors and joints satisfy C^T load =
+    # gravity.
     load = constant(np.linalg.inv(model.motors).T) @ gravity
     friction = friction_torque(model, motors @ qd, load, z)
     for k, joint in enumerate(model.residuals.friction):
@@ -129,27 +132,28 @@ def drive_friction(model: TrainedModel, residuals: Symbols, qd: ca.SX, gravity: 
 
 
 def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) -> ca.SX:
-    """Return the friction torque of the motors, (n, 1) [Nm, N], as ``runtime.friction_laws``.
+    """Return the friction torque of the motors, (n, 1) [Nm, N], by the formulas of ``runtime.friction_laws``.
 
     Args:
-        model: description.
-        qd: velocities of the motors, (n, 1).
-        gravity: gravity torques of the motors, (n, 1).
+        model: the model as plain numbers.
+        qd: velocities of the motors, (n, 1) [rad/s, m/s].
+        gravity: gravity torques of the motors, (n, 1) [Nm, N].
         z: friction state, (n K, 1), the K elements of the first joint first.
     """
     constants = model.friction
-    # ca.reshape is column-major: a column for the elements of each joint
+    # ca.reshape is column-major, so that each column has the K elements of a joint.
     deflection = ca.reshape(
         z * (constants.bristle_fractions / model.breakaway).ravel(), model.breakaway.shape[1], model.n
     )
-    # of dry friction, in [-1, 1]: depends on velocity or on bristles
+    # direction of dry friction, in [-1, 1]: a function of velocity at joints without bristles, else of the
+    # bristles
     direction = constants.memoryless * _smooth_sign(qd, constants.coulomb_smoothing_velocity)
     direction += ca.sum1(deflection).T
     load = ca.sqrt(gravity**2 + constants.min_load**2)
     speed = ca.fabs(qd) / constants.stribeck_velocity
     rounding = constants.stribeck_rounding
     slow = 1 / (1 + (1 + rounding) / 8 * speed**2 / (speed + rounding))
-    for _ in range(3):  # to the power of 8
+    for _ in range(3):  # three squares are the power of 8
         slow = slow * slow
     dry = constants.coulomb + constants.load_dependence * load + constants.stribeck * slow
     viscous = constants.viscous * qd + constants.saturation * _smooth_sign(qd, constants.saturation_velocity)
@@ -157,40 +161,40 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
 
 
 def _smooth_sign(velocity: ca.SX, width: np.ndarray) -> ca.SX:
-    """Return the direction of velocities (n, 1), smoothed over widths (n,), (n, 1)."""
+    """Return smooth signs of velocities, (n, 1); velocity: (n, 1), width: width of the transition, (n,)."""
     return velocity / ca.sqrt(velocity**2 + width**2)
 
 
 def sliding_bristles(model: TrainedModel, qd: ca.SX) -> ca.SX:
-    """Return z, (n K, 1), of motors that have moved at qd (n, 1) for a long time."""
+    """Return the friction state z, (n K, 1), of motors that have moved at constant qd, (n, 1), for a long time."""
     direction = ca.tanh(qd / model.friction.coulomb_smoothing_velocity)
     return ca.SX(_per_element(model.breakaway, direction) * model.breakaway.ravel())
 
 
 def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
-    """Return z, (n K, 1), after a monotonic displacement of the motors.
+    """Return the friction state z, (n K, 1), after a displacement of the motors without reversals.
 
     Args:
-        breakaway: break-away displacements, (n, K).
-        z: before, (n K, 1).
-        dq: displacements, (n, 1).
+        breakaway: break-away displacements, (n, K) [rad, m].
+        z: friction state before the displacement, (n K, 1) [rad, m].
+        dq: displacements of the motors, (n, 1) [rad, m].
     """
     limit = breakaway.ravel()
     return ca.SX(ca.fmin(ca.fmax(z + _per_element(breakaway, dq), -limit), limit))
 
 
 def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:
-    """Return values (n, 1) repeated for the K elements of each joint, (n K, 1)."""
+    """Return values (n, 1) with each value repeated K times, once per element of the joint, (n K, 1)."""
     return ca.vec(ca.repmat(values.T, breakaway.shape[1], 1))
 
 
 def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
-    """Return the torque of position servos, (n, 1), for delayed commands u, q and qd, (n, 1)."""
+    """Return the torque of position servos, (n, 1); u: delayed commands, (n, 1), q and qd: (n, 1)."""
     error = u - q
     if servos.dead_zone.any():
         error -= ca.fmin(ca.fmax(error, -servos.dead_zone), servos.dead_zone)
     torque: ca.SX = servos.kp * error - servos.kd * qd
-    # without a limit, no comparison in C
+    # Joints without a torque limit are skipped, which saves comparisons in C.
     for joint in np.flatnonzero(np.isfinite(servos.limit)).tolist():
         limit = servos.limit[joint]
         torque[joint] = ca.fmin(ca.fmax(torque[joint], -limit), limit)
@@ -198,23 +202,25 @@ def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
 
 
 def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Outputs:
-    """Return derivatives of inverse and forward dynamics with respect to q, qd and tau, (n, n) each.
+    """Return Jacobians, (n, n) each, of inverse dynamics (by q, qd) and forward dynamics (by q, qd, tau).
 
-    dqdd/dx = -M^-1 dforce/dx at qdd of the forward dynamics (Carpentier and Mansard, RSS 2018).
+    Forward dynamics have dqdd/dx = -M^-1 dforce/dx at the computed qdd (Carpentier and Mansard, RSS
+    2018).
     """
     expressions = _expressions(model, inputs, residuals, derivatives=True)
     (force,), (mass,) = expressions["force"], expressions["mass_matrix"]
     symbols = [inputs["q"]]
     jacobians = [ca.SX.eye(model.n)]
-    # the chain rule: residual terms, which a program computes by loops, are symbols that depend on q
+    # Chain rule: a residual term is a symbol, whose Jacobian with respect to q is another symbol.
     for symbol, jacobian in symbol_jacobians(model, residuals):
         symbols.append(symbol)
         jacobians.append(jacobian)
     by_position = ca.jtimes(force, ca.vertcat(*symbols), ca.vertcat(*jacobians))
-    # Residual terms of M enter through their coriolis terms, which are explicit in qd.
+    # Residual terms depend on q only, and `coriolis` is an explicit expression in qd: no chain rule is
+    # needed.
     by_velocity = ca.jacobian(force, inputs["qd"])
     right = ca.horzcat(-by_position, -by_velocity, constant(model.inputs))
-    # at the accelerations of the forward dynamics
+    # Jacobians of the force are evaluated at the accelerations that the forward dynamics give.
     right = ca.substitute(right, inputs["qdd"], *expressions["forward_dynamics"])
     to_inputs = constant(model.input_inverse)
     return {
@@ -226,11 +232,10 @@ def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Ou
 def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:
     """Return matrix^-1 right, (n, columns), by L D L^T; matrix: positive definite, (n, n).
 
-    The lower triangle is not used, so CasADi computes only one triangle. For n = 6 there are 6 divisions; ``ca.ldl``
-    needs 21.
+    The lower triangle is not used, so CasADi need not compute it. For n = 6 there are 6 divisions; ``ca.ldl`` needs 21.
     """
     n = matrix.shape[0]
-    # copies, which are changed in place
+    # The elimination changes matrices in place, so it works on copies.
     matrix = ca.SX(matrix)
     right = ca.SX(right)
     factors: list[ca.SX] = []
@@ -238,7 +243,8 @@ def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:
         inverse = 1 / matrix[k, k]
         row = matrix[k, k + 1 :]
         factor = inverse * row
-        # Schur complement of the pivot; M is positive definite, so no pivoting is needed.
+        # The remaining block becomes the Schur complement of the pivot. A positive definite matrix needs no
+        # pivoting.
         matrix[k + 1 :, k + 1 :] -= factor.T @ row
         right[k + 1 :, :] -= factor.T @ right[k, :]
         right[k, :] *= inverse

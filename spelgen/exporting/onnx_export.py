@@ -31,7 +31,7 @@ from spelgen.exporting.tuning import TUNING
 
 
 def export_onnx(trained: Trained) -> Exported:
-    """Return an .onnx file for each entry point. Raises RunError if ONNX Runtime and the model differ."""
+    """Return an .onnx file for each entry point. Raises RunError if results of ONNX Runtime and the model differ."""
     model = trained.prepared()
     models, files = {}, {}
     for name in program_names(trained):
@@ -54,7 +54,8 @@ def export_onnx(trained: Trained) -> Exported:
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
     """Return the serialised ONNX model of an entry point."""
-    # decompositions act while the program is traced, before the translation to ONNX
+    # Functions without an ONNX operator are replaced while torch traces the program, before the translation
+    # to ONNX.
     with _silent_exporter():
         with _Decomposed():
             program = export_program(model, name, flat_state=True)
@@ -68,7 +69,7 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
         )
     assert exported is not None
     content = exported.model_proto
-    # without torch's metadata of each node, two thirds of the file
+    # torch's metadata of the nodes are removed: they would be two thirds of the file.
     for described in (content, content.graph, *content.graph.node):
         described.ClearField("metadata_props")
     return bytes(content.SerializeToString())
@@ -76,7 +77,7 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
 
 @contextmanager
 def _silent_exporter() -> Iterator[None]:
-    """Suppress warnings of torch about absent torchvision and deprecated functions."""
+    """Suppress warnings of torch's ONNX exporter about absent torchvision and deprecated functions."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -95,12 +96,12 @@ def _cross(a: Tensor, b: Tensor, *, dim: int) -> Tensor:
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
-    """Return matrix^-1 right, (..., n, columns), by Gauss-Jordan elimination; no pivoting: definite matrix."""
-    n = matrix.shape[-1]  # constant, so the program has the unrolled loop
+    """Return matrix^-1 right, (..., n, columns), by Gauss-Jordan elimination without pivoting; matrix: definite."""
+    n = matrix.shape[-1]  # constant: tracing unrolls the loop
     identity = torch.eye(n, dtype=matrix.dtype)
-    # the matrix or the right-hand side may have no batch dimension
+    # Either of the matrix and the right-hand side may have no batch dimension.
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
-    # matrix and right-hand side are eliminated together
+    # The elimination transforms matrix and right-hand side together, as columns of one array.
     rows = torch.cat([matrix.expand(*batch, n, n), right.expand(*batch, *right.shape[-2:])], dim=-1)
     for k in range(n):
         pivot = rows[..., k : k + 1, :]
@@ -110,7 +111,7 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def _solve_triangular(matrix: Tensor, right: Tensor, *, upper: bool, unitriangular: bool) -> Tensor:
-    """Return matrix^-1 right, (..., n, columns), for a triangular matrix (..., n, n) whose diagonal counts as ones."""
+    """Return matrix^-1 right, (..., n, columns); matrix: triangular, its diagonal is replaced by ones."""
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
     return _solve(matrix - matrix * identity + identity, right)
 
@@ -121,29 +122,29 @@ class _Cholesky(NamedTuple):
 
 
 def _cholesky_ex(matrix: Tensor) -> _Cholesky:
-    """Return the matrix, (..., n, n), and info (...): 0 if it is positive definite, otherwise 1.
+    """Return the unchanged matrix, (..., n, n), and info (...): 0 if the matrix is positive definite, otherwise 1.
 
-    Networks of M use info only, so the factor is not computed.
+    Networks of M use only info of torch's ``cholesky_ex``, so the Cholesky factor is not computed.
     """
     rows = matrix
     info = torch.zeros(matrix.shape[:-2], dtype=torch.int32)
     for k in range(matrix.shape[-1]):
         pivot = rows[..., k : k + 1, k : k + 1]
-        # also 1 for NaN
+        # A comparison with NaN is false, so info is 1 for a matrix with NaN, too.
         info = torch.where(pivot[..., 0, 0] > 0, info, 1)
         rows = rows - rows[..., k : k + 1] * rows[..., k : k + 1, :] / pivot
     return _Cholesky(matrix, info)
 
 
 def _scalar_tensor(s: float, dtype: int = onnx.TensorProto.DOUBLE, **options: object) -> onnxscript.ir.Value:
-    """Return a constant. The translation of torch rounds it to float32, an error of 1e-8 in networks."""
+    """Return an ONNX constant in double precision; torch's own translation rounds to float32, an error of 1e-8."""
     value = np.array(s, dtype=onnx.helper.tensor_dtype_to_np_dtype(dtype))
     constant = onnxscript.opset18.Constant(value=onnx.numpy_helper.from_array(value))
     return cast("onnxscript.ir.Value", constant)
 
 
 def _softplus(x: Tensor) -> Tensor:
-    """Return log(1 + exp x), (...), or x if both are equal in float64; ONNX Runtime has float32 only."""
+    """Return softplus(x) = log(1 + exp x), (...), or x for large x; ONNX Runtime has softplus in float32 only."""
     return torch.where(x > 20.0, x, x.exp().log1p())
 
 
@@ -165,12 +166,12 @@ class _Decomposed(TorchFunctionMode):
         args: tuple[object, ...] = (),
         kwargs: dict[str, object] | None = None,
     ) -> object:
-        """Call the decomposition of a function, if there is one."""
+        """Call the decomposition of a torch function if ``functions`` has one, otherwise the function itself."""
         return self.functions.get(func, func)(*args, **(kwargs or {}))
 
 
 def called_by_onnx(files: Mapping[str, bytes]) -> Called:
-    """Return a function that calls entry points in ONNX Runtime, for arrays of states."""
+    """Return a function that evaluates an entry point in ONNX Runtime, by name, for arrays of states."""
     sessions = {name: onnx_session(content) for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:
@@ -184,9 +185,9 @@ def called_by_onnx(files: Mapping[str, bytes]) -> Called:
 
 
 def onnx_session(content: bytes) -> onnxruntime.InferenceSession:
-    """Return a session with one thread."""
+    """Return a session of ONNX Runtime, with one thread, for the content of an .onnx file."""
     options = onnxruntime.SessionOptions()
-    # synchronisation would take longer than operations with small matrices
+    # One thread is used, since synchronising several takes longer than operations with small matrices.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.log_severity_level = 3  # no warnings of unused inputs

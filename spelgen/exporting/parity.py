@@ -31,7 +31,7 @@ Called = Callable[[str, Values], Mapping[str, np.ndarray]]
 
 
 def _energy(model: ArmModel, q: Tensor, qd: Tensor) -> Tensor:
-    """Return kinetic and potential energy, (states, 2) [J], for q and qd (states, n)."""
+    """Return kinetic and potential energy, (states, 2) [J], at q and qd, (states, n)."""
     kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
     return torch.stack([kinetic, model.potential_energy(q)], dim=-1)
 
@@ -49,21 +49,21 @@ _REFERENCES: dict[str, Callable[..., Tensor]] = {
     "energy": _energy,
     "servo_torque": lambda model, u, q, qd: model.servo(u, q, qd),
 }
-"""The outputs of entry points by the torch model, except for derivatives and the tip."""
+"""The torch model's functions of entry points, by name, except for derivatives and the tip."""
 
 
 @dataclass(frozen=True)
 class Parity:
-    """Largest difference to the torch model of each entry point, relative to its largest value; summary: a sentence."""
+    """Largest difference per entry point, relative to the torch model's largest value; summary: a sentence."""
 
     differences: dict[str, float]
     summary: str
 
 
 def require_parity(differences: dict[str, float], tolerance: float, states: int) -> Parity:
-    """Return the parity of differences by entry point. Raises RunError if a difference is above the tolerance."""
+    """Return the result of a comparison. Raises RunError if a relative difference is above the tolerance."""
     for name, difference in differences.items():
-        if not difference <= tolerance:  # also true for NaN
+        if not difference <= tolerance:  # also raised for NaN
             raise RunError(
                 f"{name} differs from the model by {difference:.1e}",
                 element="parity check",
@@ -90,34 +90,34 @@ def check_parity(
     """Compare an export with the torch model at random states. Raises RunError for a difference above the tolerance.
 
     Args:
-        called: calls the export.
-        trained: model and arm.
-        names: of the entry points.
-        tolerance: relative to the largest value of an output.
+        called: function that evaluates an entry point of the export.
+        trained: the torch model and its arm.
+        names: names of the entry points to compare.
+        tolerance: largest allowed difference, relative to the largest value of an output.
         states: number of random states.
-        dtype: of the export; the inputs of both are rounded to it.
+        dtype: number type of the export; the inputs of export and torch model are rounded to this type.
     """
     inputs = random_inputs(trained.arm.chain.coordinates, states, trained.memory)
     inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
-    # in double precision: the rounding of a float32 model would exceed the tolerance
+    # The torch model computes in double precision, since rounding errors in float32 exceed the tolerance.
     exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
     differences: dict[str, float] = {}
     for name in names:
         outputs = called(name, inputs)
         expected = _expected(exact, trained, name, inputs)
-        # reshaped: formats differ in the shape of matrices and vectors of one joint
+        # For an arm of one joint, the shapes of matrices and vectors differ between formats.
         errors = [relative(outputs[key].reshape(value.shape), value) for key, value in expected.items()]
         differences[name] = float(np.max(errors))  # np.max returns NaN if any error is NaN
     return require_parity(differences, tolerance, states)
 
 
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0) -> Values:
-    """Return random inputs of the exported functions: joint quantities (states, n), and z (states, memory).
+    """Return random inputs of the entry points by name: joint quantities (states, n), and z (states, memory).
 
-    The seed is fixed, since exports are reproducible.
+    The seed is fixed, so that exports are reproducible.
     """
     random = np.random.default_rng(0)
-    # velocities within the limits: friction at higher speeds is extrapolated
+    # Velocities are mostly within the limits, because friction at higher speeds is extrapolated.
     speed = nominal_speeds(coordinates)
     q = np.stack([random.uniform(*working_range(joint), states) for joint in coordinates], axis=-1)
     return {
@@ -125,32 +125,32 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
         "qd": 0.5 * speed * random.standard_normal(q.shape),
         "qdd": 2.0 * speed * random.standard_normal(q.shape),
         "dq": 0.05 * speed * random.standard_normal(q.shape),
-        # break-away displacements are fractions of a milliradian
+        # The standard deviation of z has the size of break-away displacements, fractions of a milliradian.
         "z": 1e-4 * random.standard_normal((states, memory)),
-        # forward dynamics are linear in tau: its size is of no importance
+        # Forward dynamics are linear in tau, so the size of tau has no influence on the relative difference.
         "tau": 10.0 * random.standard_normal(q.shape),
         "u": q + 0.3 * random.standard_normal(q.shape),
     }
 
 
 def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
-    """Return the velocity limits of the URDF, or nominal speeds of joints without a limit, (n,) [rad/s, m/s]."""
+    """Return the URDF's velocity limits, (n,) [rad/s, m/s]; joints without a limit get a nominal speed."""
     nominal = {"revolute": TUNING.angular_speed, "prismatic": TUNING.linear_speed}
     return np.array([joint.velocity or nominal[joint.joint_type] for joint in coordinates])
 
 
 def relative(values: np.ndarray, expected: np.ndarray) -> float:
-    """Return the largest difference of arrays (...,), relative to the largest expected value; NaN if any is NaN."""
+    """Return the largest difference of arrays (...,) relative to the largest expected value; NaN if any is NaN."""
     if not expected.size:
         return 0.0
-    # absolute if all expected values are zero
+    # The difference is absolute if all expected values are zero.
     size = np.abs(expected).max() or 1.0
     with np.errstate(invalid="ignore"):
         return float(np.abs(values - expected).max() / size)
 
 
 def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> Values:
-    """Return the outputs of an entry point by the torch model, (states, ...), for inputs (states, n)."""
+    """Return the torch model's outputs of an entry point by name, (states, ...), for inputs (states, n)."""
     entry = ENTRY_POINTS[name]
     arguments: list[Tensor] = []
     for key in entry.inputs:

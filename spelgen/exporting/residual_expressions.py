@@ -1,17 +1,17 @@
-"""Residual terms of a model as CasADi symbols.
+"""CasADi symbols that represent the residual terms of a model.
 
-Scalar expressions of a model contain residual terms as symbols, so that a program can compute them by loops over
-weights and lookup of splines. The symbols are, for R the part of M that the network of M adds to (m entries of its
-lower triangle), and k joints whose friction varies with q:
+The scalar expressions of a model contain the residual terms as symbols, so that exported code can compute these terms
+by loops over network weights and lookup of splines. R is the part of M that a network computes, with m nonzero entries
+in the lower triangle, and k is the number of joints whose friction varies with q. The symbols are:
 
-- ``mass`` (m, 1), entries of R; ``rate`` (m, 1), their time derivatives; ``kinetic`` (n, 1), d/dq of 1/2 qd^T R qd;
-- ``energy`` and ``gravity`` (n, 1), the network of V and its derivative with respect to q;
-- ``torque`` (n, 1) and ``torque_energy``, functions of single joints and their integral;
-- ``factor`` (k, 1), logarithms of the factors on friction.
+- ``mass`` (m, 1), entries of R; ``rate`` (m, 1), time derivatives of mass; ``kinetic`` (n, 1), d/dq of 1/2 qd^T R qd;
+- ``energy`` and ``gravity`` (n, 1), the network of V and the derivative of energy with respect to q;
+- ``torque`` (n, 1) and ``torque_energy``, the torques that are functions of single joints, and their potential energy;
+- ``factor`` (k, 1), logarithms of the factors that friction is multiplied by.
 
-Derivatives need ``first`` (m, n) and ``second`` (m, n n) instead of rate and kinetic: derivatives of mass with respect
-to q, second derivatives in blocks of n columns per joint. They also need ``stiffness`` (n, n), d gravity / dq, and the
-derivatives ``torque_slope`` and ``factor_slope`` with respect to the position of the joint.
+Derivatives of the dynamics depend on further symbols. ``first`` (m, n) and ``second`` (m, n n) replace rate and
+kinetic: first and second derivatives of mass with respect to q, the second in n columns per joint. ``stiffness`` (n, n)
+is d gravity / dq; ``torque_slope`` and ``factor_slope`` are derivatives with respect to the joint's own position.
 """
 
 from typing import TypeVar
@@ -26,17 +26,18 @@ Scalars = TypeVar("Scalars", ca.SX, ca.MX)
 
 
 def residual_symbols(model: TrainedModel) -> Symbols:
-    """Return the symbols by name; structural zeros for terms that the model does not have."""
+    """Return the symbols of the residual terms by name; terms that the model does not have are structural zeros."""
     n = model.n
     residuals = model.residuals
     entries, factors = len(residuals.entries), len(residuals.friction)
     has_potential = residuals.potential is not None
     sizes = {
         "mass": (entries, entries, 1),
-        # directional derivatives: a program computes them in one sweep, without the n columns of the symbol `first`
+        # Directional derivatives: exported code computes each in one sweep over the network; `first` would
+        # take n sweeps.
         "rate": (entries, entries, 1),
         "kinetic": (entries, n, 1),
-        # for derivatives of forces
+        # `first`, `second` and the slopes occur only in derivatives of the dynamics.
         "first": (entries, entries, n),
         "second": (entries, entries, n * n),
         "energy": (has_potential, 1, 1),
@@ -55,7 +56,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
 
 
 def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
-    """Return the symmetric matrix, (n, n), with values (m, 1) at the entries of R."""
+    """Return the symmetric matrix, (n, n), that has these values, (m, 1), at the nonzero entries of R."""
     matrix = ca.SX(model.n, model.n)
     for k, (row, column) in enumerate(model.residuals.entries):
         matrix[row, column] = matrix[column, row] = values[k]
@@ -63,7 +64,7 @@ def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
 
 
 def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: bool) -> ca.SX:
-    """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1); qd: (n, 1). derivatives: whether ``first`` replaces rate."""
+    """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1); derivatives: ``first`` replaces ``rate`` and ``kinetic``."""
     if not derivatives:
         return symmetric(model, symbols["rate"]) @ qd - symbols["kinetic"]
     kinetic = symbols["first"].T @ in_kinetic_energy(model, qd)
@@ -71,20 +72,20 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
 
 
 def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
-    """Return the factor of each entry of R in 1/2 qd^T R qd, (m, 1); qd: (n, 1)."""
+    """Return the coefficient of each entry of R in the energy 1/2 qd^T R qd, (m, 1); qd: (n, 1)."""
     products = []
     for row, column in model.residuals.entries:
-        # an off-diagonal entry occurs twice in R
+        # An off-diagonal entry occurs twice in R, so the factor 1/2 cancels.
         weight = 0.5 if row == column else 1.0
         products.append(weight * qd[row] * qd[column])
     return ca.vertcat(*products)
 
 
 def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
-    """Return the symbols that depend on q, (k, 1) each, with their derivatives with respect to q, (k, n)."""
-    # the friction factor of a joint depends on the position of this joint only
+    """Return pairs of a symbol that depends on q, as a column of any length, and the Jacobian with respect to q."""
+    # One row per friction factor, which depends on the position of its own joint only.
     joints = np.eye(model.n)[list(model.residuals.friction)]
-    # second is (m, n n): a block of n columns per joint of the first derivative
+    # `second` is (m, n n): each block of n columns is the Jacobian of one column of `first`.
     by_joint = ca.horzsplit(symbols["second"], model.n)
     jacobians = [
         (symbols["factor"], symbols["factor_slope"] * ca.SX(joints)),
@@ -93,5 +94,5 @@ def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX,
         (symbols["gravity"], symbols["stiffness"]),
         (symbols["torque"], ca.diag(symbols["torque_slope"])),
     ]
-    # without the terms that the model does not have
+    # Terms that the model does not have are structural zeros and are omitted.
     return [(symbol, jacobian) for symbol, jacobian in jacobians if symbol.nnz()]

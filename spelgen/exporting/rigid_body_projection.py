@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 
 class NearestFriction(NamedTuple):
-    """Viscous friction and Coulomb friction per direction, (n,) each; backward <= 0 <= forward.
+    """Viscous friction, and Coulomb friction per direction of motion, (n,) each; backward <= 0 <= forward.
 
-    error: root mean square of the difference to the friction of a model over positions and speeds, relative to the root
-    mean square of this friction.
+    error: root mean square difference between this friction and the model's friction over positions and speeds,
+    relative to the root mean square of the model's friction, (n,).
     """
 
     viscous: np.ndarray
@@ -41,18 +41,19 @@ class NearestFriction(NamedTuple):
 
     @property
     def coulomb(self) -> np.ndarray:
-        """Mean Coulomb friction of both directions, (n,): a URDF and MuJoCo have one number."""
+        """Mean Coulomb friction of both directions, (n,) [Nm, N], since a URDF and MuJoCo have one value per joint."""
         return np.asarray((self.forward - self.backward) / 2)
 
 
 @dataclass(frozen=True, eq=False)
 class RigidBodyProjection:
-    """An arm of n joints with the parameters that a URDF and its settings can have.
+    """Parameters of an arm of n joints in the form that a URDF and a settings file can contain.
 
-    inertias: (bodies, 10) inertial parameters in the frames of the joints, as in ``Body``. armature: (n,), of the
-    motors [kg m^2, kg]. motors: C, (n, n), motor velocities per joint velocities. inputs: G at zero, (n, n). exact:
-    whether the trained model has rigid bodies, which are used. mass_error, gravity_error: relative root mean square
-    differences of M and gravity torque to the trained model. bodies: model of the rigid bodies only, float64.
+    inertias: inertial parameters in the frames of the joints, (bodies, 10), as in ``Body``. armature: rotor inertia of
+    the motors, (n,) [kg m^2, kg]. motors: C, (n, n), motor velocities per joint velocities. inputs: G at q = 0, (n, n).
+    exact: whether the rigid bodies are the trained model's own, not the nearest ones. mass_error, gravity_error:
+    relative root mean square difference between the rigid bodies and the trained model, of M and of the gravity torque.
+    bodies: float64 model that consists of the rigid bodies only.
     """
 
     arm: Arm
@@ -69,7 +70,7 @@ class RigidBodyProjection:
 
     @property
     def summary(self) -> tuple[str, str]:
-        """Sentences on the differences of bodies and friction to the trained model."""
+        """Sentences about the differences between projection and trained model: rigid bodies and friction."""
         bodies = "bodies are those of the model"
         if not self.exact or self.mass_error or self.gravity_error:
             source = "the rigid bodies nearest to the model"
@@ -85,11 +86,11 @@ class RigidBodyProjection:
 
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
-    """Return the projection of a trained model of ``arm``."""
-    # a copy in double precision: the model of the user is not changed
+    """Return the rigid bodies and the friction that are nearest to a trained model of ``arm``."""
+    # A copy in double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
-    # rigid bodies of the model need no search; residual terms are omitted, and the summary states it
+    # If the model has rigid bodies they are used. Residual terms are omitted, as the summary states.
     exact = isinstance(model, RigidBodyDynamics)
     bodies: ArmModel = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
@@ -108,16 +109,17 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
 
 
 def sampled_positions(arm: Chain) -> Tensor:
-    """Return random positions in the joints' ranges, (positions, n), the same in each call."""
+    """Return random positions in the joints' ranges, (positions, n) [rad, m]; the seed is fixed."""
     return torch.from_numpy(random_inputs(arm.coordinates, TUNING.positions)["q"])
 
 
 def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
-    """Return the physically consistent bodies with the smallest errors of M and gravity torque at q (positions, n).
+    """Return the model of physically consistent rigid bodies that best fits M and gravity torque at q, (positions, n).
 
-    The cost is the mean of |W (M - M0) W^T|^2 / n + |g - g0|^2 / mean g0^2, with M0 and g0 of the model. W is the
-    inverse Cholesky factor of the mean of M0, so that joints of small inertia at the tip have the same weight as
-    joints at the base. A small ridge towards the URDF's bodies determines the parameters that M and g do not depend on.
+    The cost is the mean of |W (M - M0) W^T|^2 / n + |g - g0|^2 / mean g0^2, with M and g of the rigid bodies, M0 and g0
+    of the given model. W is the inverse Cholesky factor of the mean of M0, so that joints of small inertia at the tip
+    have the same weight as joints at the base. A small ridge towards the URDF's bodies determines the parameters that M
+    and g do not depend on.
     """
     bodies = build(arm, "closed-form")
     whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
@@ -126,10 +128,11 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
     load = gravity.square().mean().sqrt().clamp(min=1e-9)
 
     def distance() -> Tensor:
-        """Return the cost with its ridge, ()."""
+        """Return the sum of the cost and the ridge, ()."""
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
-        # parameters of zero are the URDF's bodies
+        # The bodies of the URDF have all parameters zero, so the ridge is a sum of squares of the
+        # parameters.
         weights = torch.cat([parameter.flatten() for parameter in bodies.parameters()])
         distance: Tensor = (mass_error.square().sum() / model.n + gravity_error.square().sum()) / len(q)
         return distance + 0.5 * TUNING.ridge * weights.square().sum()
@@ -139,20 +142,20 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
 
 
 def _relative_rms(values: Tensor, expected: Tensor) -> float:
-    """Return the root mean square of values - expected, (...,) each, relative to the expected root mean square."""
+    """Return the root mean square of values - expected, divided by the root mean square of expected, (...,) each."""
     size = expected.square().mean().sqrt().clamp(min=1e-12)
     return float((values - expected).square().mean().sqrt() / size)
 
 
 def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
-    """Return the viscous and Coulomb friction nearest to the friction of a model, by non-negative least squares.
+    """Return the viscous and Coulomb friction that best fit the friction of a model, by non-negative least squares.
 
     Args:
-        arm: with the velocity limits.
+        arm: arm with velocity limits.
         model: trained model.
-        q: (positions, n) [rad, m], of which every k-th is used.
+        q: positions, (positions, n) [rad, m], of which evenly spaced rows are used.
     """
-    # friction changes most at low speed: logarithmic steps
+    # Speeds have logarithmic steps, because friction changes most at low speed.
     fractions = np.geomspace(0.02, 1.0, TUNING.friction_speeds)
     fractions = np.concatenate([-fractions[::-1], fractions])
     speeds = np.outer(fractions, nominal_speeds(arm.coordinates))
@@ -162,12 +165,13 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
     torques = model.friction_torque(positions, qd).numpy()  # (positions, speeds, n)
     rows: list[tuple[float, float, float, float]] = []
     for joint, speed in enumerate(speeds.T):
-        # opposite to the motion: viscous and Coulomb friction are then not negative
+        # Torques are multiplied by the direction of motion, so that viscous and Coulomb friction are not
+        # negative.
         torque = torques[..., joint] * np.sign(speed)
         columns = np.stack([np.abs(speed), speed > 0, speed < 0], axis=-1)
         (viscous, forward, backward), _ = nnls(columns, torque.mean(axis=0))
         residual = torque - columns @ (viscous, forward, backward)
-        # a joint without friction has no residual
+        # A joint without friction has the error zero, not 0 / 0.
         error = np.linalg.norm(residual) / (np.linalg.norm(torque) or 1.0)
         rows.append((viscous, forward, -backward, float(error)))
     return NearestFriction(*np.array(rows).T)

@@ -1,8 +1,8 @@
 """Rigid bodies as CasADi expressions: torques by recursive Newton-Euler, M and V by the recursion of the structure.
 
-Bodies are expressed in the frames of their joints, whose z is the joint axis (Featherstone, Rigid Body Dynamics
-Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi omits structural
-zeros: of the geometry, and velocities of ``ca.SX(n, 1)``.
+Quantities of a body are expressed in its joint's frame, whose z is the joint axis (Featherstone, Rigid Body Dynamics
+Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi omits operations
+with structural zeros: zeros of the geometry, and all velocities if qd is ``ca.SX(n, 1)``.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ Wrench = tuple[ca.SX, ca.SX]
 
 
 def constant(values: object) -> ca.DM:
-    """Return numbers (rows, columns) as a CasADi matrix with structural zeros."""
+    """Return numbers, (rows, columns), as a CasADi matrix in which zeros are structural."""
     return ca.sparsify(ca.DM(np.array(values, dtype=float)))
 
 
 def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[Frame]:
-    """Return rotation (3, 3) and position (3, 1) of each body's frame in the frame of its parent, at q (n, 1)."""
+    """Return rotation, (3, 3), and position, (3, 1) [m], of each body's frame in the parent's frame, at q (n, 1)."""
     frames: list[Frame] = []
     for body in bodies:
         rotation = ca.SX(constant(body.rotation))
@@ -45,24 +45,26 @@ def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[Frame]:
 
 
 class RigidBodies:
-    """The bodies of an arm at q, (n, 1).
+    """The rigid bodies of an arm at a position q, (n, 1).
 
-    inertias: (bodies, 10) numbers, or a symbol (10, 1) of each body; structural zeros take no operations.
+    inertias: inertial parameters as numbers, (bodies, 10), or as a CasADi vector (10, 1) per body; structural zeros in
+    a vector cause no operations.
     """
 
     def __init__(self, arm: Chain, q: ca.SX, inertias: Sequence[ca.SX] | np.ndarray) -> None:
-        # frames are shared by torque and momentum, so that their sines are computed once
+        # `torque` and `momentum` use the same frames, so that sines and cosines are computed once.
         self.arm, self.bodies, self.frames = arm, arm.bodies, body_frames(arm.bodies, q)
         self.inertias: list[tuple[ca.SX, ca.SX, ca.SX]] = []
         for ten in map(ca.sparsify, map(ca.SX, inertias)):
-            # xx, xy, xz, yy, yz, zz follow mass and first moment
+            # The ten parameters are mass, first moment (3), and the tensor's xx, xy, xz, yy, yz, zz.
             tensor = ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)
             self.inertias.append((ten[0], ten[1:4], tensor))
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
-        """Return the torques of the bodies, without armature, (n, 1) [Nm, N]; structural zeros of qd are omitted."""
-        # angular velocity, angular acceleration, acceleration and spin of the base, then of the bodies, in their
-        # frames; instead of gravity the base accelerates upwards
+        """Return M qdd + h of the bodies without armature, (n, 1) [Nm, N]; zeros of qd cause no operations."""
+        # The motion of the base and then of each body, in its own frame: angular velocity, angular
+        # acceleration, acceleration of the origin, and spin. Gravity is replaced by an upward acceleration of
+        # the base.
         gravity = np.array(self.arm.gravity, dtype=float)
         motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
         wrenches: list[Wrench] = []
@@ -70,7 +72,8 @@ class RigidBodies:
             w, rate, acceleration, spin = motions[body.parent + 1]
             ratio = float(body.multiplier)
             speed, added = ratio * qd[body.coordinate], ratio * qdd[body.coordinate]
-            # Everything is in the frame of the body: constants of the body need no rotation.
+            # Quantities are rotated into the frame of the body, in which first moment and tensor are
+            # constant.
             acceleration = rotation.T @ (acceleration + spin @ position)
             w, rate = rotation.T @ w, rotation.T @ rate
             turning = ca.cross(w, _Z) * speed
@@ -78,28 +81,30 @@ class RigidBodies:
                 w = w + _Z * speed
                 rate = rate + _Z * added + turning
             else:
-                # Coriolis acceleration: 2 w x v
+                # The Coriolis acceleration is 2 w x v.
                 acceleration = acceleration + _Z * added + 2 * turning
-            # spin p is the acceleration of point p relative to the origin
+            # With this matrix, spin @ p is the acceleration of a point p of the body relative to the origin.
             spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
             motions.append((w, rate, acceleration, spin))
-            # Newton, then Euler about the frame's origin
+            # Newton's equation gives the force, Euler's about the origin of the frame the torque.
             force = mass * acceleration + spin @ moment
             torque = ca.cross(moment, acceleration) + inertia @ rate
             wrenches.append((force, torque + ca.cross(w, inertia @ w)))
         self._carry(wrenches)
         torques = ca.SX(len(self.arm.coordinates), 1)
         for body, wrench in reversed(list(zip(self.bodies, wrenches, strict=True))):
-            # mimic joints share the coordinate of their leader
+            # A mimic joint has the coordinate of its leader, so its torque is added there, times its multiplier.
             torques[body.coordinate] += float(body.multiplier) * _along(body, wrench)
         return torques
 
     def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return M qd and d/dq of the kinetic energy, without armature, (n, 1) each.
+        """Return the momentum M qd and d/dq of the kinetic energy, both without armature, (n, 1) each.
 
-        The momentum of the bodies that a joint carries is projected onto its axis S, and onto dS/dt = twist x S.
+        The momentum of all bodies that a joint carries is projected onto the joint axis S for M qd, and onto dS/dt =
+        twist x S for the gradient.
         """
-        # angular velocity, and velocity of the origin, of the base, then of the bodies, in their frames
+        # The twist of the base and then of each body, in its own frame: angular velocity, and velocity of the
+        # origin.
         twists = [(ca.SX(3, 1), ca.SX(3, 1))]
         momenta: list[Wrench] = []
         for body, (mass, moment, inertia), (rotation, position) in self._rows():
@@ -121,11 +126,11 @@ class RigidBodies:
         return momentum, gradient
 
     def _rows(self) -> zip[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
-        """Return each body with mass, first moment (3, 1) and tensor (3, 3), and its frame; parents come first."""
+        """Return rows, parents first: body, its mass, first moment (3, 1) and tensor (3, 3), and its frame."""
         return zip(self.bodies, self.inertias, self.frames, strict=True)
 
     def _carry(self, wrenches: list[Wrench]) -> None:
-        """Add to the wrench of each body the wrenches of all bodies that it carries."""
+        """Add to the wrench of each body the wrenches of all bodies that it carries, in place."""
         for index in reversed(range(len(wrenches))):
             parent = self.bodies[index].parent
             if parent >= 0:
@@ -137,31 +142,32 @@ class RigidBodies:
 
 
 def _along(body: Body, wrench: Wrench) -> ca.SX:
-    """Return the component of a wrench along or about the axis of the body's joint, (1, 1)."""
+    """Return the force along a prismatic joint's axis, or the torque about a revolute joint's axis, (1, 1)."""
     return wrench[1][2] if body.joint_type == "revolute" else wrench[0][2]
 
 
 def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q (n, 1), by the recursion of `structure`."""
+    """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q, (n, 1); see ``structure`` for the recursion."""
     positions = []
     for joint, base in enumerate(base_denominators(model.arm)):
-        # Angles of mimic joints are integer multiples of the base angle.
+        # Angles of mimic joints are integer multiples of the leader's angle divided by `base`.
         angle = q[joint] / base
         positions.append(Position(ca.cos(angle), ca.sin(angle), q[joint]))
     result = energies(model.arm, positions, model.inertias.tolist(), float)
     mass = ca.SX(model.n, model.n)
     for (row, column), entry in result.mass.items():
-        # the same expression in both triangles: CasADi computes it once
+        # Both triangles have the same expression, which CasADi computes once.
         mass[row, column] = mass[column, row] = entry
     return mass, ca.SX(result.potential)
 
 
 def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return pose (4, 4) and Jacobian (6, n), linear then angular, of a frame in the root frame, at q (n, 1).
+    """Return pose (4, 4) and Jacobian (6, n), linear then angular, of a frame relative to the root frame, at q (n, 1).
 
-    carrier: index of the body that carries the frame; -1: the root link. pose: (4, 4), in the frame of this body.
+    carrier: index of the body that carries the frame; -1: the root link. pose: pose in the frame of this body, (4, 4).
     """
-    # poses of the root link, then of all bodies: poses of bodies that do not carry the frame vanish from the function
+    # The list has poses of the root link and of all bodies. CasADi drops poses that the result does not
+    # depend on.
     poses = [ca.SX.eye(4)]
     for body, frame in zip(bodies, body_frames(bodies, q), strict=True):
         poses.append(poses[body.parent + 1] @ ca.vertcat(ca.horzcat(*frame), constant([[0, 0, 0, 1]])))
@@ -169,7 +175,7 @@ def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: 
     jacobian = ca.SX(6, q.shape[0])
     while carrier >= 0:
         body = bodies[carrier]
-        # the axis is z of the body's frame
+        # The joint axis is the z axis of the body's frame.
         axis, origin = poses[carrier + 1][:3, 2], poses[carrier + 1][:3, 3]
         column = ca.vertcat(axis, ca.SX(3, 1))
         if body.joint_type == "revolute":
@@ -180,7 +186,7 @@ def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: 
 
 
 def _rotation_about_z(angle: ca.SX) -> ca.SX:
-    """Return the rotation about z, (3, 3), by an angle (1, 1)."""
+    """Return the matrix of the rotation about z, (3, 3), by an angle, (1, 1) [rad]."""
     c, s = ca.cos(angle), ca.sin(angle)
     rotation = ca.SX(3, 3)
     rotation[0, 0] = rotation[1, 1] = c

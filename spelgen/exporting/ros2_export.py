@@ -37,9 +37,9 @@ _CONTROLLER_PATHS = {
 
 
 def export_ros2(trained: Trained) -> Exported:
-    """Return the package. Raises RunError if its C differs from the model."""
+    """Return the colcon package. Raises RunError if results of the C code differ from the model's."""
     model, missing = trained.described, _missing_part(trained)
-    # the plugin of inverse dynamics is always part of the package
+    # The inverse_dynamics_solver plugin is part of each package; controller and estimator are optional.
     controller, estimator = missing is None or missing[0] != "controller", missing is None
     entries = (*_CALLED, "tip_pose") if estimator else _CALLED
     levels = trained.levels if estimator else None
@@ -65,23 +65,23 @@ def export_ros2(trained: Trained) -> Exported:
 
 
 def _missing_part(trained: Trained) -> tuple[str, str] | None:
-    """Return the part that the package does not contain, controller or estimator, and the reason; None: none.
+    """Return "controller" or "estimator" and the reason why the package has no such part; None if it has both.
 
-    A package without controller has no estimator either.
+    The estimator is part of the controller, so a package without a controller has neither.
     """
     model = trained.described
     if model.servos is not None or not model.actuated.all():
         return "controller", "it needs an effort interface of every joint"
     if trained.levels is None:
         return "estimator", "its noise levels are found from the training logs of a fit"
-    # its payload is in the frame of the last body, the published one in the frame of the tip link
+    # The estimator's payload is in the frame of the last body, but published in the frame of the tip link.
     if model.tip.carrier != len(model.arm.bodies) - 1:
         return "estimator", "the tip link is not part of the last body"
     return None
 
 
 def _use(package: str, name: str, *, controller: bool) -> str:
-    """Return the line of the README that describes the use of the package."""
+    """Return the line of the README about the use of the package."""
     use = (
         f"Put this folder into a workspace and run colcon build --packages-select {package}. "
         f"{package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver."
@@ -97,22 +97,23 @@ def _use(package: str, name: str, *, controller: bool) -> str:
 
 
 def _controller_numbers(trained: Trained) -> dict[str, object]:
-    """Return names, limits and the tip's pose as text of C++ and YAML. An absent effort limit is 0 and must be set."""
+    """Return names, limits and the pose of the tip as C++ and YAML text; a missing effort limit is 0."""
     model, coordinates = trained.described, trained.arm.chain.coordinates
     revolute = np.array([joint.joint_type == "revolute" for joint in coordinates])
     continuous = [str(joint.continuous).lower() for joint in coordinates]
     rotation = (f"{{{_listed(row)}}}" for row in model.tip.pose[:3, :3])
     return {
         "joint_names": ", ".join(map(cpp_string, trained.joint_names)),
-        # a JSON text is YAML
+        # A JSON string is also a valid YAML string.
         "yaml_joints": ", ".join(map(json.dumps, trained.joint_names)),
         "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in trained.joint_names),
-        # 0 for an unknown limit: the user must set it
+        # An unknown effort limit is 0, and the user must set a limit.
         "efforts": _listed(joint.effort or 0.0 for joint in coordinates),
         "velocities": _listed(_velocity_limit(joint.velocity) for joint in coordinates),
-        # [rad, m] computed torque stops above it
+        # [rad, m] position error above which computed torque control stops
         "position_errors": _listed(np.where(revolute, 0.2, 0.05)),
-        # [rad, m] travel by the measured velocity after which an unchanged position is a fault
+        # [rad, m] If the integral of the measured velocity exceeds this at constant measured position, the
+        # sensor is faulty.
         "frozen_travel": _listed(np.where(revolute, 1e-2, 1e-3)),
         "continuous": ", ".join(continuous),
         "tip_link": cpp_string(model.tip.link),
@@ -123,21 +124,22 @@ def _controller_numbers(trained: Trained) -> dict[str, object]:
 
 
 def _velocity_limit(velocity: float | None) -> float:
-    """Return the velocity above which a joint is damped; references at the URDF's limit overshoot it a little."""
+    """Return the velocity above which a joint is damped: 20 % above the URDF's limit, since tracking overshoots."""
     largest = UNLIMITED["velocity"]
     return largest if velocity is None else min(float(f"{1.2 * velocity:.4g}"), largest)
 
 
 def _listed(numbers: Iterable[float] | np.ndarray) -> str:
-    """Return numbers, separated by commas, that read back exactly."""
+    """Return numbers as text, separated by commas, without rounding."""
     return ", ".join(repr(float(number)) for number in numbers)
 
 
 def cpp_string(text: str) -> str:
-    """Return a C++ literal of a text from a file; all bytes except plain letters, digits and ``_-/`` are escaped."""
+    """Return a C++ string literal of an untrusted text; all bytes except ASCII letters, digits and _-/ are escaped."""
     characters: list[str] = []
     for character in text:
         plain = character.isascii() and (character.isalnum() or character in "_-/")
-        # an octal escape has at most three digits, so that a digit may follow
+        # Escapes are octal, since an octal escape ends after three digits; a hexadecimal one would include a
+        # next digit.
         characters.append(character if plain else "".join(f"\\{byte:03o}" for byte in character.encode()))
     return f'"{"".join(characters)}"'

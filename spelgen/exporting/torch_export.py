@@ -1,4 +1,4 @@
-"""--to torch: programs of torch.export, which need only torch, and the trained parameters as safetensors."""
+"""--to torch: programs of torch.export, which run with torch only, and the trained parameters as safetensors."""
 
 import io
 import warnings
@@ -28,20 +28,20 @@ PROGRAMS: dict[str, Callable[..., Tensor]] = {
     "tip_pose": PreparedModel.pose,
     "tip_jacobian": PreparedModel.jacobian,
 }
-"""The entry points with a program, and the methods that compute them."""
+"""The entry points that are exported as programs, and the methods that compute them."""
 FRICTION_STATE = ("friction_step", "friction_memory")
 """The entry points of models with a friction state."""
 
 
 def export_torch(trained: Trained) -> Exported:
-    """Return a .pt2 file per entry point and model.safetensors. Raises RunError if a program differs from the model."""
+    """Return a .pt2 file per entry point and model.safetensors. Raises RunError if results differ from the model's."""
     model = trained.prepared()
     programs, files = {}, {}
     for name in program_names(trained):
         programs[name] = files[f"{name}.pt2"] = _saved(export_program(model, name))
     parity = check_programs(_called_by_torch(programs, model), trained, list(programs), TUNING.tolerance)
     checked = f"Checked when exported, by torch {torch.__version__}: {parity.summary}"
-    # clones, since safetensors refuses shared memory
+    # Tensors are cloned, since safetensors refuses tensors that share memory.
     parameters = {key: x.cpu().contiguous().clone() for key, x in trained.model.state_dict().items()}
     shapes = f"{number_type(model)} (batch, n), any batch"
     if model.elements:
@@ -63,30 +63,30 @@ def program_names(trained: Trained) -> list[str]:
 
 
 def check_programs(called: Called, trained: Trained, names: Sequence[str], tolerance: float) -> Parity:
-    """Compare programs with the torch model; programs in float32 have their own tolerance. Raises RunError."""
+    """Compare programs with the torch model, with a larger tolerance in float32. Raises RunError for differences."""
     if trained.float32:
         return check_parity(called, trained, names, TUNING.float32_tolerance, dtype=np.float32)
     return check_parity(called, trained, names, tolerance)
 
 
 def number_type(model: PreparedModel) -> str:
-    """Return float32 or float64."""
+    """Return the name of the model's number type: ``float32`` or ``float64``."""
     return str(model.dtype).removeprefix("torch.")
 
 
 def calls(model: PreparedModel, names: Sequence[str], zeros: str, no_state: str) -> list[str]:
-    """Return lines of Python that call ``run`` for all programs, friction_memory first and friction_step last.
+    """Return lines of Python for the README that call each program: friction_memory first, friction_step last.
 
     Args:
-        model: of the programs.
-        names: of the programs.
-        zeros: expression for q, (5, n).
-        no_state: expression for z without friction_memory.
+        model: model that was exported.
+        names: names of the programs.
+        zeros: Python expression for an array of zeros, (5, n).
+        no_state: Python expression for z, if the program friction_memory is not exported.
     """
     lines = [f"q = qd = qdd = tau = dq = {zeros}  # a batch of 5; dq: change of q since the last step"]
     if model.elements and "friction_memory" not in names:
         lines.append(f"z = {no_state}")
-    # the order of a control loop: z is initialised before, and updated after the other calls
+    # In a control loop, z is initialised before all other calls and updated after them.
     for name in sorted(names, key=lambda name: (name == "friction_step") - (name == "friction_memory")):
         output = {"friction_memory": "z", "friction_step": "z"}.get(name, program_output(name))
         inputs = ", ".join(f"{key}={key}" for key in program_inputs(model, name))
@@ -95,17 +95,17 @@ def calls(model: PreparedModel, names: Sequence[str], zeros: str, no_state: str)
 
 
 def _saved(program: torch.export.ExportedProgram) -> bytes:
-    """Return the content of a .pt2 file."""
+    """Return the content of the .pt2 file of a program."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about shared memory of tensors, which are constants
+        warnings.simplefilter("ignore")  # shared memory, harmless for constants
         torch.export.save(program, buffer)
     return buffer.getvalue()
 
 
 def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
-    """Return a function that calls the programs of files."""
-    # the saved content is checked, not the program in memory
+    """Return a function that loads the programs from files and evaluates one by name, for arrays of states."""
+    # The parity check runs the saved files, not the programs in memory.
     programs = {name: torch.export.load(io.BytesIO(content)).module() for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:
@@ -120,7 +120,7 @@ def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
 
 
 class _Program(nn.Module):
-    """An entry point with the inputs of its program."""
+    """A module whose forward method is one entry point, for torch.export."""
 
     def __init__(self, model: PreparedModel, name: str, flat_state: bool) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class _Program(nn.Module):
         self._names = program_inputs(model, name)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Return the output, (batch, ...), for inputs (batch, n) and z (batch, n, K) or (batch, n K)."""
+        """Return the entry point's output, (batch, ...), for inputs (batch, n) and z (batch, n, K) or (batch, n K)."""
         states = dict(zip(self._names, inputs, strict=True))
         if "z" in states:
             states["z"] = states["z"].reshape(-1, self._model.n, self._model.elements)
@@ -139,21 +139,22 @@ class _Program(nn.Module):
 def export_program(
     model: PreparedModel, name: str, *, flat_state: bool = False
 ) -> torch.export.ExportedProgram:
-    """Return the program of an entry point, with inputs (batch, n).
+    """Return the program of an entry point, with inputs (batch, n) for any batch size.
 
     The friction state z is (batch, n, K), or (batch, n K) if ``flat_state``.
     """
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(program_inputs(model, name), (model.n,))
     if "z" in shapes:
         shapes["z"] = (model.n * model.elements,) if flat_state else (model.n, model.elements)
-    # a batch of two: torch.export treats one as a constant; 0.1: zero may be a kink of friction
+    # The example has a batch of two, since torch.export makes a batch size of one a constant. Inputs are 0.1,
+    # since friction may not be differentiable at zero.
     inputs = tuple(torch.full((2, *shape), 0.1, dtype=model.dtype) for shape in shapes.values())
     batch = tuple({0: torch.export.Dim("batch")} for _ in inputs)
     return torch.export.export(_Program(model, name, flat_state), inputs, dynamic_shapes=(batch,))
 
 
 def program_inputs(model: PreparedModel, name: str) -> tuple[str, ...]:
-    """Return the names of the inputs of an entry point, with z only if the model has a friction state."""
+    """Return the names of an entry point's inputs, without z if the model has no friction state."""
     inputs = ENTRY_POINTS[name].inputs
     return inputs if model.elements else tuple(key for key in inputs if key != "z")
 

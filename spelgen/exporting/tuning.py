@@ -5,38 +5,44 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ExportTuning:
-    """Parity checks of exports, and the projection onto the nearest rigid bodies."""
+    """Constants of parity checks, of the projection onto the nearest rigid bodies, and of MJCF files."""
 
-    # [1] Random states of a parity check.
+    # [1] Number of random states of a parity check.
     states: int = 200
-    # [rad/s] Speed of a revolute joint without a velocity limit in these states.
+    # [rad/s] Nominal speed of a revolute joint whose URDF has no velocity limit, for the states of parity
+    # checks.
     angular_speed: float = 1.0
-    # [m/s] Speed of a prismatic joint without a velocity limit.
+    # [m/s] Nominal speed of a prismatic joint whose URDF has no velocity limit.
     linear_speed: float = 0.3
-    # [1] Largest difference of C, CasADi and torch programs, relative to the largest value; `benchmarks/deploy.py`
-    # measures 4e-14.
+    # [1] Largest allowed difference between C, CasADi and torch programs and the model, relative to the
+    # largest value; `benchmarks/deploy.py` measures 4e-14.
     tolerance: float = 1e-12
-    # [1] Largest relative difference of ONNX programs; larger because M may be ill-conditioned.
+    # [1] Largest allowed relative difference of ONNX programs; larger than `tolerance`, because M may be
+    # ill-conditioned.
     onnx_tolerance: float = 1e-10
-    # [1] Largest relative difference of float32 programs, whose eliminations lose digits if M is ill-conditioned.
+    # [1] Largest allowed relative difference of float32 programs; solving with an ill-conditioned M loses
+    # digits.
     float32_tolerance: float = 1e-3
-    # [1] Largest relative difference of MuJoCo; `benchmarks/deploy.py` measures 9e-15.
+    # [1] Largest allowed relative difference of MuJoCo's dynamics; `benchmarks/deploy.py` measures 9e-15.
     mujoco_tolerance: float = 1e-9
-    # [1] Random positions at which a model and the nearest rigid bodies are compared.
+    # [1] Number of random positions at which the nearest rigid bodies are fitted to a model.
     positions: int = 512
-    # [1] Steps of the optimizer towards the nearest rigid bodies.
+    # [1] Number of optimizer steps of the fit of the nearest rigid bodies.
     steps: int = 400
-    # [1] Weight of the difference to the URDF's parameters in directions that M and gravity do not determine.
+    # [1] Weight of the penalty on the distance from the URDF's parameters, which fixes parameters that M and
+    # gravity do not determine.
     ridge: float = 1e-8
-    # [1] Number of these positions at which viscous and Coulomb friction are projected.
+    # [1] Number of the random positions at which viscous and Coulomb friction are fitted.
     friction_positions: int = 32
-    # [1] MuJoCo's solimpfriction at its stiffest: with the default a loaded joint creeps at rest.
+    # [1] MuJoCo's solimpfriction: the stiffest values, since a loaded joint at rest creeps with the default.
     friction_impedance: tuple[float, ...] = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-    # [1] Speeds in each direction, from 2 % to 100 % of a joint's nominal speed.
+    # [1] Number of speeds per direction, from 2 % to 100 % of a joint's nominal speed, at which friction is
+    # fitted.
     friction_speeds: int = 25
-    # [1] Triangles of all meshes of an MJCF together.
+    # [1] Maximum total number of triangles in all meshes of an MJCF.
     faces: int = 20_000
-    # [1] Thickness of a mesh, relative to its size, below which MuJoCo refuses it.
+    # [1] A mesh whose thickness divided by its length is at most this number is omitted, since MuJoCo refuses
+    # flat meshes.
     flat: float = 1e-5
 
 

@@ -33,7 +33,7 @@ _SERVO = (
 
 
 def export_urdf(trained: Trained) -> Exported:
-    """Return the URDF, the settings, and the friction of a trained model."""
+    """Return three files of a trained model: the URDF, the settings, and the friction model."""
     projection = rigid_body_projection(trained.model, trained.arm)
     use = (
         "The .urdf contains inertials, viscous and Coulomb friction, which simulators ignore; the .yaml beside it, "
@@ -49,14 +49,14 @@ def export_urdf(trained: Trained) -> Exported:
 
 
 def _urdf_text(projection: RigidBodyProjection) -> bytes:
-    """Return the arm's URDF with the inertials and friction of a projection.
+    """Return the content of the arm's URDF, with the inertials and friction of a projection.
 
-    The link of a moving joint gets the inertia of its body; links that are fixed to it by fixed or locked joints lose
-    their <inertial>.
+    A body is a rigid group of links. The link that a moving joint carries gets the inertial of its whole body; the
+    <inertial> of other links of the group is removed.
     """
     robot = projection.arm.robot
     arm = projection.arm.chain
-    # the URDF is untrusted
+    # The URDF is untrusted, so the parser loads no entities and no files from the network.
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     root = etree.fromstring(urdf_bytes(robot.path), parser)
     links = {element.get("name"): element for element in root.findall("link")}
@@ -67,13 +67,13 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
         for link in body.links:
             _remove(links[link.name], "inertial")
         name = body.joint.child
-        # from the body frame, whose z is the joint axis, to the link frame
+        # The z axis of a body's frame is the joint axis; this rotation maps the body frame to the link frame.
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
         _set_inertial(links[name], inertia, rotation)
     friction = projection.friction
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
-        # the file has one <dynamics> per joint: readers use the first or the last
+        # Existing <dynamics> are removed: with two of them, some tools read the first and some the last.
         _remove(element, "dynamics")
         values = {"damping": _number(friction.viscous[index]), "friction": _number(friction.coulomb[index])}
         etree.SubElement(element, "dynamics", values)
@@ -81,16 +81,17 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
 
 
 def _settings_text(projection: RigidBodyProjection) -> str:
-    """Return the settings of the arm with the armature and friction of a projection."""
+    """Return the arm's settings as YAML, with the armature and friction of a projection."""
     path = projection.arm.robot.path.with_suffix(".yaml")
     content: dict[str, dict[str, dict[str, object]]] = {}
-    # other settings of the user are kept
+    # All other settings in the user's file are kept.
     if path.exists():
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
     friction = projection.friction
     for index, coordinate in enumerate(projection.arm.chain.coordinates):
-        # settings have the inertia at the rotor, the model has the inertia at the joint
+        # The settings specify the inertia at the rotor; the model has the inertia at the joint, gear^2 times
+        # as large.
         gear = projection.arm.settings.joint(coordinate.name).gear
         joint = joints.setdefault(coordinate.name, {})
         joint["rotor_inertia"] = _plain(projection.armature[index] / gear**2)
@@ -106,9 +107,9 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
     coulomb = np.stack([projection.friction.forward, projection.friction.backward], axis=1)
-    # by section and name: arrays (n,) or (n, K)
+    # Each section has arrays by name, (n,) or (n, K).
     sections = {"viscous_coulomb": {"viscous": projection.friction.viscous, "coulomb": coulomb}}
-    # friction networks have no constants
+    # Only rigid-body models have a friction model with constants; others have friction networks.
     if projection.exact:
         content["law"] = _LAW
         sections["law"] = _law_constants(trained, projection)
@@ -127,11 +128,11 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
 
 
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
-    """Return the constants of the friction model by name, (n,) or (n, K) each."""
+    """Return the constants of the friction model by name, (n,) or (n, K) each, in SI units."""
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
-    # a factor of one at all positions is not stated
+    # The factor is omitted from the file if it is one at all positions.
     if (factor != 1).any():
         constants["position_factor"] = np.stack([factor.min(axis=0), factor.max(axis=0)], axis=-1)
     return constants
@@ -147,9 +148,9 @@ def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarra
     """Replace the <inertial> of a link.
 
     Args:
-        link: of the URDF.
-        inertia: (10,), in the body frame.
-        rotation: (3, 3), from the body frame to the link frame.
+        link: <link> element of the URDF.
+        inertia: inertial parameters in the body frame, (10,).
+        rotation: rotation from the body frame to the link frame, (3, 3).
     """
     _remove(link, "inertial")
     mass, center, tensor = about_center(inertia)
@@ -161,7 +162,7 @@ def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarra
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     moments = list(map(_number, tensor[np.triu_indices(3)]))
     etree.SubElement(inertial, "inertia", dict(zip(names, moments, strict=True)))
-    # as the first child, as in most URDFs
+    # The <inertial> is inserted as the first child, as in most URDFs.
     link.insert(0, inertial)
 
 

@@ -1,4 +1,4 @@
-"""The request of a fit, and its data: logs checked, split, filtered and cut into windows; validation on the windows."""
+"""Arguments of a fit, preparation of the logs (checks, split, filter, windows), and the loss on validation windows."""
 
 import hashlib
 import math
@@ -26,10 +26,11 @@ from spelgen.settings.log_mapping import LogMapping
 class RunOptions:
     """How a fit runs.
 
-    device, threads: of torch. resume: continue from the folder's checkpoint, exactly as if there had been no
-    interruption. force: replace a run. progress: show it on stderr. mapping: with which the logs were read, kept with
-    the run. notes: earlier diagnostics, reported with the others. began: start of the allowed time (`time.monotonic`);
-    None: now.
+    device: torch device. threads: number of threads of torch. resume: continue from the checkpoint of the run folder;
+    the result is the same as without an interruption. force: replace a run in the folder. progress: show the progress
+    on stderr. mapping: names and units of the columns of the logs; the run folder gets a copy. notes: diagnostics of
+    steps before the fit, reported with the diagnostics of the fit. began: start of the allowed time
+    (`time.monotonic`) [s]; None: now.
     """
 
     device: str = "cpu"
@@ -46,8 +47,9 @@ class RunOptions:
 class FitRequest:
     """The arguments of a fit.
 
-    validation: the fraction of the logs that is set aside, or trajectories. urdf: of the robot, None if unknown.
-    began: start of the allowed time (`time.monotonic`). folder: of the run, None without one.
+    validation: fraction of the logs that is set aside for validation, or the validation trajectories. urdf: URDF file
+    of the robot, None if unknown. began: start of the allowed time (`time.monotonic`) [s]. folder: run folder, None if
+    the fit writes no files.
     """
 
     model: ArmModel
@@ -63,17 +65,18 @@ class FitRequest:
 
     @property
     def recordings(self) -> list[Trajectory]:
-        """All logs, validation included."""
+        """All trajectories, for training and validation."""
         return [*self.logs, *(() if isinstance(self.validation, float) else self.validation)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PreparedLogs:
-    """Logs that were checked, and the facts of them that a run folder records.
+    """Facts about the checked logs, which the run folder records.
 
-    preprocessing: the resolved one. digest: of all numbers, so that a fit resumes on the same data only.
-    training_names, validation_names: of the logs. window_counts: for training and validation. diagnostics: for the
-    user. scales: of the validation loss; None without one.
+    preprocessing: filter, gaps and delay, with all automatic values resolved. digest: SHA-256 of all numbers of the
+    logs; a fit resumes only on logs with the same digest. training_names, validation_names: names of the trajectories.
+    window_counts: number of training windows and of validation windows. diagnostics: messages about the logs for the
+    user. scales: units of the errors in the validation loss; None if the objective has no validation loss.
     """
 
     preprocessing: Preprocessing
@@ -87,7 +90,7 @@ class PreparedLogs:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingData(PreparedLogs):
-    """Windows of the logs for training and validation; recordings: all trajectories, with validation."""
+    """Windows of the logs for training and validation; recordings: all trajectories, for training and validation."""
 
     training: Windows
     validation: Windows
@@ -99,9 +102,9 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
     """Check the logs, split them and cut windows. Raises LogError.
 
     Args:
-        request: of the fit.
-        window: samples of a window.
-        stride: samples between the starts of two windows.
+        request: arguments of the fit; the model, the logs and their preprocessing are used.
+        window: number of samples per window.
+        stride: number of samples between the starts of successive windows.
     """
     if not request.logs:
         raise LogError("no logs", expected="a trajectory or more")
@@ -117,22 +120,22 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
         require_joints(trajectory, model.joint_names)
     require_torques(recordings)
     notes = check(recordings, model.joint_names, model.joint_types)
-    # Resolved once for all logs: training and validation need the same filter.
+    # The preprocessing is resolved once for all logs, so that training and validation have the same filter.
     resolved = request.preprocessing.resolved([x.sample_rate for x in recordings])
     decimation, reach = resolved.decimation or 1, bristle_reach(model)
 
     def windows(trajectories: Sequence[Trajectory]) -> Windows:
-        """Return all windows (W, K, n) of the filtered pieces between gaps."""
+        """Return W windows of K samples, from the filtered segments between gaps in the sample times."""
         pieces = resolved.pieces(trajectories, shortest=(window - 1) * decimation + 1)
         return cut_windows(pieces, window, stride, decimation, measured=resolved.filtered, reach=reach)
 
     training = windows(split.training)
-    # A bounded number of windows: validation follows every epoch.
+    # The number of validation windows is bounded, since every epoch ends with a validation.
     validation = thinned(windows(split.validation), TUNING.validation_windows)
     return TrainingData(
         training=training,
         validation=validation,
-        # of training windows only: validation logs must not change the loss
+        # scales of the training windows only: validation logs must not change the loss function
         scales=loss_scales(training, model.joint_types),
         preprocessing=resolved,
         training_names=[x.name for x in split.training],
@@ -150,16 +153,18 @@ def digest(trajectories: Iterable[Trajectory]) -> str:
     for x in trajectories:
         for array in (x.t, x.q, x.qd, x.tau, x.u):
             if array is not None:
-                # The bytes of the arrays, without a copy of contiguous ones.
+                # `.data` gives access to the bytes of an array without a copy, if the array is contiguous.
                 numbers.update(np.ascontiguousarray(array).data)
     return numbers.hexdigest()
 
 
 class Validation:
-    """Validation windows, and a probe of the training windows for the integrator's steps.
+    """Validation loss of a model, and the number of integration steps that the model needs.
 
-    substeps: steps of rk4 between samples; None: chosen for the model. batch: of training; validation predicts four
-    times as many windows together.
+    The number of integration steps is chosen on a few training windows, `probe`.
+
+    substeps: rk4 steps per sample interval; None: chosen for the model. batch: number of windows per training batch;
+    a validation batch has four times as many windows.
     """
 
     def __init__(
@@ -176,28 +181,28 @@ class Validation:
         self.solver, self.prescribed = solver, substeps
         self.size = len(data.validation)
         self.scales = data.scales.to(device)
-        # Larger batches than in training: no graph of derivatives is in memory.
+        # Validation needs less memory per window than training, since no derivatives are computed.
         self.batches = data.validation.to(device).split(4 * batch)
-        # Evenly spread windows, so that fast and slow parts of the motion are in the probe.
+        # The windows are evenly spread, so that the probe contains fast and slow motion.
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)
 
     def loss(self, substeps: int) -> float:
-        """Return `rollout_loss` of the validation windows; infinite if they diverge."""
+        """Return the `rollout_loss` of the validation windows [1]; infinite if a rollout diverges."""
         total = 0.0
         try:
             with torch.no_grad():
                 for windows in self.batches:
                     loss = rollout_loss(self.model, windows, self.scales, substeps, self.solver)
-                    # Weighted by size: the last batch may be smaller.
+                    # Batches are weighted by their number of windows: the last batch may be smaller.
                     total += loss.item() * len(windows)
         except torch.linalg.LinAlgError:
             return math.inf
         return total / self.size
 
     def substeps(self, present: int | None = None) -> int:
-        """Return the number of integration steps per sample interval: as prescribed, or chosen for the model.
+        """Return the number of integration steps per sample interval: the prescribed number, or a chosen one.
 
-        present: lower bound of the chosen number.
+        The number is chosen by `choose_substeps`; present: lower bound of the choice.
         """
         if self.solver != "rk4":
             return 1
@@ -206,6 +211,6 @@ class Validation:
         return choose_substeps(self.model, self.probe, self.scales, start=present or 1)
 
     def measure(self) -> tuple[int, float]:
-        """Return the integration steps that the model needs between samples, and its validation loss."""
+        """Return the number of integration steps per sample interval, and the validation loss with these steps."""
         substeps = self.substeps()
         return substeps, self.loss(substeps)

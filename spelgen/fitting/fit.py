@@ -1,4 +1,4 @@
-"""Fit a model to logs, in memory; the command `spelgen train` is this with files."""
+"""Fit a model to logs in memory. The command `spelgen train` reads model and logs from files and calls `fit`."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -40,15 +40,16 @@ QUIET = RunOptions()
 ALL: tuple[type[Objective], ...] = (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
 OBJECTIVES = {objective.name: objective for objective in ALL}
 Rates = Callable[[], Sequence[float]]
-"""Return the sample rates of the logs [Hz]; called only if the choice depends on them, since it may read the logs."""
+"""Function that returns the sample rates of the logs [Hz]. It may read all logs, and is called only if necessary."""
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Options of a fit whose objective may not be known yet.
+    """Options of a fit whose objective may depend on the logs.
 
-    objective: None: chosen by `default_objective`. options: by name; an option that does not apply is an error.
-    defaults: by name, for options that are not given; inapplicable ones are omitted.
+    objective: name of the objective; None: `default_objective` chooses it. options: values of options by name; an
+    option that does not apply to the objective is an error. defaults: values by name for options that are not given;
+    defaults that do not apply to the objective are ignored.
     """
 
     objective: str | None = None
@@ -68,25 +69,27 @@ def fit(
     folder: Path | str | None = None,
     options: RunOptions = QUIET,
 ) -> Fit:
-    """Fit ``model`` to ``logs``, and the baselines that it is compared with; it then has the best weights found.
+    """Fit ``model`` to ``logs``, and fit the baselines for comparison; ``model`` then has the best weights found.
 
     Ctrl-C or SIGTERM end the fit with status "interrupted".
 
     Args:
-        model: of `spelgen.build` or `spelgen.load_module`; its weights are changed.
-        logs: of the arm, with torques, or with commands for an arm under position servos.
-        config: a `TorqueFit`, `MomentumFit` or `Rollout`, or for an arm under position servos a `ServoFit`, which uses
-            all logs and needs no validation. Default: torque for rigid bodies if logs are dense enough for
-            accelerations, rollout for networks.
+        model: model from `spelgen.build` or `spelgen.load_module`; its weights are changed.
+        logs: trajectories of the arm with torques, or with commands if the arm has position servos.
+        config: a `TorqueFit`, `MomentumFit` or `Rollout`, or a `ServoFit` for an arm with position servos. A
+            `ServoFit` uses all logs and needs no validation. Default: `ServoFit` for position servos; `TorqueFit` for
+            rigid bodies if a log is sampled densely enough for accelerations; otherwise `Rollout`.
         preprocessing: filter, gaps and delay of the logs.
-        validation: the fraction of the logs that is set aside, whole trajectories chosen by ``seed``, or trajectories.
-        seed: of the split and of the order of batches.
-        arm: the arm or the URDF that the model was made from: for the regularizer, the baselines and the run folder.
-        folder: where checkpoints are written after every epoch (see `RunFolder`); without one, `Fit.save` writes all.
-        options: how the fit runs.
+        validation: fraction of the logs that is set aside for validation (whole trajectories, chosen at random with
+            ``seed``), or the validation trajectories.
+        seed: random seed of the split and of the order of batches.
+        arm: the arm that the model was made from, or its URDF, for the regularizer, the baselines and the run folder.
+        folder: run folder, in which a checkpoint is written after every epoch (see `RunFolder`); without a folder,
+            `Fit.save` writes all files.
+        options: device, threads, resumption and progress.
 
     Returns:
-        The fitted model with its record, and with the baselines of least squares if ``arm`` is known.
+        The fitted model with its record, and with the least-squares baselines if ``arm`` is known.
 
     Raises OptionError for an option that does not apply to this model, LogError, and RunError if the folder contains a
     run or cannot be resumed with these arguments.
@@ -101,16 +104,16 @@ def fit(
     request = FitRequest(model, logs, config, preprocessing, validation, seed, urdf, options, began, folder)
     objective = objective_of(request)
     if run is not None and not options.resume:
-        # Before the logs are filtered and cut, which may take minutes.
+        # checked before the logs are filtered and cut into windows, which may take minutes
         run.require_free(force=options.force)
-    # locked after the request was checked: a wrong option creates no folder
+    # the folder is created and locked after the check of the options: a wrong option creates no folder
     with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
         return _Fitting(request, objective, run).fitted()
 
 
 class _Fitting:
-    """A fit in progress, from prepared logs to the files of its run folder, if it has one."""
+    """A fit in progress: it prepares the logs, runs the objective, and writes the run folder, if there is one."""
 
     def __init__(self, request: FitRequest, objective: Objective, run: RunFolder | None) -> None:
         self.request, self.objective, self.run = request, objective, run
@@ -128,17 +131,17 @@ class _Fitting:
             self._resume(self.run)
         else:
             self.notes += objective.begin()
-            # A new run is written after the first steps succeeded: there is no folder for logs that cannot be fitted.
+            # The run folder is written after `begin` succeeded: logs that cannot be fitted create no run.
             self.run.start(required_spec(request.model), request.urdf, force=request.options.force)
             self._save()
             mapping = self.record.mapping.model_dump(mode="json", exclude_defaults=True)
             if mapping:
                 write_json(self.run.mapping, mapping)
-            write_json(self.run.config, self.record.to_dict())  # from now on it is a run and can be resumed
+            write_json(self.run.config, self.record.to_dict())  # marks a complete run, which can be resumed
         status = self._run()
         model, checkpoint = request.model, Checkpoint.model_validate(objective.checkpoint())
         model.load_state_dict(checkpoint.best_weights)
-        model.requires_grad_(True)  # also for parameters that the fit kept constant
+        model.requires_grad_(True)  # the objective may have disabled gradients of some parameters
         return Fit(
             model=model,
             history=objective.history,
@@ -161,19 +164,22 @@ class _Fitting:
             raise RunError(
                 "a checkpoint of another model", file=run.checkpoint, do="start a new run"
             ) from error
-        run.write_metrics(self.objective.history)  # epochs after the checkpoint will be run again
-        self.baselines = run.read_baselines()  # the logs are the same
+        run.write_metrics(self.objective.history)  # drops epochs after the checkpoint: they are run again
+        self.baselines = run.read_baselines()  # still valid: a run resumes only on the same logs
 
     def _save(self) -> None:
         """Write the checkpoint, the best weights and the history."""
         if self.run is not None:
             checkpoint = self.objective.checkpoint()
-            # the checkpoint is last: a resumed run drops the lines of epochs after it
+            # The checkpoint is written after the metrics: if it is not written, a resumed run drops the last lines.
             self.run.write_metrics(self.objective.history)
             self.run.save(checkpoint["best_weights"], checkpoint)
 
     def _run(self) -> Status:
-        """Show the notes, fit until an end is reached or Ctrl-C, and fit the baselines of a fit that ended."""
+        """Print the diagnostics, run the objective, fit the baselines, and return the status.
+
+        Ctrl-C ends the fit with status "interrupted", without baselines.
+        """
         arm = self._baseline_arm()
         with TrainingProgress(show=self.request.options.progress) as progress:
             for note in self.notes:
@@ -192,7 +198,7 @@ class _Fitting:
         return status
 
     def _baseline_arm(self) -> Arm | None:
-        """Return the arm that baselines are fitted for; None if its URDF is unknown, or if they are fitted already.
+        """Return the arm for the fit of baselines; None if the URDF is unknown, or if baselines are fitted already.
 
         A URDF that cannot be read is reported, and the model is fitted without baselines.
         """
@@ -221,10 +227,10 @@ def objective_of(request: FitRequest) -> Objective:
 
 
 def default_objective(model: ArmModel, rates: Rates) -> str:
-    """Return the objective for a model and its logs.
+    """Return the name of the default objective for a model and its logs.
 
-    "servo" for an arm under position servos; "torque" for rigid bodies if a log is sampled densely enough for
-    accelerations; else "rollout".
+    The default is "servo" for an arm with position servos, "torque" for rigid bodies if a log is sampled densely enough
+    for accelerations, and otherwise "rollout".
     """
     if model.input_quantity == ServoObjective.input:
         return ServoObjective.name
@@ -234,7 +240,10 @@ def default_objective(model: ArmModel, rates: Rates) -> str:
 
 
 def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rates: Rates) -> FitConfig:
-    """Return the configuration of a fit. Raises OptionError for an option that does not apply to the model."""
+    """Return the requested configuration, or the default configuration with the requested options.
+
+    Raises OptionError for an option that does not apply to the model.
+    """
     rigid_bodies = isinstance(model, RigidBodyDynamics)
     if isinstance(requested, FitConfig):
         requested.require(rigid_bodies=rigid_bodies)
@@ -248,7 +257,7 @@ def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rat
     objective, defaults = chosen.objective, chosen.defaults
     if objective is None:
         objective = default_objective(model, rates)
-        if rigid_bodies and objective == "rollout":  # rigid bodies need no regularizer unless it is requested
+        if rigid_bodies and objective == "rollout":  # for rigid bodies the regularizer is off by default
             defaults = {"urdf_weight": 0.0, **defaults}
     return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.options, defaults=defaults)
 
@@ -259,7 +268,7 @@ def sample_rates(logs: Sequence[Trajectory]) -> list[float]:
 
 
 def _urdf(arm: Arm | Path | str | None) -> Path | None:
-    """Return the file of a loaded arm, or a path."""
+    """Return the path of the URDF of a loaded arm, or the given path; None without an arm."""
     if arm is None:
         return None
     return Path(arm) if isinstance(arm, str | Path) else arm.robot.path

@@ -36,10 +36,11 @@ from spelgen.spec import ModelSpec
 class Fit:
     """A fitted model, the record of its fit, and the baselines that were fitted to the same logs.
 
-    history: lines of metrics.jsonl, one per epoch. status: how the fit ended; None for a run that was loaded. record:
-    content of config.json. checkpoint: content of checkpoint.pt. baselines: content of least_squares.json, {} without
-    any. urdf: of the robot, None if unknown. folder: of the run, None without one.
-    logs: to which the model was fitted; () for a run that was loaded.
+    history: lines of metrics.jsonl, one per epoch. diagnostics: messages about the logs and the fit. status: how the
+    fit ended; None for a run that was loaded. record: content of config.json. checkpoint: content of checkpoint.pt.
+    baselines: content of least_squares.json, {} without baselines. urdf: URDF file of the robot, None if unknown.
+    folder: run folder, None if the fit wrote no files. logs: trajectories for training and validation; () for a run
+    that was loaded.
     """
 
     model: ArmModel
@@ -65,33 +66,33 @@ class Fit:
 
     @property
     def epochs(self) -> int:
-        """Number of epochs."""
+        """Number of completed epochs."""
         return self.checkpoint.epoch
 
     @property
     def steps(self) -> int:
-        """Number of steps on windows."""
+        """Number of optimizer steps on windows."""
         return self.checkpoint.step
 
     @property
     def best_epoch(self) -> int:
-        """The epoch after which the model was best; 0: before the first."""
+        """Number of the epoch with the lowest validation loss; 0: the model before the first epoch was best."""
         return self.checkpoint.best_epoch
 
     @property
     def best_validation(self) -> float:
-        """`rollout_loss` of the validation windows [1]."""
+        """Lowest validation loss: `rollout_loss` [1]; for position servos, RMS position error [rad, m]."""
         return self.checkpoint.best_loss
 
     @property
     def torque_nmse(self) -> dict[str, float]:
-        """Mean squared torque error divided by the variance, per joint; without joints whose torque is constant."""
+        """Joint name -> mean squared torque error / variance of the torque; joints with constant torque are omitted."""
         by_joint = zip(self.model.joint_names, self.checkpoint.torque_nmse, strict=False)
         return {joint: nmse for joint, nmse in by_joint if math.isfinite(nmse)}
 
     @property
     def result(self) -> str:
-        """The outcome in words: the error of the fitted torques, else the validation loss."""
+        """The result in words: the error of the fitted torques, or the validation loss of other objectives."""
         nmse = self.torque_nmse
         if not nmse:
             return f"validation loss {self.best_validation:.3g}"
@@ -103,12 +104,12 @@ class Fit:
 
     @property
     def seconds(self) -> float:
-        """Time of the fit [s]."""
+        """Duration of the fit [s]."""
         return self.checkpoint.seconds
 
     @property
     def substeps(self) -> int:
-        """Steps of rk4 per sample interval that the model needs."""
+        """Number of rk4 steps per sample interval that the model needs."""
         return self.checkpoint.substeps
 
     @property
@@ -118,7 +119,7 @@ class Fit:
 
     @cached_property
     def posterior(self) -> Posterior:
-        """95 % intervals of the parameters, of M(q), g(q) and of predicted torques.
+        """Posterior of the model: 95 % intervals of the parameters, of M(q), g(q) and of predicted torques.
 
         Raises RunError unless rigid bodies were fitted to torques.
         """
@@ -131,25 +132,26 @@ class Fit:
     @overload
     def predict(self, trajectory: Trajectory, *, std: Literal[True]) -> Uncertain: ...
     def predict(self, trajectory: Trajectory, *, std: bool = False) -> np.ndarray | Uncertain:
-        """Return joint torques (T, n) [Nm, N] of the model's inverse dynamics along a trajectory, at its own times.
+        """Return joint torques (T, n) [Nm, N] of the model's inverse dynamics at the samples of a trajectory.
 
-        Velocity is filtered as in the fit and differentiated. NaN in pieces between gaps that are too short for that.
+        The velocity is filtered as in the fit, and differentiated. The torque is NaN at a single sample between two
+        gaps in the sample times, since such a sample has no acceleration.
 
         Args:
-            trajectory: of the arm.
+            trajectory: trajectory of the arm.
             std: return the torques with their standard deviations (see `Posterior.torque`).
         """
         reach = bristle_reach(self.model)
         tau, deviation = np.full_like(trajectory.q, np.nan), np.full_like(trajectory.q, np.nan)
         for start, stop in pairwise(gap_ends(trajectory.t, self.preprocessing.gap)):
-            # One sample has no acceleration.
+            # a single sample has no acceleration
             if stop - start < 2:
                 continue
             piece = trajectory[start:stop]
             # The zero-phase filter needs a few samples for its transient.
             if self.preprocessing.cutoff and len(piece) > 3:
                 piece = low_pass(piece, self.preprocessing.cutoff)
-            # logs have no accelerations
+            # accelerations are not logged
             qdd = np.gradient(piece.qd, piece.t, axis=0)
             motion = piece.q, piece.qd, qdd, bristles_along(piece.q, reach)
             if std:
@@ -159,10 +161,10 @@ class Fit:
         return Uncertain(tau, deviation) if std else tau
 
     def score(self, logs: Trajectory | Sequence[Trajectory]) -> float:
-        """Return 1 - nMSE of the torque on the samples of ``logs`` that move: 1 is perfect, 0 as good as a constant.
+        """Return 1 - nMSE of the torque on the samples of ``logs`` in motion: 1 is perfect, 0 as good as a constant.
 
-        The mean over trajectories of the mean over joints, by the protocol of `dynamics_samples`. Raises LogError
-        where no log is sampled densely enough for accelerations.
+        The score is the mean over trajectories of the mean over joints. Samples are selected and filtered by
+        `dynamics_samples`. Raises LogError if no log is sampled densely enough for accelerations.
         """
         logs = [logs] if isinstance(logs, Trajectory) else logs
         reach = bristle_reach(self.model)
@@ -191,14 +193,17 @@ class Fit:
             run.start(spec, self.urdf, force=force)
             run.write_metrics(self.history)
             run.save(self.model.state_dict(), self.checkpoint.content)
-            # Before config.json, which marks a complete run.
+            # config.json is written last, since it marks a complete run
             if self.baselines:
                 write_json(run.baseline, self.baselines)
             write_json(run.config, self.record.to_dict())
         return run.path
 
     def _torque(self, *motion: np.ndarray | None) -> np.ndarray:
-        """Return torques (T, n) at q, qd, qdd, and at z and direction if they are known (see `DynamicsSamples`)."""
+        """Return the joint torques (T, n) [Nm, N] of the model's inverse dynamics.
+
+        motion: q, qd, qdd (T, n), and the friction state z and direction, None if unknown (see `DynamicsSamples`).
+        """
         like = next(self.model.parameters())
         # torch does not accept arrays with negative strides, which filters return
         inputs = [torch.as_tensor(np.ascontiguousarray(x)).to(like) for x in motion if x is not None]
@@ -224,7 +229,7 @@ class Fit:
 
 
 def required_spec(model: PortHamiltonian) -> ModelSpec:
-    """Return the specification of a model, which a run folder keeps. Raises RunError for a model without one."""
+    """Return the specification of a model, which a run folder contains. Raises RunError for a model without one."""
     if isinstance(model, ArmModel):
         return model.spec
     raise RunError(
@@ -235,10 +240,13 @@ def required_spec(model: PortHamiltonian) -> ModelSpec:
 
 
 def load_run(folder: Path | str) -> Fit:
-    """Return a run of `spelgen train` or `Fit.save`, with its best weights. Raises RunError and ModuleError."""
+    """Return the fit in a run folder of `spelgen train` or `Fit.save`, with the best weights found.
+
+    Raises RunError and ModuleError.
+    """
     run = RunFolder(folder)
     record = run.read_record()  # a missing run is reported before its model is assembled
-    # a loaded model predicts: derivatives would take memory
+    # no gradients: a loaded model is for predictions, and derivatives would need memory
     return Fit(
         model=fitted_model(run).requires_grad_(False).eval(),
         history=run.read_metrics(),

@@ -1,9 +1,9 @@
 """Levenberg-Marquardt minimization of a nonlinear least-squares cost.
 
 Marquardt, J. SIAM 11:431 (1963): a step s solves (H + damping diag H) s = -g, with the Gauss-Newton Hessian H and the
-gradient g of the cost. A step that lowers the cost divides the damping by a factor; otherwise the damping is multiplied
-by it, and the step is repeated. A problem defines its own parameters (a vector, or a dataclass) and its own residual:
-the solver compares costs only.
+gradient g of the cost. After a step that lowers the cost, the damping is divided by a factor; otherwise the damping is
+multiplied by the same factor, and the step is repeated. A problem defines the type of its parameters (a vector, or a
+dataclass) and its residual: the solver compares costs only.
 """
 
 from collections.abc import Callable, Iterable
@@ -37,7 +37,7 @@ class NormalEquations(NamedTuple):
     def step(self, damping: float | Tensor = 0.0) -> Tensor:
         """Return the damped step (..., k); damping: one number, or (...), one per system of equations."""
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
-        # Marquardt's scaling by diag H, not Levenberg's by 1: steps do not depend on the units of the parameters.
+        # Marquardt's scaling by diag H instead of Levenberg's identity: steps are independent of the parameters' units.
         diagonal = torch.diag_embed(self.curvature.diagonal(dim1=-2, dim2=-1))
         result: Tensor = torch.linalg.solve(self.curvature + factor * diagonal, self.descent)
         return result
@@ -51,8 +51,8 @@ class NormalEquations(NamedTuple):
 class SolverState(Generic[Parameters]):
     """Iterate of the solver.
 
-    residual: of the problem at x, reused by its normal equations. damping: of the next step. steps: accepted steps,
-    former calls included.
+    residual: residual of the problem at x, from which the normal equations are computed. damping: damping of the next
+    step. steps: number of accepted steps, including earlier calls of the solver.
     """
 
     x: Parameters
@@ -66,8 +66,8 @@ class SolverState(Generic[Parameters]):
 class SolverResult(Generic[Parameters]):
     """Last iterate and reason of termination.
 
-    normal_equations: of the last linearization. It is at the last iterate, unless a threshold or the maximum number of
-    steps ended the solver right after a step; then it is at the iterate before that step.
+    normal_equations: normal equations of the last linearization. They are at the last iterate, unless a threshold or
+    the maximum number of steps ended the solver right after a step; then they are at the iterate before this step.
     """
 
     state: SolverState[Parameters]
@@ -76,22 +76,25 @@ class SolverResult(Generic[Parameters]):
 
 
 class LeastSquaresProblem(Protocol[Parameters]):
-    """Cost of parameters x, computed from a residual (or from its sums of squares, if the residual is too large)."""
+    """Nonlinear least-squares problem: the cost of parameters x is computed from a residual, or from sums of squares.
+
+    Sums of squares replace the residual if the residual is too large.
+    """
 
     def residual(self, x: Parameters) -> Tensor:
-        """Return the residual, from which the cost is computed: of samples, (T, n), or squared and summed, (n,)."""
+        """Return the residual of the samples, (T, n), or the sum of its squares per joint, (n,); see `cost`."""
 
     def cost(self, x: Parameters, residual: Tensor) -> float:
-        """Return the cost for this residual, (...,); infinite if the residual diverged."""
+        """Return the cost at x, computed from the result of `residual` at x; infinite if the residual diverged."""
 
     def normal_equations(self, x: Parameters, residual: Tensor) -> NormalEquations:
-        """Return Gauss-Newton Hessian and negative gradient with respect to the free parameters, (k, k) and (k,)."""
+        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) with respect to k free parameters."""
 
     def candidates(self, x: Parameters, step: Tensor) -> Iterable[Parameters]:
-        """Return the parameters after a step (k,).
+        """Return one or more candidates for the parameters after a step (k,).
 
-        Further candidates are evaluated only if the gain ratio of the ones before (decrease of the cost divided by the
-        predicted decrease) is low.
+        The solver evaluates the next candidate only if the gain ratio of the best candidate so far (decrease of the
+        cost divided by the predicted decrease) is low.
         """
 
 
@@ -101,7 +104,7 @@ def initial_state(
     damping: float = TUNING.initial_damping,
     steps: int = 0,
 ) -> SolverState[Parameters]:
-    """Return the state at x before the first step."""
+    """Return the state of the solver at x, before a step."""
     residual = problem.residual(x)
     return SolverState(x, residual, problem.cost(x, residual), damping, steps)
 
@@ -119,13 +122,13 @@ def levenberg_marquardt(
 
     Args:
         problem: cost, residual and normal equations.
-        state: first iterate, from `initial_state` or a former result.
+        state: first iterate, from `initial_state` or from the result of an earlier call.
         max_steps: maximum number of accepted steps.
-        min_decrease: a smaller decrease of the cost, or a smaller predicted one, ends the solver.
-        min_relative_decrease: likewise relative to the cost after the step.
+        min_decrease: the solver ends if the decrease of the cost, or the predicted decrease, is smaller.
+        min_relative_decrease: the solver ends if the decrease, divided by the cost after the step, is smaller.
         callback: is called with the state after each accepted step.
     """
-    # also without a step: a result has the normal equations of its state
+    # computed even if max_steps is 0: the result contains normal equations
     normal = problem.normal_equations(state.x, state.residual)
     for number in range(max_steps):
         if number:
@@ -146,17 +149,17 @@ def _accepted_step(
     normal: NormalEquations,
     min_decrease: float,
 ) -> SolverState[Parameters] | Termination:
-    """Return the state after one step that lowers the cost, or the reason why there is none."""
+    """Return the state after one step that lowers the cost, or the reason why no step was accepted."""
     damping = state.damping
     for _ in range(TUNING.max_trials):
         step = normal.step(damping)
         predicted = normal.predicted_decrease(step)
-        # More damping predicts a smaller decrease still: there is nothing to try after this.
+        # No further damping is tried: a larger damping has an even smaller predicted decrease.
         if predicted < max(TUNING.min_predicted_decrease * state.cost, min_decrease):
             return Termination.SMALL_PREDICTION
         best = _best_candidate(problem, state, step, predicted)
         if best.cost < state.cost:
-            # The lower bound keeps the damping within reach of the next few failures.
+            # Without the lower bound, many rejected steps might be needed to raise the damping again.
             return replace(best, damping=max(damping / TUNING.damping_factor, TUNING.min_damping))
         damping *= TUNING.damping_factor
     return Termination.NO_DECREASE
@@ -168,13 +171,16 @@ def _best_candidate(
     step: Tensor,
     predicted: float,
 ) -> SolverState[Parameters]:
-    """Return the state of minimum cost among the candidates of a step, up to the first with a high gain ratio."""
+    """Return the state of minimum cost among the candidates of a step, up to the first with a high gain ratio.
+
+    predicted: predicted decrease of the cost, the denominator of the gain ratio.
+    """
     best = replace(state, cost=float("inf"))
     for x in problem.candidates(state.x, step):
         candidate = initial_state(problem, x, state.damping, state.steps + 1)
         if candidate.cost < best.cost:
             best = candidate
-        # The quadratic model holds here: further candidates would cost evaluations and gain little.
+        # The quadratic model predicts the decrease well: further candidates would gain little.
         if state.cost - best.cost >= TUNING.min_gain_ratio * predicted:
             break
     return best

@@ -1,4 +1,4 @@
-"""Objective momentum: fit the weak form of the equations of motion, the first stage of fits of windows."""
+"""The objective momentum: fit the weak form of the equations of motion, also as a stage of the objective rollout."""
 
 import copy
 import math
@@ -23,18 +23,19 @@ from spelgen.settings.fits import DEFAULTS, Rollout, WindowConfig
 
 
 class MomentumObjective(Objective):
-    """Steps on the weak form, kept if they lower the validation loss. All windows are in memory.
+    """Minimization of `momentum_loss`; the result is kept if it lowers the validation loss. All windows are in memory.
 
-    best_loss, best_weights: of the model with the lowest validation loss so far. substeps: of the integrator between
-    samples. seconds: elapsed part of the allowed time. epoch_steps: steps in an epoch.
+    best_loss, best_weights: lowest validation loss so far, and the weights of the model with this loss. substeps:
+    number of integration steps per sample interval. seconds: elapsed part of the allowed time [s]. epoch_steps: number
+    of optimizer steps per epoch.
     """
 
     name: ClassVar[str] = "momentum"
-    config: WindowConfig  # resolved by `prepare`
+    config: WindowConfig  # `prepare` sets the defaults that depend on the number of windows
     saved_attributes: ClassVar[tuple[str, ...]] = (
         "epoch", "step", "best_epoch", "best_loss", "best_weights", "seconds", "substeps", "momentum_done",
     )  # fmt: skip
-    """Attributes that are saved in a checkpoint."""
+    """Names of the attributes that a checkpoint contains."""
 
     def __init__(self, request: FitRequest) -> None:
         super().__init__(request)
@@ -49,17 +50,17 @@ class MomentumObjective(Objective):
         self.config = self.config.resolved(len(self.data.training))
         self.regularizer = None
         if self.config.urdf_weight:
-            # relative to the model before any fit, also in a resumed run
+            # the unit of M is the mean M of the initial model, also if the run is resumed
             self.regularizer = urdf_regularizer(self.request.urdf, self.model, self.data.training, self.notes)
         return self.data
 
     def begin(self) -> list[Diagnostic]:
-        """Validate the initial model."""
+        """Validate the initial model; return diagnostics."""
         self._set_up()
         return self.notes
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Resume from the best weights so far; an incomplete momentum stage is repeated."""
+        """Resume from the best weights in the checkpoint; an incomplete momentum stage is repeated."""
         self._set_up()
         for name in self.saved_attributes:
             setattr(self, name, checkpoint[name])
@@ -81,7 +82,7 @@ class MomentumObjective(Objective):
         return {name: vars(self)[name] for name in self.saved_attributes}
 
     def _set_up(self) -> None:
-        """Validate the current model."""
+        """Move the model and the data to the device, set the batch and epoch sizes, and validate the current model."""
         device, config = self.request.options.device, self.config
         # the time to read and prepare the logs is part of the allowed time
         self.seconds = time.monotonic() - self.request.began
@@ -101,7 +102,7 @@ class MomentumObjective(Objective):
         self.momentum_done = not config.momentum_steps
 
     def _keep(self, substeps: int, loss: float) -> None:
-        """Set the current model, which was validated, as the best so far."""
+        """Record the current model as the best so far, with its integration steps and its validation loss."""
         self.substeps, self.best_loss, self.best_epoch = substeps, loss, self.epoch
         self.best_weights = copy.deepcopy(self.model.state_dict())
 
@@ -113,34 +114,34 @@ class MomentumObjective(Objective):
         return time.monotonic() - self._since
 
     def fraction(self, seconds: float) -> float:
-        """Return the fraction of the allowed time; 0 without a limit."""
+        """Return elapsed seconds divided by the allowed time; 0 if the time is not limited."""
         return seconds / self.allowed if self.allowed else math.inf
 
     def _new_optimizer(self, generator: torch.Generator) -> WindowOptimizer:
-        """Return an optimizer of the weights that require a gradient; generator: for the order of batches."""
+        """Return an optimizer of the weights that require a gradient; generator: random order of the batches."""
         decay = self.config.weight_decay or 0.0
         if self.config.optimizer == "lbfgs":
             return LBFGS(self.model, decay)
         return MiniBatchAdamW(self.model, self.batch, decay, generator)
 
     def penalty(self) -> Tensor | float:
-        """Return the regularization loss, ()."""
+        """Return the regularization loss, (); 0 without a regularizer."""
         if self.regularizer is None:
             return 0.0
         return self.config.urdf_weight * self.regularizer.loss(self.model)
 
     def learning_rate(self, fraction: float) -> float:
-        """Return the learning rate at a fraction of the training: a linear warm-up times a cosine decay."""
+        """Return the learning rate after a fraction (0 to 1) of the training: linear warm-up times cosine decay."""
         cosine = (1 + math.cos(math.pi * min(fraction, 1.0))) / 2
         decay = TUNING.final_rate + (1 - TUNING.final_rate) * cosine
-        # 1e-3: the first step has a learning rate above zero
+        # 1e-3: the learning rate of the first step is not zero
         warm_up = min(1.0, (fraction + 1e-3) / TUNING.warm_up)
         return (self.config.learning_rate or DEFAULTS.learning_rate) * warm_up * decay
 
     def _momentum_stage(self, progress: TrainingProgress) -> None:
-        """Take the momentum steps, which need no ODE solver, and keep them if they lower the validation loss.
+        """Minimize the momentum loss, which needs no ODE solver; keep the result if it lowers the validation loss.
 
-        After an interruption the stage is repeated.
+        After an interruption the whole stage is repeated.
         """
         call, steps = TUNING.epoch_steps, self.config.momentum_steps
         optimizer = self._new_optimizer(torch.Generator().manual_seed(self.request.seed))

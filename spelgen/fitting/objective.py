@@ -19,16 +19,16 @@ Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 
 
 class Objective(ABC):
-    """A way to fit a model.
+    """Base class of objectives. An objective fits a model to logs: it defines the loss and how the loss is minimized.
 
-    `fit` calls `prepare`, then `begin` for a new fit or `resume`, then `run`. Only `fit` writes to the run folder: it
-    writes `checkpoint` and history (the lines of metrics.jsonl) whenever ``save`` is called, and results (fields of
-    `run_record.Record`, by name) at the end.
+    `fit` calls `prepare`, then `begin` for a new fit or `resume` for an interrupted one, then `run`. Only `fit` writes
+    to the run folder: it writes the `checkpoint` and the attribute history (the lines of metrics.jsonl) whenever
+    ``save`` is called, and the attribute results (fields of `run_record.Record`, by name) at the end.
     """
 
     name: ClassVar[str]
     input: ClassVar[Literal["torque", "position"]] = "torque"
-    """The input of the models that it fits, which is also in their logs."""
+    """Input quantity of the models that the objective can fit; the logs must contain this quantity."""
 
     def __init__(self, request: FitRequest) -> None:
         self.request, self.model, self.config = request, request.model, request.config
@@ -42,30 +42,30 @@ class Objective(ABC):
 
     @abstractmethod
     def begin(self) -> list[Diagnostic]:
-        """Do the steps of a new fit before its first checkpoint; return diagnostics."""
+        """Run the part of a new fit that precedes the first checkpoint; return diagnostics."""
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Continue from the files of a run folder. By default the fit is complete, and its best weights are loaded.
+        """Restore the state of a fit from the files of a run folder. By default, only the best weights are loaded.
 
         Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError for files of another model.
         """
-        # An objective without own states is finished at its checkpoint: only the weights count.
+        # By default `begin` runs the whole fit, so the checkpoint is from a finished fit: its weights are sufficient.
         self.model.load_state_dict(checkpoint["best_weights"])
         self._checkpoint = checkpoint
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Run the fit until a stopping criterion holds, and return it; call ``save`` to write a `checkpoint`.
+        """Run the fit until a stopping criterion holds; return the status. ``save`` writes a checkpoint.
 
-        By default `begin` does the whole fit. KeyboardInterrupt may be raised at any time.
+        By default `run` does nothing, since `begin` runs the whole fit. KeyboardInterrupt may be raised at any time.
         """
         return "finished"
 
     def checkpoint(self) -> Content:
-        """Return the content of checkpoint.pt: the keys of `run_record.Checkpoint`, and states for `resume`."""
+        """Return the content of checkpoint.pt: the fields of `run_record.Checkpoint`, and the states for `resume`."""
         return self._checkpoint
 
     def _make_checkpoint(self, loss: float, seconds: float, substeps: int, step: int = 0) -> None:
-        """Make a checkpoint with the current weights of the model, for an objective without epochs."""
+        """Set the checkpoint of an objective without epochs: the current weights, their loss, and the time [s]."""
         self._checkpoint = {
             "epoch": 0, "step": step, "best_epoch": 0, "best_loss": loss, "seconds": seconds, "substeps": substeps,
             "best_weights": copy.deepcopy(self.model.state_dict()),
@@ -73,7 +73,7 @@ class Objective(ABC):
 
 
 def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -> Record:
-    """Return the record of a fit before it runs, with the resolved options that apply to the model and no others."""
+    """Return the record of a fit before it runs. It contains only the options that apply to the model, resolved."""
     model, spec, options = request.model, spec_of(request.model), request.options
     notes = [note for note in (*prepared.diagnostics, *options.notes) if note.severity == "warning"]
     record = Record(
@@ -94,7 +94,7 @@ def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -
         mapping=options.mapping or LogMapping(input=model.input_quantity),
         device=options.device,
         threads=options.threads,
-        # of logs and links; diagnostics of the run are about the command, and do not describe the model
+        # warnings about logs and links; diagnostics of the run are about the command and do not describe the model
         warnings=[f"{note.where}: {note.message}" for note in notes if note.where != "run"],
     )
     known: Content = {}

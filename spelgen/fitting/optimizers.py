@@ -1,7 +1,7 @@
 """Optimizers of window losses: AdamW on batches, or L-BFGS on all windows at once if there are few.
 
-The gradient of a few hundred windows costs no more than the gradient of a batch and is exact, so that L-BFGS can use
-the curvature: this matters for simulated logs, which can be fitted to many digits, and for short logs.
+The gradient of a few hundred windows takes no longer than the gradient of a batch. It has no sampling noise, so L-BFGS
+can estimate the curvature. This matters for short logs, and for simulated logs, which can be fitted to many digits.
 """
 
 import inspect
@@ -18,39 +18,39 @@ from spelgen.logs.windows import Windows
 
 Loss = Callable[[Windows], Tensor]
 LearningRate = Callable[[int], float]
-Summands = Callable[[], Iterable[Tensor]]  # of a loss; one at a time is in memory with its graph
+Summands = Callable[[], Iterable[Tensor]]  # yields the terms of a loss: only one graph is in memory at a time
 
 
 class WindowOptimizer(ABC):
-    """Optimizer of the weights of a model that required a gradient when this object was created.
+    """Optimizer of the weights of a model that require a gradient when the optimizer is created.
 
-    State of a resumed run that torch's optimizer does not have is an entry of its parameter groups, which it saves.
+    torch's optimizers save their parameter groups, so further state for a resumed run is stored in these groups.
     """
 
     _optimizer: torch.optim.Optimizer
 
     @abstractmethod
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
-        """Take optimizer steps and return the mean loss; NaN as soon as a loss is not finite.
+        """Take optimizer steps and return the mean loss; NaN if a loss is not finite.
 
         Args:
-            loss: loss of a batch of windows.
+            loss: function that returns the loss of a batch of windows.
             windows: training windows.
             steps: number of steps.
-            learning_rate: learning rate of step 0, 1, ...
+            learning_rate: function that returns the learning rate of step number 0, 1, ...
         """
 
     @property
     def stalled(self) -> bool:
-        """Whether further steps do not lower the loss."""
+        """Whether recent steps did not lower the loss."""
         return False
 
     def state_dict(self) -> Content:
-        """Return the state of a resumed run."""
+        """Return the state from which a run is resumed."""
         return self._optimizer.state_dict()
 
     def load_state_dict(self, state: Content) -> None:
-        """Resume from a `state_dict`."""
+        """Restore the state from the result of `state_dict`."""
         self._optimizer.load_state_dict(state)
 
 
@@ -83,9 +83,9 @@ class MiniBatchAdamW(WindowOptimizer):
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
         """See `WindowOptimizer`."""
         rows, size = steps * self._batch, len(windows)
-        # Whole passes over the windows, so that each window is used equally often.
+        # Batches are cut from passes over all windows in random order, so that windows are used about equally often.
         passes = [torch.randperm(size, generator=self._generator) for _ in range(-(-rows // size))]
-        total: Tensor | float = 0.0  # on the device: no synchronization with a GPU between steps
+        total: Tensor | float = 0.0  # stays on the device: float() in each step would wait for a GPU
         for step, batch in enumerate(torch.cat(passes)[:rows].split(self._batch)):
             for group in self._optimizer.param_groups:
                 group["lr"] = learning_rate(step) * group["factor"]
@@ -103,12 +103,12 @@ class MiniBatchAdamW(WindowOptimizer):
         value.backward()
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, TUNING.gradient_norm)
         self._optimizer.step()
-        # 0 * NaN is NaN: a gradient that is not finite marks the loss without a test on the host.
+        # The loss is NaN if the gradient is not finite (0 * NaN is NaN): a test on the CPU would wait for a GPU.
         return value.detach() + 0.0 * norm
 
 
 class _EagerLBFGS(torch.optim.LBFGS):
-    """L-BFGS of torch without its compiler, whose import takes 5 s of a fit that may take 10."""
+    """L-BFGS of torch, without the import of torch's compiler: the import takes 5 s, and a whole fit may take 10 s."""
 
     add_param_group = inspect.unwrap(torch.optim.Optimizer.add_param_group)
     zero_grad = inspect.unwrap(torch.optim.Optimizer.zero_grad)
@@ -119,8 +119,8 @@ class _EagerLBFGS(torch.optim.LBFGS):
 class LBFGS(WindowOptimizer):
     """L-BFGS (Liu and Nocedal, Math. Programming 45, 1989) with a strong-Wolfe line search on all windows.
 
-    A step is an evaluation of the loss; the learning rate is not used. weight_decay: factor of half the sum of squares
-    of all matrices, which is added to the loss.
+    The number of steps is the number of evaluations of the loss; the learning rate is not used. weight_decay: factor of
+    the penalty, which is half the sum of squares of all matrices and is added to the loss.
     """
 
     _optimizer: torch.optim.LBFGS
@@ -132,11 +132,12 @@ class LBFGS(WindowOptimizer):
             self._parameters,
             history_size=TUNING.lbfgs_history,
             line_search_fn="strong_wolfe",
-            # simulated logs are fitted to many digits: `stalled` ends the fit, not torch
+            # tighter than torch's defaults, since simulated logs are fitted to many digits: `stalled` ends the fit
             tolerance_grad=1e-12,
             tolerance_change=1e-15,
         )
-        # loss at the end of the last call, without and with the penalty; number of successive calls without progress
+        # last: loss at the end of the last call, without and with the penalty. waits: number of successive calls
+        # without progress.
         self._optimizer.param_groups[0].update(last=(math.inf, math.inf), waits=0)
 
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
@@ -144,7 +145,10 @@ class LBFGS(WindowOptimizer):
         return self.minimise(lambda: [loss(windows)], steps)
 
     def minimise(self, summands: Summands, steps: int) -> float:
-        """Minimise the sum of losses like `run`; only one summand at a time is in memory with its graph."""
+        """Minimise a sum of losses, and return the sum at the end; NaN if no evaluation was finite.
+
+        Only one summand at a time is in memory with its graph of derivatives.
+        """
         group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps
         self._finite = False
@@ -158,7 +162,7 @@ class LBFGS(WindowOptimizer):
         except torch.linalg.LinAlgError:
             return math.nan
         loss, (last, last_penalised) = total.item(), group["last"]
-        # The loss may rise while the penalised one falls: either is progress.
+        # A decrease of the loss or of the penalised loss is progress: one may rise while the other falls.
         progress = loss <= TUNING.lbfgs_stalled * last or penalised <= TUNING.lbfgs_stalled * last_penalised
         group["last"], group["waits"] = (loss, penalised), 0 if progress else group["waits"] + 1
         return loss
@@ -170,14 +174,14 @@ class LBFGS(WindowOptimizer):
         return waits > 1
 
     def _evaluated(self, summands: Summands) -> Tensor:
-        """Return the loss with its penalty, (), after its backward pass; a large number if it is not finite."""
+        """Compute the gradients and return the penalised loss, (); a large number if they are not finite."""
         self._optimizer.zero_grad()
         try:
             value = torch.zeros((), dtype=torch.float64)
             for number, summand in enumerate(summands()):
                 if number == 0:
                     summand = summand + self._penalty()
-                # Gradients add up, so that only one summand's graph is in memory.
+                # Gradients of the summands accumulate, so that only one summand's graph is in memory.
                 summand.backward()
                 value = value + summand.detach()
             gradients = torch.cat([x.grad.flatten() for x in self._parameters if x.grad is not None])
@@ -197,9 +201,9 @@ def minimise(model: torch.nn.Module, summands: Summands, evaluations: int, weigh
     """Minimize a loss over the weights of a model by `LBFGS`; return the number of evaluations.
 
     Args:
-        model: its weights that require a gradient are fitted.
-        summands: of the loss.
-        evaluations: maximum number, rounded up to whole calls.
+        model: model whose weights are fitted, if they require a gradient.
+        summands: function that yields the terms of the loss.
+        evaluations: maximum number of evaluations of the loss, rounded up to a multiple of `TUNING.lbfgs_call`.
         weight_decay: see `LBFGS`.
     """
     optimizer, count = LBFGS(model, weight_decay), 0

@@ -1,7 +1,8 @@
 """Posterior of a fitted model: 95 % intervals of its parameters, of M(q), g(q) and of predicted torques.
 
-The covariance of the fitted parameters (`fitting.torque.covariance`) is propagated to first order: the variance of a
-function f is |df/dx R|^2 with the covariance R R^T. Torque predictions add the residual of held-out samples.
+The covariance R R^T of the fitted parameters x (`fitting.torque.covariance`) is propagated to first order: the variance
+of a function f(x) is |df/dx R|^2. The variance of a predicted torque also includes the squared residual of held-out
+samples.
 """
 
 import copy
@@ -38,7 +39,7 @@ QUANTITIES = {
     "offset": "{0.torque}",
     "gain": "",
 }
-"""Units of the quantities of a drive, formatted with `UNITS` of its joint type."""
+"""Unit of each quantity of a drive: a format string for the `UNITS` of the joint's type."""
 
 
 class Uncertain(NamedTuple):
@@ -49,7 +50,10 @@ class Uncertain(NamedTuple):
 
 
 class Propagated(NamedTuple):
-    """Value of a function of the model, (...), and its derivative times R, (..., k): norms over k are deviations."""
+    """Value of a function of the model, (...), and its derivative times R, (..., k).
+
+    The norm of ``root`` over k is the standard deviation of the value.
+    """
 
     value: Tensor
     root: Tensor
@@ -59,9 +63,9 @@ class Propagated(NamedTuple):
 class Posterior:
     """Posterior of a model that was fitted to torques.
 
-    covariance: (K, K) of the rigid-body, drive and friction parameters. torque_std: (n,) RMS torque residual of blocks
-    of samples that were not fitted [Nm, N], below the cutoff of the fit's filter. delay: of the torques relative to the
-    positions.
+    covariance: (K, K), covariance of the rigid-body, drive and friction parameters. torque_std: (n,) [Nm, N], RMS
+    torque residual of blocks of samples that were not fitted, below the cutoff frequency of the fit's filter. delay:
+    delay of the torques relative to the positions [s]; None if there is no delay.
     """
 
     model: ArmModel
@@ -70,24 +74,28 @@ class Posterior:
     delay: Interval | None = None
 
     def uncertain(self, function: Callable[[ArmModel], Tensor]) -> Uncertain:
-        """Return a function of the model, (...,), with standard deviations: ``lambda model: model.armature``."""
+        """Return the value (...) of a function of the model, and its standard deviations.
+
+        Example of a function: ``lambda model: model.armature``.
+        """
         value, root = self.propagate(function)
         return Uncertain(value.numpy(), root.norm(dim=-1).numpy())
 
     def propagate(self, function: Callable[[ArmModel], Tensor]) -> Propagated:
-        """Return a function of the model, (...), and its derivative times R."""
+        """Return the value (...) of a function of the model, and its derivative times R, (..., k)."""
 
         def at(x: Tensor) -> Tensor:
-            """Return the function at parameters x, (K,)."""
+            """Return the value of the function at parameters x, (K,)."""
             return evaluate_with(self.model, self._vector.unflatten(x), function)
 
-        part = 1e-4  # central differences over a part of a standard deviation: linear, and far above rounding
+        # central differences over this part of a standard deviation: linear, and far above rounding errors
+        part = 1e-4
         with torch.no_grad():
             columns = [(at(self._x + part * x) - at(self._x - part * x)) / (2 * part) for x in self._root.mT]
             return Propagated(at(self._x), torch.stack(columns, dim=-1))
 
     def mass_matrix(self, q: np.ndarray) -> Uncertain:
-        """Return M (T, n, n) at q (T, n), with standard deviations."""
+        """Return M (T, n, n) [kg m^2, kg m, kg] at q (T, n) [rad, m], with standard deviations."""
         position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
         at_rest, units = self._regressor(position, zero, zero), torch.eye(self.model.n).double()
         columns = [self._regressor(position, zero, unit.expand_as(zero)) - at_rest for unit in units]
@@ -95,7 +103,7 @@ class Posterior:
             return self._linear(self.model.mass_matrix(position), torch.stack(columns, dim=-2))
 
     def gravity(self, q: np.ndarray) -> Uncertain:
-        """Return gravity torques (T, n) [Nm, N] at q (T, n), with standard deviations."""
+        """Return gravity torques (T, n) [Nm, N] at q (T, n) [rad, m], with standard deviations."""
         position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
         with torch.no_grad():
             return self._linear(self.model.gravity(position), self._regressor(position, zero, zero))
@@ -103,8 +111,8 @@ class Posterior:
     def torque(self, *motion: np.ndarray) -> Uncertain:
         """Return the torques (T, n) [Nm, N] that would be logged, with standard deviations.
 
-        motion: q, qd, qdd (T, n), and z and direction where known. The standard deviation includes noise and errors
-        of the model, from the torque residual of blocks of samples that were not fitted.
+        motion: q, qd, qdd (T, n), and the friction state z and direction, if known. The standard deviation includes
+        noise and model errors, estimated by the torque residual of blocks of samples that were not fitted.
         """
         q, *motion_and_state = (torch.as_tensor(np.ascontiguousarray(x)) for x in motion)
         model, root, of_bodies = self.model, self._root.clone(), self._vector.mask("bodies")
@@ -115,7 +123,7 @@ class Posterior:
             inverse = torch.linalg.inv(inputs + torch.diag((~inputs.any(dim=1)).double()))
         variance = (inverse.square() @ torch.from_numpy(self.torque_std).square()).expand_as(q).clone()
         samples = DynamicsSamples("", motion[0], motion[1], motion[2], np.zeros_like(motion[0]), *motion[3:])
-        size = 2048  # of a block: the Jacobians of all samples of a log may not fit into memory
+        size = 2048  # samples per block: the Jacobian of all samples of a log may not fit into memory
         for first in range(0, len(q), size):
             block = TorqueSamples.of([samples[first : first + size]])
             rows = torch.zeros(block.count, model.n, root.shape[1]).double()
@@ -126,7 +134,7 @@ class Posterior:
 
     @cached_property
     def base_parameters(self) -> tuple[Interval, ...]:
-        """The identifiable combinations of inertial parameters and armatures."""
+        """Intervals of the identifiable combinations of inertial parameters and armatures."""
         names, combination = self._base
         values, roots = (combination @ factor for factor in self._constants)
         rows = zip(names, values.tolist(), roots.norm(dim=1).tolist(), strict=True)
@@ -134,7 +142,7 @@ class Posterior:
 
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
-        """Mass [kg] and first moments [kg m] of each body that the logs determine individually."""
+        """Intervals of the masses [kg] and first moments [kg m] that the logs determine individually."""
         _, combination = self._base
         alone = compress(self.base_parameters, (combination.count_nonzero(dim=1) == 1).tolist())
         return tuple(replace(x, positive=x.name[0] == "m") for x in alone if x.name[0] in "mh")
@@ -148,16 +156,16 @@ class Posterior:
 
     @cached_property
     def drives(self) -> dict[str, tuple[Interval, ...]]:
-        """Armature, viscous and Coulomb friction, torque offset and trained gain, each per joint, by quantity.
+        """Quantity -> intervals of the joints: armature, viscous and Coulomb friction, torque offset, trained gain.
 
-        Viscous and Coulomb friction approximate the friction model by least squares up to the typical speed.
+        Viscous and Coulomb friction approximate the fitted friction by least squares up to the typical speed.
         """
         model, inputs = self.model, self.model.inputs
         trained = inputs.gain_rows.tolist() if isinstance(inputs, MotorInputs) else []
         friction_line = _friction_line(model)
 
         def constants(model: ArmModel) -> Tensor:
-            """Return the quantities of all joints, (4, n) or (5, n)."""
+            """Return the quantities of all joints: (4, n), or (5, n) if gains are trained."""
             rows = [model.armature, *friction_line(model), model.torque_offset]
             if isinstance(model.inputs, MotorInputs) and trained:
                 rows.append(model.inputs.gains().sum(dim=1))
@@ -176,7 +184,7 @@ class Posterior:
 
     @property
     def drive_columns(self) -> dict[str, list[str]]:
-        """Columns of the table of drives: quantity -> texts of value and unit, (n,), empty for joints without it."""
+        """Columns of the table of drives: quantity -> n texts of value and unit; an empty text if there is no value."""
         columns = {}
         for quantity, of_joints in self.drives.items():
             cells = {x.name: f"{x.text} {x.unit}".rstrip() for x in of_joints}
@@ -201,7 +209,7 @@ class Posterior:
         )
 
     def to_dict(self) -> Content:
-        """Return all intervals in their JSON form."""
+        """Return all intervals and the RMS torque residuals as JSON."""
         return {
             "base_parameters": [x.to_dict() for x in self.base_parameters],
             "bodies": [x.to_dict() for x in self.bodies],
@@ -221,7 +229,7 @@ class Posterior:
 
     @cached_property
     def _root(self) -> Tensor:
-        """R, (K, k), without directions of negligible variance."""
+        """Factor R (K, k) of the covariance R R^T, without directions of negligible variance."""
         values, vectors = torch.linalg.eigh(self.covariance)
         kept = values > 1e-14 * values.max()
         root: Tensor = vectors[:, kept] * values[kept].sqrt()
@@ -233,14 +241,17 @@ class Posterior:
 
     @cached_property
     def _constants(self) -> Propagated:
-        """Inertial parameters of all bodies, then armatures, (10 B + n,)."""
+        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with their derivatives times R."""
         return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
 
     def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         return constants_regressor(self.model.chain, motors_of(self.model), q, qd, qdd)
 
     def _linear(self, value: Tensor, rows: Tensor) -> Uncertain:
-        """Return a value (...) with the standard deviation of the constants' contribution, rows (..., 10 B + n)."""
+        """Return a value (...) with its standard deviation.
+
+        rows: (..., 10 B + n), derivatives of the value with respect to the inertial parameters and armatures.
+        """
         return Uncertain(value.numpy(), (rows @ self._constants.root).norm(dim=-1).numpy())
 
 
@@ -250,12 +261,12 @@ def posterior_of(
     """Return the posterior of a fitted model.
 
     Args:
-        model: with the fitted parameters.
-        content: `Checkpoint.posterior`: covariance (K, K), torque_std (n,) and delay_std [s]; untrusted.
-        delay: of the torques [s].
-        file: checkpoint, for messages.
+        model: model with the fitted parameters.
+        content: `Checkpoint.posterior` of a file, checked here: covariance (K, K), torque_std (n,) and delay_std [s].
+        delay: delay of the torques relative to the positions [s].
+        file: path of the checkpoint, for error messages.
 
-    Raises RunError without content, and for the content of another model.
+    Raises RunError if the content is None, or if it belongs to another model.
     """
     if content is None:
         raise RunError(
@@ -270,12 +281,14 @@ def posterior_of(
         do = "restore it from a copy, or fit again"
         raise RunError("a posterior of another model", file=file, element="posterior", do=do)
     late = Interval("torque delay", delay, delay_std, "s") if delay else None
-    model = copy.deepcopy(model).double().cpu().requires_grad_(False)  # the caller may change its own
+    model = (
+        copy.deepcopy(model).double().cpu().requires_grad_(False)
+    )  # a copy: the caller may change its model
     return Posterior(model, covariance, torque_std.numpy(), late)
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
-    """Return a tensor by its name; None if it is absent, has another shape or type, is zero or not finite."""
+    """Return the tensor ``name``; None if it is absent, has another shape, is not float64, is zero or not finite."""
     tensor = content.get(name)
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
         return tensor if tensor.any() and tensor.isfinite().all() else None
@@ -283,18 +296,19 @@ def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | Non
 
 
 def _friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
-    """Return a function of a model: viscous and Coulomb friction, (2, n), that are nearest to its friction.
+    """Return a function that approximates the friction of a model by viscous and Coulomb friction, (2, n).
 
-    The line is fitted by least squares to friction at speeds up to the typical speed, averaged over random positions,
-    at which gravity and residual terms have the values of the fitted model.
+    The approximation is a straight line, fitted by least squares to the friction torque at speeds up to the typical
+    speed. The friction torque is averaged over random positions; there, gravity load and residual terms are taken from
+    ``model``.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
     places = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
     q = torch.from_numpy([x.center for x in joints] + places)
     with torch.no_grad():
-        load = model.gravity(q) @ torch.linalg.inv(motors_of(model))  # (P, n), on the drives
+        load = model.gravity(q) @ torch.linalg.inv(motors_of(model))  # gravity torque on the drives, (P, n)
         factor = friction_factor(model, q)
-    # logarithmic: the Stribeck effect and the intercept are at low speeds
+    # in units of the typical speed; dense at low speeds, which determine the Stribeck effect and the intercept
     speeds = np.geomspace(0.02, 1.0, 25)
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 

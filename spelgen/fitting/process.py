@@ -39,7 +39,10 @@ def require_device(device: str) -> None:
 
 @contextmanager
 def threads_of_torch(count: int) -> Iterator[None]:
-    """Set the number of torch's threads: more than two rarely help small matrices, and one makes runs repeatable."""
+    """Set the number of torch's threads within a context.
+
+    More than two threads rarely accelerate operations on small matrices; with one thread, runs are repeatable.
+    """
     previous = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -50,7 +53,10 @@ def threads_of_torch(count: int) -> Iterator[None]:
 
 @contextmanager
 def termination_as_interrupt() -> Iterator[None]:
-    """End training after SIGTERM as after Ctrl-C. Only the main thread can set handlers; others have no effect."""
+    """Raise KeyboardInterrupt at SIGTERM, as at Ctrl-C, within a context.
+
+    Only the main thread can set signal handlers; in other threads the context has no effect.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -67,18 +73,18 @@ def termination_as_interrupt() -> Iterator[None]:
 
 @contextmanager
 def locked(folder: Path | None) -> Iterator[None]:
-    """Create the folder and lock it against other processes of this machine; None: no effect.
+    """Create the folder and lock it against other processes of this machine, within a context; None: no effect.
 
-    Raises RunError with the process that holds the lock. The kernel releases the lock when its holder ends for any
-    reason, so a remaining file has no effect.
+    Raises RunError with the process that has locked the folder. The kernel releases the lock when this process ends for
+    any reason, so a remaining lock file has no effect.
     """
     if folder is None:
         yield
         return
-    # Folders that do not exist yet: they are removed if the fit writes nothing.
+    # folders that are created here; they are removed again if the fit writes nothing into them
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     file = folder / LOCK
-    # no wait: the user may not know of the other process
+    # fail at once instead of waiting: the user may not know of the other process
     lock = FileLock(file, timeout=0)
     with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -90,7 +96,7 @@ def locked(folder: Path | None) -> Iterator[None]:
                 f"{holder} trains in this folder", file=folder, do="wait for it, or -o another"
             ) from None
     try:
-        # For the message to another process: the lock itself has no content.
+        # another process shows this text in its error message
         file.write_text(f"process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%F %T')},")
         yield
     finally:
@@ -102,7 +108,7 @@ def locked(folder: Path | None) -> Iterator[None]:
 
 
 class TrainingProgress:
-    """Progress on stderr within a context: a bar, or one line per stage without a terminal; nothing without `show`."""
+    """Progress on stderr within a context: a bar on a terminal, else one line per stage; nothing without ``show``."""
 
     def __init__(self, *, show: bool) -> None:
         self._show = show
@@ -110,7 +116,7 @@ class TrainingProgress:
         columns = ("{task.description}", BarColumn(12), MofNCompleteColumn(), TimeRemainingColumn())
         self._bar = Progress(*columns, "{task.fields[state]}", console=self._console)
         self._task = self._bar.add_task("training", total=None, visible=False, state="")
-        self._line = ""  # of the current stage, printed at its end without a terminal
+        self._line = ""  # text of the current stage, printed at the end of the stage if there is no terminal
 
     def __enter__(self) -> TrainingProgress:
         if self._show and self._console.is_terminal:
@@ -120,7 +126,7 @@ class TrainingProgress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._bar.live.is_started:  # rich prints an empty line otherwise
+        if self._bar.live.is_started:  # rich prints an empty line for a bar that was not started
             self._bar.stop()
         self._end_stage()
 
@@ -131,24 +137,24 @@ class TrainingProgress:
             self._console.print("".join(c if c.isprintable() else "?" for c in text), markup=False)
 
     def momentum(self, step: int, steps: int, loss: float) -> None:
-        """Show the progress of the momentum steps."""
+        """Show the progress of the momentum stage: the number of steps, the maximum number, and the loss [1]."""
         state = f"loss {loss:.3g}"
         self._show_stage("momentum", step, steps, state, f"{step} steps, {state}")
 
     def round(self, number: int, rounds: int, steps: int, rms: float) -> None:
-        """Show the progress of a servo fit: outer iteration, steps in total, root mean square error [rad, m]."""
+        """Show the progress of a servo fit: outer iteration, number of solver steps, RMS position error [rad, m]."""
         state = f"{steps} steps, errors {1000 * rms:.3g} mrad"
         self._show_stage("servos", number, rounds, state, state)
 
     def epoch(self, record: Content, epochs: int) -> None:
-        """Show the progress of the epochs: one record of metrics.jsonl; epochs: maximum number."""
+        """Show the progress after an epoch. record: its line of metrics.jsonl; epochs: maximum number of epochs."""
         state = f"validation {record['validation']:.3g}, best {record['best']:.3g}"
         rate, epochs_done = record["step"] / record["seconds"], counted(record["epoch"], "epoch")
         line = f"{epochs_done}, loss {record['loss']:.3g}, {state}, {rate:.1f} steps/s"
         self._show_stage("training", record["epoch"], epochs, state, line)
 
     def _show_stage(self, stage: str, done: int, total: int, state: str, line: str) -> None:
-        """Show the state of a stage in the bar; without a terminal, print the line at the end of the stage."""
+        """Show ``state`` in the bar; without a terminal, print ``line`` at the end of the stage."""
         if not self._line.startswith(stage):
             self._end_stage()
             self._bar.reset(self._task, description=stage, total=total, visible=True)

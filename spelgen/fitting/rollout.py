@@ -1,4 +1,4 @@
-"""Prediction of windows by a model: an ODE solution from the first sample, with zero-order hold of the input."""
+"""Prediction of windows by a model: integration from a window's first sample, with zero-order hold of the input."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
 
 SOLVER: dict[str, object] = {"method": "dopri5", "rtol": TUNING.adaptive_rtol, "atol": TUNING.adaptive_atol}
-AT_REST = 1e-6  # [rad, m] below the resolution of encoders
+AT_REST = 1e-6  # [rad, m] largest displacement of joints at rest; below the resolution of encoders
 
 
 def roll_out(
@@ -31,9 +31,9 @@ def roll_out(
     with its own sample times. Each interval between samples is solved separately: the input jumps at its ends.
 
     Args:
-        model: its parameter cache is computed once.
-        windows: measured motion (W, K, n) and inputs.
-        substeps: steps of rk4 per interval.
+        model: model to integrate; its parameter cache is computed once.
+        windows: measured motion (W, K, n) and inputs (W, K-1, n).
+        substeps: number of rk4 steps per interval.
         solver: "rk4", the classical Runge-Kutta method, or "dopri5" with adaptive steps.
     """
     prepared = model.prepare()
@@ -47,15 +47,15 @@ def roll_out(
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
 
         def rhs(q: Tensor, p: Tensor, z: Tensor, tau: Tensor = tau) -> tuple[Tensor, Tensor]:
-            """Return the rates of q and p, (W, n) each."""
+            """Return dq/dt and dp/dt, (W, n) each."""
             return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
 
         for substep in range(substeps):
             q, p, z, qd = advance(model, rhs, q, p, z, dt.unsqueeze(-1) / substeps)
             if substep == 0:
-                velocities.append(qd)  # at the start of the interval
+                velocities.append(qd)  # velocity at the start of the interval
         positions.append(q)
-    # rk4 computes the velocity at the start of an interval anyway: only the last one is missing.
+    # The integrators return the velocity at the start of each interval: only the velocity at the end is computed here.
     velocities = [*velocities[1:], model.velocity(model.at(q, prepared=prepared), p)]
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
 
@@ -68,15 +68,15 @@ def _adaptive_step(
     z: Tensor,
     step: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Integrate over one interval with adaptive steps; arguments and results (W, n) as of `runge_kutta`.
+    """Integrate over one interval with adaptive steps; arguments and results as for `runge_kutta`, (W, n) each.
 
     Dormand and Prince, J. Comput. Appl. Math. 6 (1980), differentiated through the solver. All windows are solved
     together, with time in units of their own intervals.
     """
-    from torchdiffeq import odeint  # its import takes half a second
+    from torchdiffeq import odeint  # imported only if needed: the import takes half a second
 
     def rate(t: Tensor, state: Tensor) -> Tensor:
-        """Return the rate of the state (q, p), (W, 2 n), per sample interval."""
+        """Return the derivative of the state (q, p), (W, 2 n), with respect to time in units of the interval."""
         q_now, p_now = state.chunk(2, dim=-1)
         return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
 
@@ -93,16 +93,16 @@ def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequen
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
-    # constant in the derivatives: the wrapped angle has slope one
+    # detached: the derivative of the wrapped angle with respect to q' is one
     turns = torch.round(difference.detach() / (2 * math.pi))
     return difference - 2 * math.pi * torch.where(revolute, turns, 0.0)
 
 
 class LossScales(NamedTuple):
-    """Units of the errors of q, qd and tau.
+    """Units in which losses measure errors of q, qd and tau.
 
-    q, qd: (K-1, n), root mean square change since the first sample of a window, per sample and joint. tau: (n,),
-    standard deviation [Nm, N].
+    q, qd: (K-1, n) [rad, m, per second], RMS change since the first sample of a window, for each further sample and
+    each joint. tau: (n,) [Nm, N], standard deviation.
     """
 
     q: Tensor
@@ -115,9 +115,9 @@ class LossScales(NamedTuple):
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
-    """Return the scales of windows; of joints that hardly move, 1 % of the largest scale.
+    """Return the scales of windows; for joints that hardly move, 1 % of the largest scale.
 
-    Raises LogError if no joint moves: any model predicts standstill.
+    Raises LogError if no joint moves: windows at rest do not determine a model.
     """
     moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
     if moved.abs().max() < AT_REST:
@@ -125,7 +125,7 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
             f"windows in which no joint moves by {AT_REST:g} rad or m", expected="motion", do="record some"
         )
     changed = windows.qd[:, 1:] - windows.qd[:, :1]
-    # A constant torque, mostly of gravity, is no scale of the torque that moves the arm.
+    # The mean torque, mostly due to gravity, is subtracted: it is no measure of the torque that moves the arm.
     varied = windows.tau - windows.tau.mean(dim=(0, 1))
     return LossScales(
         _scale(moved.square().mean(dim=0)),
@@ -135,9 +135,9 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
 
 
 def _scale(mean_square: Tensor) -> Tensor:
-    """Return the root of mean squares (..., n), at least 1 % of the largest one."""
+    """Return the square roots of mean squares (..., n), each at least 1 % of the largest root of the n joints."""
     root = mean_square.sqrt()
-    # above zero even if nothing varies: errors are divided by the scale
+    # 1e-9: positive even if nothing varies, since errors are divided by the scale
     smallest = (1e-2 * root.amax(dim=-1, keepdim=True)).clamp(min=1e-9)
     return torch.maximum(root, smallest)
 
@@ -145,7 +145,7 @@ def _scale(mean_square: Tensor) -> Tensor:
 def rollout_errors(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> Tensor:
-    """Return scaled errors (W, K-1, 2n) of the rollout: of the positions, then of the velocities."""
+    """Return the errors of the rollout in units of ``scales``, (W, K-1, 2n): n positions, then n velocities."""
     q, qd = roll_out(model, windows, substeps, solver)
     position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q
     return torch.cat([position, (qd - windows.qd[:, 1:]) / scales.qd], dim=-1)
@@ -154,10 +154,11 @@ def rollout_errors(
 def rollout_loss(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> Tensor:
-    """Return the mean squared scaled error, (), of the rollouts (W, K, n): SPEL eq. 8 with other units.
+    """Return the mean square of `rollout_errors`, (): the loss of SPEL eq. 8 with other units.
 
-    The paper sums squared geodesic distances and velocity errors over joints and samples in rad and rad/s. Scaled, all
-    joints and samples have the same weight, and the loss of a prediction of standstill is 1.
+    The paper sums squared geodesic distances [rad^2] and velocity errors [rad^2/s^2] over joints and samples. With
+    scaled errors, all joints and samples have the same weight, and a prediction that the initial state does not change
+    has loss 1.
     """
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
@@ -165,31 +166,32 @@ def rollout_loss(
 def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tensor:
     """Return the mean squared residual of the weak form, (): p(t) - p(0) minus the impulse of all forces until t.
 
-    The impulse is along the measured samples, by the trapezium rule: no ODE solution and no accelerations are needed.
-    The residual is divided by the time, which is a mean torque, and by the standard deviation of the torque at the
-    joint. A residual velocity, M(q)^-1 times the impulse, would be smaller for an M that is too large.
+    The impulse is integrated along the measured samples by the trapezium rule: no ODE solution and no accelerations are
+    needed. The residual is divided by the time t, which gives a mean torque, and by the standard deviation of the
+    joint's torque. An alternative, the velocity error M(q)^-1 times the residual, would favour an M that is too large.
 
     Args:
-        model: with a momentum M(q) qd.
+        model: model with the momentum M(q) qd.
         windows: measured motion (W, K, n) and inputs (W, K-1, n).
-        scales: its scale of the torque (n,) is used.
+        scales: the scale of the torque, (n,) [Nm, N], is used.
     """
     q, qd, tau, dt = windows.q, windows.qd, windows.tau, windows.dt.unsqueeze(-1)
-    # M need not be positive definite here, since velocities are measured; constrained to it, the descent would end at
-    # the boundary
+    # M is not constrained to be positive definite here: it is not inverted, since velocities are measured, and with the
+    # constraint the descent would end at the boundary.
     with mass_as_learned(model):
         configuration = model.configuration(q, model.prepare())
     p = (configuration.mass @ qd.unsqueeze(-1)).squeeze(-1)
     past = known_past(model, memory_along(model, q, qd, windows.z))
     force = model.lagrangian_gradient(configuration, qd) - model.friction_torque(configuration, qd, *past)
-    # the input is constant in each interval: at a sample, it has the values of the intervals after and before it
+    # The input is constant in each interval and jumps at the samples: each sample has two input forces, one with the
+    # input of the interval after the sample, the other with the input of the interval before it.
     input_after = model.input_force(configuration, qd, torch.cat((tau, tau[:, -1:]), dim=1))
     input_before = model.input_force(configuration, qd, torch.cat((tau[:, :1], tau), dim=1))
     mean = (force[:, :-1] + input_after[:, :-1] + force[:, 1:] + input_before[:, 1:]) / 2
     residual = (p[:, 1:] - p[:, :1] - (dt * mean).cumsum(dim=1)) / dt.cumsum(dim=1)
     with torch.no_grad():
         inputs = model.input_matrix(q).abs()
-    # of joint torques: there may be gears between motors and joints
+    # The scales of motor torques are converted to joint torques: there may be gears between motors and joints.
     unit = (inputs @ scales.tau).mean(dim=(0, 1))
     result: Tensor = (residual / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
     return result
@@ -205,7 +207,7 @@ def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int)
 
 
 def integration_error(coarse: Tensor, fine: Tensor) -> float:
-    """Return the integration error of a rollout relative to the error of the model.
+    """Return the integration error of a rollout divided by the error of the model [1].
 
     Args:
         coarse: (W, K-1, 2n) scaled errors of the rollout.
@@ -220,7 +222,8 @@ def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start
     """Return the minimum number of rk4 steps per sample interval, at least `start`, with a small integration error."""
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.max_substeps:
-        # Half the step divides the error of rk4 by 16: the difference of the two is the error of the coarse one.
+        # Half the step size divides the error of rk4 by 16, so the difference between both rollouts is about the error
+        # of the coarse rollout.
         fine = probed(model, windows, scales, 2 * substeps)
         if integration_error(coarse, fine) < TUNING.integration_fraction:
             break

@@ -1,4 +1,4 @@
-"""Objective rollout: epochs of predicted windows, with checkpoints and rollbacks of diverged epochs."""
+"""The objective rollout: minimize the error of predicted windows in epochs, and repeat epochs that diverged."""
 
 import copy
 import math
@@ -25,12 +25,13 @@ from spelgen.settings.fits import Rollout, TorqueFit
 
 
 class RolloutObjective(MomentumObjective):
-    """Stages: torque fit of rigid bodies, momentum steps, epochs of predicted windows.
+    """A fit in three steps: torque fit of rigid bodies, minimization of `momentum_loss`, epochs on predicted windows.
 
-    A checkpoint has the whole state, so that a resumed run repeats the same numbers.
+    A checkpoint contains the whole state, so that a resumed run gives the same numbers as an uninterrupted run.
 
-    Residual terms that the torque fit did not select are fixed in the first part of the epochs: on short windows they
-    would absorb a part of the rigid-body motion. In the second part they are fitted, too, from the best weights so far.
+    The epochs have two stages. In the first stage, residual terms that the torque fit did not select are fixed: on
+    short windows they would absorb a part of the rigid-body motion. In the second stage all weights are fitted,
+    starting from the best weights of the first stage.
     """
 
     name: ClassVar[str] = "rollout"
@@ -40,7 +41,7 @@ class RolloutObjective(MomentumObjective):
     )  # fmt: skip
 
     def begin(self) -> list[Diagnostic]:
-        """Fit torques, then validate the model."""
+        """Fit torques if the model consists of rigid bodies, then validate the model; return diagnostics."""
         if self.config.torque_first and isinstance(self.model, RigidBodyDynamics):
             samples = torque_samples(self.model, self.data)
             if samples is not None:
@@ -60,7 +61,7 @@ class RolloutObjective(MomentumObjective):
         self.history = history[: self.epoch]
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Run epochs until one of the stopping criteria holds; `save` is called after each epoch."""
+        """Run epochs until one of the stopping criteria holds; ``save`` is called after each epoch."""
         self._start_clock()
         if not self.momentum_done:
             self._momentum_stage(progress)
@@ -79,7 +80,7 @@ class RolloutObjective(MomentumObjective):
         return super().checkpoint() | state | {"generator": self.generator.get_state()}
 
     def _set_up(self) -> None:
-        """Validate the current model and create its optimizer."""
+        """Validate the current model, and set the state of the first stage with a new optimizer."""
         super()._set_up()
         self.generator = torch.Generator().manual_seed(self.request.seed)
         self.fixed, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
@@ -98,7 +99,7 @@ class RolloutObjective(MomentumObjective):
         return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.penalty()
 
     def _end(self) -> Status | None:
-        """Return the stopping criterion that holds, or None."""
+        """Return the status of the stopping criterion that holds; None if the stage continues."""
         if self.epoch >= self.config.epochs or self.optimizer.stalled:
             return "finished"
         patience = self.config.patience
@@ -111,12 +112,12 @@ class RolloutObjective(MomentumObjective):
         return "finished" if self._done() >= self._stage_end else None
 
     def _run_epoch(self) -> Content:
-        """Run one epoch; if its losses are not finite, repeat it at a lower learning rate."""
+        """Run one epoch and return its line of metrics.jsonl; repeat it at half the learning rate if it diverges."""
         while True:
-            # The state before the epoch, for a repetition at half the learning rate.
+            # the state before the epoch, from which a diverged epoch is repeated
             state = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             steps, start = self._steps_in_time(), self.seconds_now()
-            # NaN if the loss or gradient of any step is not finite
+            # the mean loss is NaN if the loss or the gradient of any step is not finite
             loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
             trained = self.seconds_now()
             self.step, self._step_seconds = self.step + steps, (trained - start) / steps
@@ -140,20 +141,20 @@ class RolloutObjective(MomentumObjective):
         """Return the number of steps of the next epoch, limited by the remaining time."""
         if math.isinf(self.allowed):
             return self.epoch_steps
-        # Nothing has been measured yet: a short epoch, which measures the time of a step.
+        # The time per step is still unknown: a short epoch measures it.
         if not self._step_seconds:
             return min(self.epoch_steps, TUNING.epoch_steps)
         remaining = self.allowed - self.seconds_now() - self._validation_seconds
         return max(1, min(self.epoch_steps, int(remaining / self._step_seconds)))
 
     def _rate(self, ahead: int = 0) -> float:
-        """Return the learning rate `ahead` steps from now."""
+        """Return the learning rate of the step that is ``ahead`` steps after the last completed step."""
         fraction = (self._done(ahead) - self.stage_from) / (self._stage_end - self.stage_from)
         return self.learning_rate_factor * self.learning_rate(fraction)
 
     def _done(self, ahead: int = 0) -> float:
-        """Return the completed fraction `ahead` steps from now: of all steps or of the allowed time, the larger one."""
-        # With a limit of time the schedule of the learning rate must end with the time, not with the epochs.
+        """Return the completed fraction of all steps after ``ahead`` more steps, or of the allowed time if larger."""
+        # If the time is limited, the learning-rate schedule must end with the time, not with the last epoch.
         steps = self.config.epochs * self.epoch_steps
         return max((self.step + ahead) / steps, self.fraction(self.seconds))
 
@@ -162,7 +163,7 @@ class RolloutObjective(MomentumObjective):
         return TUNING.first_stage if self.fixed else 1.0
 
     def _release(self, end: Status) -> bool:
-        """Start the second stage, in which all weights are trained; False if there is none or its time is used up."""
+        """Start the second stage, in which all weights are fitted. Return False if it is not needed or has no time."""
         if not self.fixed or end == "out of time" or not self.epoch:
             return False
         self.model.load_state_dict(self.best_weights)
@@ -171,7 +172,10 @@ class RolloutObjective(MomentumObjective):
         return self._end() is None
 
     def _roll_back(self, weights: Content, optimizer: Content, step: int) -> None:
-        """Restore the state before a diverged epoch, and halve all further learning rates."""
+        """Restore the state before a diverged epoch, and halve all further learning rates.
+
+        Raises RunError after too many diverged epochs.
+        """
         self.rollbacks += 1
         self.model.load_state_dict(weights)
         if self.rollbacks > TUNING.max_rollbacks:

@@ -1,4 +1,4 @@
-"""A run folder: its files, each of which is written completely or not at all, and its model."""
+"""Run folder: reading and writing of its files, each completely or not at all, and the model of the run."""
 
 import io
 import json
@@ -20,10 +20,11 @@ from spelgen.urdf.document import urdf_bytes
 class RunFolder:
     """The files of one training run.
 
-    spec: specification of the model. urdf, settings: of its robot, if known. mapping: names and units of the logs, a
-    file for --mapping. config: record of the fit. metrics: a line per epoch. checkpoint: state from which the fit is
-    resumed. weights: the best state_dict so far. evaluation: results of `evaluate`. baseline: baselines fitted to the
-    training logs, and the coverage of these. estimator: noise levels of the estimator.
+    spec: specification of the model. urdf, settings: URDF and settings of the robot, if known. mapping: names and units
+    of the columns of the logs, in the format of --mapping. config: record of the fit. metrics: one line per epoch.
+    checkpoint: state from which the fit is resumed. weights: the best state_dict so far. evaluation: results of
+    `evaluate`. baseline: baselines fitted to the training logs, and the coverage of the training logs. estimator: noise
+    levels of the state estimator.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -41,7 +42,7 @@ class RunFolder:
         self.estimator = self.path / "estimator.json"
 
     def require_free(self, *, force: bool) -> None:
-        """Raise RunError if there is a run in the folder, unless it may be replaced."""
+        """Raise RunError if the folder contains a run, unless ``force`` is true and the run may be replaced."""
         if self.path.exists() and not self.path.is_dir():
             raise RunError("a file", file=self.path, expected="a folder or a new name")
         if self.config.exists() and not force:
@@ -49,18 +50,19 @@ class RunFolder:
             raise RunError("there is a run in this folder", file=self.path, do=do)
 
     def start(self, spec: ModelSpec, urdf: Path | None, *, force: bool) -> None:
-        """Make the folder, write the specification and copy the robot into it.
+        """Make the folder, write the specification, and copy the URDF and the settings of the robot.
 
-        A folder is a run if it has config.json, which is written last. Raises RunError if there is one, unless forced.
+        A folder contains a run if it contains config.json, which the caller writes last. Raises RunError if the folder
+        contains a run, unless ``force``.
         """
         self.require_free(force=force)
         content = {self.spec: f"{spec.to_json()}\n".encode()}
-        # read before files are removed: they may be this run's copies
+        # The URDF is read before files are removed: it may be the copy in this folder.
         if urdf is not None and urdf.exists():
             content[self.urdf] = urdf_bytes(urdf)  # a xacro file is expanded
         if urdf is not None and (settings := urdf.with_suffix(".yaml")).is_file():
             content[self.settings] = settings.read_bytes()
-        # first config.json, which marks a run
+        # config.json, the first of the files, is removed first: after an interruption the folder is no run
         for file in vars(self).values():
             if file != self.path:
                 remove(file)
@@ -73,14 +75,14 @@ class RunFolder:
         write_state(self.checkpoint, checkpoint)
 
     def write_metrics(self, records: Sequence[Content]) -> None:
-        """Write these records as metrics.jsonl; no file without any."""
+        """Write metrics.jsonl with one line per record; without records, remove the file."""
         if records:
             write_bytes(self.metrics, "".join(json.dumps(record) + "\n" for record in records).encode())
         else:
             remove(self.metrics)
 
     def read_metrics(self) -> list[Content]:
-        """Return the lines of metrics.jsonl, without an incomplete last one."""
+        """Return the records of metrics.jsonl. The last line is ignored if it is incomplete."""
         if not self.metrics.exists():
             return []
         records, lines = [], read_bytes(self.metrics, RunError).decode("utf-8", "replace").splitlines()
@@ -102,7 +104,7 @@ class RunFolder:
 
     def _no_run(self, missing: Path) -> RunError:
         expected = f"a folder with {missing.name}"
-        return RunError("no such run", file=self.path, expected=expected, do="spelgen train")
+        return RunError("no such run", file=self.path, expected=expected, do="make one with `spelgen train`")
 
     def read_record(self) -> Record:
         """Return config.json. Raises RunError if it is absent, broken, or has a key absent or of another type."""
@@ -121,7 +123,9 @@ class RunFolder:
     def load_state(self, path: Path) -> Content:
         """Return the content of checkpoint.pt or model.pt, on the CPU; only tensors and plain values are unpickled."""
         if not path.exists():
-            raise RunError(f"no {path.name}", file=self.path, expected="a run folder", do="spelgen train")
+            raise RunError(
+                f"no {path.name}", file=self.path, expected="a run folder", do="make one with `spelgen train`"
+            )
         require_regular_file(path, RunError)
         expected = "a file of `spelgen train`"
         try:
@@ -142,7 +146,7 @@ class RunFolder:
                     do="build the module again with `spelgen build`, and train it again with `spelgen train`",
                 )  # fmt: skip
             raise self._no_run(self.spec)
-        # the largest specification that `spelgen build` makes has a tenth of this size
+        # the limit of 1 MiB is ten times the size of the largest specification from `spelgen build`
         text = read_bytes(self.spec, ModuleError, "a specification of a model", 2**20)
         return spec_from_json(text.decode("utf-8", "replace"), self.spec)
 
@@ -152,10 +156,10 @@ class RunFolder:
 
 
 def _require_unpacked_size(path: Path) -> None:
-    """Raise ValueError if tensors would fill the memory: torch allocates the sizes that a file states."""
+    """Raise ValueError if the unpacked file is too large: torch allocates memory of the sizes that the file states."""
     with ZipFile(path) as archive:
         size = sum(member.file_size for member in archive.infolist())
-    # far more than a checkpoint with the state of an optimizer
+    # 512 MiB, far more than a checkpoint with the state of an optimizer
     if size > 2**29:
         raise ValueError(f"{size} bytes, expected at most {2**29}")
 
@@ -166,18 +170,18 @@ def _require_finite(weights: Content, path: Path) -> None:
         if not isinstance(tensor, Tensor):
             continue
         stored = tensor.untyped_storage()
-        # a shape may repeat a few numbers to any size
+        # A tensor of a huge shape may repeat a few stored numbers: only the stored numbers are tested.
         if tensor.numel() * tensor.element_size() > stored.nbytes():
             tensor = tensor.new_empty(0).set_(stored)
-        # a servo without an effort limit has an infinite one
+        # the limit of a servo without an effort limit is infinite
         if tensor.isnan().any() or (name != "servo.limit" and tensor.isinf().any()):
             do = "start a new run"
             raise RunError("no finite numbers", file=path, element=name, expected="weights", do=do)
 
 
 def write_state(path: Path, state: Content) -> None:
-    """Write a state with torch.save, all or nothing."""
-    # in memory first: an interruption does not change the former file
+    """Write a state in the format of torch.save, completely or not at all."""
+    # The state is serialized in memory first: an interruption does not change the existing file.
     buffer = io.BytesIO()
     torch.save(state, buffer)
     write_bytes(path, buffer.getvalue())

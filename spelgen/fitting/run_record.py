@@ -1,4 +1,4 @@
-"""The typed contents of a run folder's files, checked when they are read: the folder may come from elsewhere."""
+"""Typed contents of a run folder's files, checked when they are read, since the folder may come from another person."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from spelgen.settings.values import Count, NonNegative, Positive, Whole
 from spelgen.settings.yaml_document import validated
 
 Content = dict[str, Any]
-"""The content of a file of a run folder, by key: JSON, or a checkpoint of torch."""
+"""Content of a file of a run folder, key -> value: a JSON object, or a dictionary that torch saved."""
 
 Schema = TypeVar("Schema", bound=BaseModel)
-MAY_CHANGE = ("epochs", "patience", "max_minutes")  # between a run and its resumption
+MAY_CHANGE = ("epochs", "patience", "max_minutes")  # options that may differ when a run is resumed
 
 
 class Record(BaseModel):
-    """The record of a fit, which config.json keeps: the data, the settings as resolved, and the results.
+    """The record of a fit in config.json: the data, the settings with all defaults resolved, and the results.
 
-    config: the options that apply to the model; its type depends on the objective. joints: names in the order of q.
+    config: the options that apply to the model; the type depends on the objective. joints: names in the order of q.
     validation_fraction: None if validation logs were given. data_digest: SHA-256 of all numbers of the logs. training,
-    validation: names of the logs. scales: of the validation loss. mapping: with which the logs were read. servo:
-    parameters of position servos with intervals, when such a fit is finished. notes: messages of a fit to torques.
-    warnings: about the logs and the links of the URDF.
+    validation: names of the trajectories. scales: units of the errors in the validation loss. mapping: names and units
+    of the columns of the logs. servo: parameters of position servos with intervals; None unless a fit of servos has
+    finished. notes: messages of a fit to torques. warnings: warnings about the logs and the links of the URDF.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -69,8 +69,8 @@ class Record(BaseModel):
     @field_validator("config", mode="before")
     @classmethod
     def _of_the_objective(cls, options: object, info: ValidationInfo) -> object:
-        """Return the options as the objective's configuration."""
-        if "objective" not in info.data:  # an error of that key
+        """Return the options as an object of the objective's configuration class."""
+        if "objective" not in info.data:  # the objective is invalid, which pydantic reports
             return FitConfig()
         try:
             return validated(CONFIGS[info.data["objective"]], options)
@@ -92,7 +92,7 @@ class Record(BaseModel):
 
     @property
     def trajectories(self) -> int:
-        """Number of trajectories for training and validation; a trajectory that was cut counts once."""
+        """Number of trajectories; a trajectory that was cut into training and validation counts once."""
         return len(self.training) + sum(not name.endswith(LAST_PART) for name in self.validation)
 
     def to_dict(self) -> Content:
@@ -100,7 +100,7 @@ class Record(BaseModel):
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
     def require_same_run(self, resumed: Record, folder: Path) -> None:
-        """Raise RunError if `resumed`, the record of a resumed fit, has other data or settings."""
+        """Raise RunError if ``resumed``, the record of a resumed fit, has other data or settings than this record."""
         if self.data_digest != resumed.data_digest:
             do = "give the same --data or start a new run"
             raise RunError("other logs than the run was started with", file=folder, do=do)
@@ -119,11 +119,12 @@ class Record(BaseModel):
 
 
 class Checkpoint(BaseModel):
-    """The content of checkpoint.pt: the progress of a fit, and the states of its objective that it resumes from.
+    """The content of checkpoint.pt: the progress of a fit, and the state from which its objective resumes.
 
-    seconds: time of the fit [s]. substeps: integrator steps per sample interval. torque_nmse: mean squared torque error
-    divided by the variance, per joint. posterior: see `fitting.posterior`; None
-    except for rigid bodies fitted to torques. The last three belong to fits to windows. States are checked by torch.
+    seconds: duration of the fit [s]. substeps: integrator steps per sample interval. torque_nmse: mean squared torque
+    error divided by the variance of the torque, per joint. posterior: see `fitting.posterior`; None except for rigid
+    bodies fitted to torques. rollbacks, learning_rate_factor and momentum_done are states of fits to windows. Further
+    keys are states of an objective; torch checks their content.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -143,12 +144,16 @@ class Checkpoint(BaseModel):
 
     @property
     def content(self) -> Content:
-        """All that the file contains; states are not copied."""
+        """All keys and values of the file; tensors are not copied."""
         return {name: value for name, value in self if name in self.model_fields_set}
 
 
 class Epoch(BaseModel):
-    """A line of metrics.jsonl."""
+    """A line of metrics.jsonl: the state of a fit after an epoch.
+
+    step: number of optimizer steps so far. loss: mean training loss. validation: validation loss. best: lowest
+    validation loss so far. seconds: duration of the fit so far [s].
+    """
 
     epoch: Count
     step: Count
@@ -163,7 +168,7 @@ def require(schema: type[Schema], content: object, file: Path, line: int | None 
     try:
         return schema.model_validate(content)
     except ValidationError as error:
-        # one error suffices: a file that was written by a fit has none
+        # only the first error is reported: a file that a fit wrote has no error
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"]))
         message = f"{key}: {first['msg']}".removeprefix(": ")

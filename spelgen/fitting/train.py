@@ -35,11 +35,11 @@ def train(
 ) -> Fit:
     """Fit the module to the logs and write a run folder (see `RunFolder`); further arguments: see `fit`.
 
-    urdf: the robot that the module was built from, for the regularizer and the baselines; by default the file of this
-    name in the module's folder. source: without a module, a run whose model is adapted. config: a configuration, or
-    options for an objective that depends on the logs. require: function that raises an error for unusable logs before
-    the fit, or returns findings. validation, seed: by default 0.25 and 0. A resumed run uses the recorded values by
-    default, the mapping of its logs included.
+    module: the built module. data: log files. urdf: URDF that the module was built from, for the regularizer and the
+    baselines; by default, the file with the URDF's original name in the module's folder. source: run folder whose model
+    is adapted; used if there is no module. config: a configuration, or options for an objective that depends on the
+    logs. require: function that raises an error for unusable logs before the fit, or returns findings. validation,
+    seed: by default 0.25 and 0. A resumed run by default uses the recorded values and the recorded mapping of the logs.
 
     Raises ModuleError, LogError, and RunError if the folder contains a run or cannot be resumed with these arguments.
     """
@@ -54,7 +54,7 @@ def train(
         if preprocessing is AUTOMATIC:
             preprocessing = record.preprocessing
         options = replace(options, mapping=options.mapping or record.mapping)
-        # its weights come from the checkpoint
+        # `fit` loads the weights from the checkpoint
         model = run.untrained_model()
     else:
         model = load_module(module) if module is not None else fitted_model(RunFolder(source or folder))
@@ -79,7 +79,7 @@ def train(
 def robot_of(
     module: Path | None, urdf: Path | str | None, spec: ModelSpec
 ) -> tuple[Path | None, list[Diagnostic]]:
-    """Return the URDF to copy into the run, None without one, and diagnostics about it."""
+    """Return the path of the URDF to copy into the run folder, None without a URDF, and diagnostics about the URDF."""
     if urdf is not None:
         path = Path(urdf)
     elif module is not None:
@@ -94,7 +94,7 @@ def robot_of(
         raise ModuleError("another URDF than the module was built from", file=path, do=do)
     if urdf is not None:
         raise RunError("no such file", file=path, expected="the URDF the module was built from")
-    # a file next to the module was not requested: the fit continues without it
+    # The user specified no URDF, and the one next to the module is absent or changed: the fit continues without it.
     if exists:
         code = "changed-urdf"
         message = (

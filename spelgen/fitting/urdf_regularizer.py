@@ -1,6 +1,6 @@
-"""Regularizer towards the mass matrix and gravity torque of a URDF, for directions that the logs do not determine.
+"""Regularizer towards the mass matrix and gravity torque of a URDF, for parameters that the logs do not determine.
 
-The variation of M with q is compared, not its mean: rotors and loads that the URDF does not specify add constants.
+The variation of M with q is compared, not its mean: rotors and loads that the URDF does not specify add constants to M.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from spelgen.logs.windows import Windows
 class UrdfRegularizer(NamedTuple):
     """Variation of M and gravity torque of a URDF at S positions.
 
-    q: (S, n) [rad, m]. whitening: (n, n), inverse Cholesky factor of the model's mean M before the fit. variation:
-    (S, n, n) of M, whitened. gravity: (S, n) [Nm, N]. gravity_scale: (n,) [Nm, N], unit of its errors.
+    q: (S, n), positions [rad, m]. whitening: (n, n), inverse Cholesky factor of the model's mean M before the fit.
+    variation: (S, n, n) [1], whitened difference between M and its mean over the positions. gravity: (S, n), gravity
+    torque [Nm, N]. gravity_scale: (n,), unit of errors of the gravity torque [Nm, N].
     """
 
     q: Tensor
@@ -32,7 +33,7 @@ class UrdfRegularizer(NamedTuple):
     gravity_scale: Tensor
 
     def loss(self, model: ArmModel) -> Tensor:
-        """Return the mean squared difference of the model in M and in the gravity torque, (), both without unit."""
+        """Return the mean squared difference between model and URDF in the variation of M and in gravity, () [1]."""
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
         return variation.square().sum(dim=(-2, -1)).mean() / gravity.shape[-1] + gravity.square().mean()
@@ -45,12 +46,15 @@ class UrdfRegularizer(NamedTuple):
 def urdf_regularizer(
     urdf: Path | None, model: ArmModel, windows: Windows, notes: list[Diagnostic]
 ) -> UrdfRegularizer | None:
-    """Return the regularizer towards a URDF; None without one, or with a note if it cannot be read."""
+    """Return the regularizer towards a URDF; None without a URDF.
+
+    If the URDF cannot be read, a message is appended to ``notes``, and the result is None.
+    """
     if urdf is None or not urdf.exists():
         return None
     try:
         return _at_random_positions(urdf, model, windows)
-    # Pinocchio and its parser raise many types; the fit continues without a regularizer
+    # Pinocchio and its parser raise exceptions of many types; the fit continues without a regularizer
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         message = f"fitted without the URDF's regularizer: {reason}"
@@ -59,33 +63,33 @@ def urdf_regularizer(
 
 
 def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfRegularizer:
-    """Return the regularizer of a URDF at random positions in the range of a log.
+    """Return the regularizer of a URDF at random positions, uniformly distributed in the widened range of the logs.
 
     Args:
-        urdf: file.
-        model: its mean M before the fit is the unit of M.
-        windows: positions (W, K, n) [rad, m], whose range is widened.
+        urdf: URDF file.
+        model: model before the fit; the mean of its M is the unit of M.
+        windows: windows with the positions (W, K, n) [rad, m] of the logs.
 
     Raises:
-        ImportError: without Pinocchio, whose own errors are raised too.
+        ImportError: if Pinocchio is not installed. Errors of Pinocchio are raised, too.
     """
     dynamics = urdf_dynamics(urdf, model.joint_names)
     positions = windows.q.flatten(0, 1)
     low, high = positions.amin(dim=0), positions.amax(dim=0)
     margin = TUNING.regularizer_margin * (high - low)
     low, high = low - margin, high + margin
-    # a fixed seed: the same fit twice has the same regularizer
+    # the seed is fixed, so that repeated fits have the same regularizer
     generator, shape = torch.Generator().manual_seed(0), (TUNING.regularizer_points, model.n)
     q = low + (high - low) * torch.rand(shape, dtype=positions.dtype, generator=generator)
     with torch.no_grad():
         whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
     gravity = dynamics.gravity(q)
     scale = gravity.square().mean(dim=0).sqrt()
-    # without a gravity torque at any joint the unit is arbitrary
+    # 1.0: if no joint has a gravity torque, the unit is arbitrary
     scale = scale.clamp(min=TUNING.min_gravity_scale * scale.max().item() or 1.0)
     return UrdfRegularizer(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
 
 
 def _variation(mass: Tensor, whitening: Tensor) -> Tensor:
-    """Return W (M - mean M) W^T, (S, n, n), of M (S, n, n) and the whitening W (n, n)."""
+    """Return W (M - mean M) W^T, (S, n, n), for mass matrices M (S, n, n) and the whitening matrix W (n, n)."""
     return whitening @ (mass - mass.mean(dim=0)) @ whitening.mT

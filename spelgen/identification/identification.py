@@ -121,7 +121,7 @@ class Identification:
             "method": {
                 "weights": self.method.weights,
                 "coulomb_smoothing_velocity": friction.coulomb_smoothing_velocity,
-                "effects": list(friction.effects),
+                "effects": [effect.removesuffix(", joint ") for effect in friction.effects],
             },
             "torque_delay": {"delay": self.torque_delay.delay, "interval": self.torque_delay.interval},
             "condition": _finite(self.condition),

@@ -1,1 +1,1 @@
-"""Estimator of payload, friction drift and contact that runs on a robot."""
+"""Online estimator of payload, friction drift and contact."""

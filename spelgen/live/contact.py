@@ -11,7 +11,9 @@ from spelgen.live.tuning import TUNING
 
 
 class ContactState(NamedTuple):
-    """External torques and thresholds, (n,) [Nm, N]; touched: mask (n,) of torques above; force: at the tip [N]."""
+    """External torques and thresholds, (n,) [Nm, N]. touched: mask (n,) of torques above their thresholds. force: force
+    at the tip in root axes, (3,) [N].
+    """
 
     external_torque: np.ndarray
     threshold: np.ndarray
@@ -20,10 +22,10 @@ class ContactState(NamedTuple):
 
 
 class ContactObserver:
-    """First-order low-pass filter of the momentum balance, updated with each sample.
+    """Momentum observer: a first-order low-pass filter of the terms of the momentum balance, updated with each sample.
 
-    low: each low-passed term is a state, (15, n): torque, friction, its uncertainty, the momenta of the arm at two
-    bandwidths, and the regressor of the payload. baseline: disturbance that is no external torque, (n,) [Nm, N].
+    low: filter states, (15, n): torque, friction, uncertainty of friction, momenta of the arm at two bandwidths, and
+    regressor of the payload. baseline: slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -41,7 +43,8 @@ class ContactObserver:
     ) -> ContactState:
         """Return the external torques after a sample.
 
-        at: its terms. drift: friction scale minus one, and disturbance, (n, 2).
+        t: time [s]. qd: velocities, (n,). at: terms of the momentum balance at the sample. drift: friction scale minus
+        one, and disturbance [Nm, N], (n, 2).
         """
         signal, variance = self.residual(t, at, payload, drift)
         noise = np.sqrt(variance + np.square(self.levels.observer))
@@ -53,30 +56,33 @@ class ContactObserver:
     def residual(
         self, t: float, at: Balance, payload: Payload, drift: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low-pass filtered torque residual of model, payload and drift, and its variance, (n,) each.
+        """Return the low-pass filtered torque residual after model, payload and drift, and a variance, (n,) each.
 
-        The variance is due to changing accelerations, an unknown friction state and the payload; without the noise.
+        The variance is due to changing accelerations, an unknown friction state and the uncertain payload. It does not
+        include the noise of the observer.
         """
         rate = TUNING.bandwidth
         scale, disturbance = drift.T
         load = at.load_torque + rate * at.load_momentum
         free = at.torque - at.friction + rate * at.momentum
         inputs = np.stack([free, at.friction, at.uncertainty, at.momentum, at.momentum, *load.T])
-        # a contact may be as slow as a disturbance, and is none only as far as the training logs have disturbances
+        # A slow contact looks like a disturbance: limit the disturbance to values that occur in the training logs.
+        # The excess is treated as contact.
         largest = TUNING.outlier * self.levels.drift.disturbance
         disturbance = np.clip(disturbance, -largest, largest)
         if self.t is None:
-            # the steady state for constant inputs would be an external torque if the arm accelerates
+            # Start at a torque residual of zero. The steady state of the filters for constant inputs would show an
+            # external torque if the arm accelerates.
             self.low = inputs.copy()
             self.low[0], self.low[1], self.low[5:] = rate * at.momentum, 0.0, rate * at.load_momentum.T
             self.baseline = disturbance
         else:
             step = t - self.t
             gains = np.full((len(inputs), 1), 1 - np.exp(-rate * step))
-            # twice the bandwidth: the difference of two estimates of dp/dt is proportional to its rate
+            # Twice the bandwidth: the difference between two estimates of dp/dt shows how fast dp/dt changes.
             gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
-            # the disturbance of a joint in contact contains the contact
+            # The estimated disturbance of a joint in contact contains the contact torque: do not update the baseline.
             gain = np.where(self.touched, 0.0, 1 - np.exp(-step / TUNING.baseline))
             self.baseline = self.baseline + gain * (disturbance - self.baseline)
         self.t, self.inputs = t, inputs
@@ -96,12 +102,12 @@ def tip_force(jacobian: np.ndarray, torque: np.ndarray, threshold: np.ndarray) -
     """Return the weighted least-squares estimate of a force at the tip, (3,) [N], in root axes, from external torques.
 
     Args:
-        jacobian: of the tip, (3, n).
-        torque, threshold: external torques and their thresholds, (n,) [Nm, N].
+        jacobian: Jacobian of the tip's position in root axes, (3, n).
+        torque, threshold: external torques and their thresholds, (n,) [Nm, N]; weights are 1 / threshold^2.
     """
     weighted = jacobian / threshold**2
     matrix = weighted @ jacobian.T
-    # a force that no joint torque depends on is zero
+    # regularization: a force component that affects no joint torque is estimated as zero
     matrix += 1e-3 * np.trace(matrix) / 3 * np.eye(3)
     force: np.ndarray = np.linalg.solve(matrix, weighted @ torque)
     return force

@@ -28,9 +28,10 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class EstimatorState:
     """Estimates after a sample; vectors are (n,).
 
-    t [s]. refusal: "used", or the reason for which the sample was not used. contact: see `ContactState`. payload: of
-    the last report. load_changed: whether a change of the payload was detected at this sample. friction_scale: current
-    friction relative to the model [1]. disturbance: slow torque that neither model nor payload explains [Nm, N].
+    t: time of the sample [s]. refusal: "used", or the reason for which the sample was refused or used only in part.
+    contact: see `ContactState`. payload: last reported payload. load_changed: whether a change of the payload was
+    detected at this sample. friction_scale: current friction divided by the friction of the model [1]. disturbance:
+    slow torque that neither model nor payload explains [Nm, N].
     """
 
     t: float
@@ -43,10 +44,10 @@ class EstimatorState:
 
 
 class Estimator:
-    """The estimator of a fitted arm with rigid bodies under torques.
+    """Online estimator for a fit of a rigid-body model to torques.
 
-    ``step`` takes one measured sample; ``replay`` takes a log. Samples that are not finite or out of order,
-    and jumps, are refused and counted in ``refused``.
+    ``step`` processes one measured sample, ``replay`` a log. Samples with values that are not finite, samples out of
+    order and jumps are refused and counted in ``refused``.
     """
 
     def __init__(
@@ -56,10 +57,11 @@ class Estimator:
         levels: NoiseLevels | None = None,
         alarms_per_minute: float = TUNING.alarms_per_minute,
     ) -> None:
-        """Prepare the estimator of a fit. levels: by default of the fit. alarms_per_minute: rate of false contact
-        alarms.
+        """Prepare the estimator of a fit.
 
-        Raises RunError for a model without rigid bodies or with position servos, and for a fit without noise levels.
+        levels: noise levels, by default those stored with or computed for the fit. alarms_per_minute: rate of false
+        contact alarms. Raises RunError for a model without rigid bodies or with position servos, and for a fit without
+        noise levels.
         """
         self.model = torque_model(fit)
         self.levels = noise_levels(fit) if levels is None else levels
@@ -68,7 +70,7 @@ class Estimator:
         self.reset()
 
     def reset(self) -> None:
-        """Reset to unknown payload, friction drift and friction state."""
+        """Reset all states: payload, friction drift and friction state are then unknown."""
         n = self.model.n
         self.intake = Intake(self.levels, self.reach)
         self.blocks = Blocks(self.levels.rest_speed)
@@ -86,18 +88,18 @@ class Estimator:
         return {reason: count for reason, count in self.intake.counts.items() if count and reason != "used"}
 
     def step(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> EstimatorState:
-        """Use a sample: time [s], positions, velocities and measured torques, (n,); return the estimate."""
+        """Process a sample: time [s], positions, velocities and measured torques, (n,); return the estimates."""
         (state,) = self.steps(np.array([t]), *(np.array([x], dtype=float) for x in (q, qd, tau)))
         return state
 
     def replay(self, log: Trajectory) -> list[EstimatorState]:
-        """Return the estimates along a log."""
+        """Process all samples of a log; return the estimates after each sample."""
         return list(self.steps(log.t, log.q, log.qd, log.tau))
 
     def steps(
         self, t: np.ndarray, q: np.ndarray, qd: np.ndarray, tau: np.ndarray
     ) -> Iterator[EstimatorState]:
-        """Use samples, (T,) and (T, n); return their estimates."""
+        """Process samples at times t (T,), with q, qd and tau (T, n); yield the estimates after each sample."""
         refusals, terms = balance_along(self.model, self.levels, self.intake, t, (q, qd, tau))
         for now, speed, refusal, at in zip(t.tolist(), qd, refusals, terms, strict=True):
             changed = at is not None and self._advance(now, speed, at, refusal)
@@ -105,7 +107,7 @@ class Estimator:
             yield EstimatorState(now, refusal, self.contact, self.payload, changed, 1 + a, d)
 
     def _advance(self, t: float, qd: np.ndarray, at: Balance, refusal: Refusal) -> bool:
-        """Update all filters with the terms of a sample; return True if a change of the load was detected."""
+        """Update all filters with the terms of the momentum balance; return True if a changed load was detected."""
         if refusal != "used":
             self.blocks.restart()
             self.half = None
@@ -125,14 +127,18 @@ class Estimator:
         return changed
 
     def report(self) -> Payload:
-        """Estimate the payload and use it from the next step on; ``step`` calls this after each second of motion."""
+        """Estimate the payload, use it from the next sample on, and return it.
+
+        ``step`` calls this method after each second of motion and after a detected change of the load.
+        """
         main, before = self.estimate.filters[0], self.payload
         self.reported = self.estimate.moved
         self.payload = find_payload(
             main.x[:10], main.P[:10, :10], self.levels.load_variance, self.levels.load_quantile
         )
         if (before.status == "payload") != (self.payload.status == "payload"):
-            # the drift filter has attributed torques of the load to friction: it starts from the payload filter
+            # The drift filter assumed a wrong payload and attributed its torques to friction: restart it from the
+            # friction scale of the payload filter.
             joints = slice(10, 10 + self.model.n)
             self.drift = JointFilters.of_drift(self.levels.drift)
             self.drift.x[:, 0] = main.x[joints]
@@ -143,8 +149,9 @@ class Estimator:
         """Return the torques for accelerations qdd with the estimated payload and friction drift, (n,) [Nm, N].
 
         Args:
-            q, qd, qdd: (n,) [rad, m], per s, per s^2.
-            ahead: time from now until the motion [s]; the disturbance decays, and is omitted beyond 0.3 s.
+            q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (n,).
+            ahead: time between the last sample and the motion [s]. The disturbance decays with it, and is omitted
+                beyond 0.3 s.
         """
         at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
         z = torch.from_numpy((self.intake.low + self.intake.high) / 2)
@@ -152,7 +159,7 @@ class Estimator:
         with torch.no_grad():
             torque = self.model.inverse_dynamics(*at, *past)
             friction = self.model.friction_torque(*at[:2], *past)
-            # the payload moves with the last body
+            # the payload is fixed to the last body
             regressor = regressor_of(self.model.chain, *at)[..., -10:]
             load = regressor @ torch.from_numpy(self.payload.parameters)
             decay = np.zeros(1)

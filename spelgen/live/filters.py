@@ -1,8 +1,9 @@
-"""Kalman filters of the momentum balance over blocks: y = Phi theta + f a + b + d + w per joint.
+"""Kalman filters of the momentum balance, averaged over blocks of time: y = Phi theta + f a + b + d + w per joint.
 
-theta (10): payload, constant. a (n): friction scale minus one, a random walk. b (n): torque offset, constant. d (n):
-disturbance, an Ornstein-Uhlenbeck process. w: white noise. The rows of a block are used one after the other, so that
-a control loop can spread them over its samples.
+y: torque residual of the model. Phi, theta (10): regressor and inertial parameters of the payload, which is constant.
+f, a (n): friction of the model, and friction scale minus one, which is a random walk. b (n): torque offset, constant.
+d (n): disturbance, an Ornstein-Uhlenbeck process. w: white noise. The rows of a block are processed one after the
+other, so that a control loop can distribute them over its samples.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from spelgen.live.tuning import TUNING
 class Block(NamedTuple):
     """Means of the terms of the momentum balance over a block of samples.
 
-    duration [s]. y: torque residual of the model, (n,) [Nm, N]. load: regressor Phi of the payload, (n, 10).
-    friction: of the model, (n,) [Nm, N]. uncertainty: of friction whose state is not known exactly, (n,) [Nm, N].
-    moving: whether each joint moved, (n,).
+    duration: length of the block [s]. y: torque residual of the model without payload, (n,) [Nm, N]. load: regressor
+    Phi of the payload, (n, 10). friction: friction torque of the model, (n,) [Nm, N]. uncertainty: half width of the
+    possible friction torques if the friction state is not known exactly, (n,) [Nm, N]. moving: whether each joint
+    moved, (n,).
     """
 
     duration: float
@@ -35,9 +37,9 @@ class Block(NamedTuple):
     moving: np.ndarray
 
     def joined(self, later: Block) -> Block:
-        """Return one block for this block and the next one."""
+        """Return the block that joins this block and the next one."""
         duration = self.duration + later.duration
-        # means over time, so that the longer block counts more
+        # The terms are means over time: weight them by the durations of the blocks.
         weight = later.duration / duration
         y, load, friction, uncertainty = (
             a + weight * (b - a) for a, b in zip(self[1:5], later[1:5], strict=True)
@@ -46,28 +48,28 @@ class Block(NamedTuple):
 
 
 class Blocks:
-    """Accumulator of samples that returns a `Block` after each period of `TUNING.block` seconds; no low-pass filter."""
+    """Accumulator of samples that returns a `Block` of means after each period of `TUNING.block` seconds."""
 
     def __init__(self, rest_speed: np.ndarray) -> None:
         self.rest_speed = rest_speed
         self.restart()
 
     def restart(self) -> None:
-        """Discard the samples of the current block, after a gap."""
+        """Discard the samples of the current block, for example after a gap."""
         self.samples: list[tuple[float, np.ndarray, Balance]] = []
         self.duration = 0.0
 
     def add(self, t: float, qd: np.ndarray, at: Balance) -> Block | None:
-        """Add a sample: time [s], velocities (n,) and terms of the balance; return the block if it is complete."""
+        """Add a sample at time t [s], with velocities qd (n,) and terms `at`; return the block if it is complete."""
         step = t - self.samples[-1][0] if self.samples else 0.0
         self.samples.append((t, np.abs(qd), at))
-        # the sum of the steps, as the C code has it: t minus the first t rounds differently
+        # The emitted C code sums the steps, too. The difference to the first time would have other rounding errors.
         self.duration += step
-        # nearest to the length of a block: a sample more would be further from it
+        # End the block at the sample whose duration is nearest to the length of a block.
         if len(self.samples) == 1 or self.duration < TUNING.block - step / 2:
             return None
         block = self._block(self.duration)
-        # the last sample of a block is the first of the next one
+        # Blocks are contiguous: the last sample of a block is the first one of the next block.
         self.samples, self.duration = self.samples[-1:], 0.0
         return block
 
@@ -82,10 +84,11 @@ class Blocks:
 
 
 class LoadFilter:
-    """Filter of theta, a, b and d, in this order.
+    """Kalman filter of the payload theta together with a, b and d.
 
-    x: (10 + 3 n,). P: its covariance. log_likelihood: of the rows since its last reset. surprise: sum of the
-    normalised squared residuals of moving joints in the last block. disturbance: stationary variance of d, (n,).
+    x: state (theta, a, b, d), (10 + 3 n,). P: covariance of x. log_likelihood: log likelihood of all rows since its
+    last reset. surprise: sum of the normalised squared residuals of moving joints in the last block. disturbance:
+    stationary variance of d, (n,).
     """
 
     def __init__(self, noise: BlockNoise, effort: np.ndarray) -> None:
@@ -97,13 +100,13 @@ class LoadFilter:
         self.log_likelihood = self.surprise = 0.0
 
     def forget_load(self) -> None:
-        """Reset the payload to its prior distribution."""
+        """Reset the payload theta to the prior distribution."""
         self.x[:10] = 0.0
         self.P[:10] = self.P[:, :10] = 0.0
         self.P[:10, :10] = np.diag(TUNING.load_prior**2)
 
     def predict(self, duration: float) -> None:
-        """Advance the state by a time [s]."""
+        """Predict the state after a time [s]."""
         decay, growth = np.ones_like(self.x), np.zeros_like(self.x)
         decay[10 + 2 * self.n :] = np.exp(-duration / self.noise.time_constant)
         growth[10 : 10 + self.n] = TUNING.friction_walk * duration
@@ -113,14 +116,14 @@ class LoadFilter:
         self.surprise = 0.0
 
     def update(self, block: Block, joint: int) -> None:
-        """Update the state with the row of a joint; a joint at rest updates only its disturbance."""
+        """Update the state with the row of a joint. A joint at rest updates only the disturbance of this joint."""
         columns = [*range(10), *range(10 + joint, 10 + 3 * self.n, self.n)]
         row = np.array([*block.load[joint], block.friction[joint], 1.0, 1.0])
         covariance = self.P[:, columns] @ row
         noise = self.noise.white[joint] ** 2 + TUNING.uncertainty * block.uncertainty[joint] ** 2
         expected = float(row @ covariance[columns]) + noise
         residual = float(block.y[joint] - self.x[columns] @ row)
-        # Huber: the noise of an outlier is larger
+        # Huber's weights: an outlier is given a larger variance
         variance = max(expected, residual**2 / TUNING.outlier**2)
         gain = covariance / variance
         if block.moving[joint]:
@@ -128,7 +131,7 @@ class LoadFilter:
         else:
             gain[np.arange(len(gain)) != columns[-1]] = 0.0
         self.x += gain * residual
-        # Joseph's form: valid for a gain that is not the optimal one
+        # Joseph's form of the update is valid for any gain, also if it is not the optimal one.
         product = np.outer(gain, covariance)
         self.P += variance * np.outer(gain, gain) - product - product.T
         self.log_likelihood -= 0.5 * (np.log(variance) + residual**2 / variance)
@@ -137,22 +140,20 @@ class LoadFilter:
 class JointFilters:
     """Independent filters of the friction scale a and the disturbance d of each joint, for a known payload.
 
-    All joints are filtered at a time, and all hypotheses about their noise (...). K states: a first, d last, and the
-    offset b between them if there is one.
-
-    x: (..., n, K). P: its covariance, (..., n, K, K).
+    Filters of all joints, and of all hypotheses (...) about the noise, are vectorized. Each filter has K states: (a,
+    d), or (a, b, d) if there is a torque offset b. x: states, (..., n, K). P: covariances, (..., n, K, K).
     """
 
     def __init__(
         self, deviations: np.ndarray, white: np.ndarray, time_constant: np.ndarray, *, drifts: bool = False
     ) -> None:
-        """Begin with x = 0.
+        """Start with states of zero.
 
         Args:
-            deviations: prior standard deviations of the states, of d also the stationary one, (..., n, K).
-            white: standard deviations of white noise, (..., n).
-            time_constant: of d, (..., n) [s].
-            drifts: whether a is a random walk, and d is updated for joints at rest, too.
+            deviations: prior standard deviations of the states, (..., n, K); the one of d is also the stationary one.
+            white: standard deviations of white noise, (..., n) [Nm, N].
+            time_constant: time constant of d, (..., n) [s].
+            drifts: whether a is a random walk, and joints at rest update d, too.
         """
         self.x, self.P = np.zeros_like(deviations), deviations[..., None] ** 2 * np.eye(deviations.shape[-1])
         self.disturbance, self.white, self.time_constant = deviations[..., -1] ** 2, white**2, time_constant
@@ -160,15 +161,17 @@ class JointFilters:
 
     @classmethod
     def of_drift(cls, noise: BlockNoise) -> JointFilters:
-        """Return the filters of a and d that the estimator runs."""
+        """Return the filters of a and d for the estimator, whose friction scale drifts."""
         deviations = np.stack([np.full_like(noise.white, TUNING.friction), noise.disturbance], axis=-1)
         return cls(deviations, noise.white, noise.time_constant, drifts=True)
 
     def update(self, block: Block, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the state over a block, and update it with the torque of the block without the payload, (n,) [Nm, N].
+        """Predict the states over a block, and update them with a torque, (n,) [Nm, N].
+
+        torque: torque residual of the block minus the torque of the payload.
 
         Returns:
-            the residual of the prediction, and its variance by the model, (..., n).
+            Residual of the prediction, and its predicted variance, (..., n) each.
         """
         decay = np.ones_like(self.x)
         decay[..., -1] = np.exp(-block.duration / self.time_constant)
@@ -186,17 +189,17 @@ class JointFilters:
         used[:, -1] |= self.drifts
         gain = np.where(used, covariance / variance[..., None], 0.0)
         self.x = self.x + gain * residual[..., None]
-        # Joseph's form, for a gain that is optimal in some states and zero in the others
+        # This is Joseph's form if the gain is the optimal one for some states and zero for the others.
         product = gain[..., None] * covariance[..., None, :]
         self.P = self.P - np.where(used[..., None], product, product.swapaxes(-1, -2))
         return residual, expected
 
 
 class PayloadEstimate:
-    """The payload filter, and two more filters for the hypotheses of a changed load and of a contact.
+    """The payload filter, and temporarily two copies for the hypotheses of a changed load and of a contact.
 
-    The rows of a block (one per joint and filter) are spread over the samples of the next block, to bound the time per
-    sample. moved: time in motion since the start or the last change of load [s].
+    The rows of a block (one per joint and filter) are distributed over the samples of the next block, to limit the
+    computing time per sample. moved: time in motion since the start or the last change of the load [s].
     """
 
     def __init__(self, levels: NoiseLevels) -> None:
@@ -207,7 +210,7 @@ class PayloadEstimate:
         self.samples = self.per_sample = 0
 
     def start(self, block: Block) -> None:
-        """Process the remaining rows of the former block, and begin with this block."""
+        """Process the remaining rows of the previous block, and prepare the rows of this block."""
         for _ in self.rows:
             pass
         if block.moving.any():
@@ -218,7 +221,7 @@ class PayloadEstimate:
         self.rows = self._rows(block)
 
     def step(self) -> None:
-        """Process the share of rows of one sample."""
+        """Process the number of rows that is due at each sample."""
         self.samples += 1
         for _ in range(self.per_sample):
             next(self.rows, None)
@@ -234,7 +237,7 @@ class PayloadEstimate:
             yield
 
     def _compare(self, moving: int) -> None:
-        """Begin, accept or drop the hypotheses of a changed load and of a contact; moving: number of moving joints."""
+        """Start, accept or drop the hypotheses of a changed load and a contact; moving: number of moving joints."""
         main = self.filters[0]
         if len(self.filters) > 1:
             _, candidate, contact = self.filters
@@ -246,7 +249,7 @@ class PayloadEstimate:
             if self.hypotheses_moved >= least:
                 self.filters = [main]
         is_surprise = moving and main.surprise > moving + TUNING.surprise * math.sqrt(2 * moving)
-        # not before the payload filter has used the first second of motion
+        # In the first second of motion, residuals are large because the payload is unknown: test no hypotheses.
         if len(self.filters) == 1 and is_surprise and self.moved >= TUNING.changed_after:
             main.log_likelihood = self.hypotheses_moved = 0.0
             candidate, contact = copy.deepcopy(main), copy.deepcopy(main)

@@ -1,4 +1,4 @@
-"""Checks of each measured sample, and bounds of the friction state."""
+"""Plausibility checks of measured samples, and bounds of the unknown friction state."""
 
 from collections.abc import Sequence
 from typing import Literal, get_args
@@ -18,10 +18,11 @@ IGNORED: tuple[Refusal, ...] = ("not finite", "repeated", "reversed", "jump")
 
 
 class Intake:
-    """The last accepted sample, counts of samples by reason, and bounds low and high of the friction state, (n, K)
-    [rad, m].
+    """Checks of samples one after the other, and bounds of the friction state.
 
-    The bounds start at the break-away displacements. Motion of a joint makes them equal: its state is then known.
+    counts: number of samples for each result of the check. low, high: bounds of the friction state, (n, K) [rad, m].
+    The initial bounds are minus and plus the break-away displacements. Motion of a joint makes both bounds equal: the
+    friction state of the joint is then known.
     """
 
     def __init__(self, levels: NoiseLevels, bristles: BristleReach) -> None:
@@ -33,16 +34,16 @@ class Intake:
         self.low, self.high = -self.limit, self.limit
 
     def accept(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
-        """Check a sample, q, qd, tau (n,), update the bounds of the friction state, and return "used" or the reason."""
+        """Check a sample and update the bounds of the friction state; return "used" or the reason of a refusal."""
         refusal = self._check(t, q, qd, tau)
-        # after several in a row, clock or positions have changed permanently
+        # Several refused samples in a row show that the clock or the positions have changed permanently: restart.
         self.ignored += refusal in ("reversed", "jump")
         restarts = self.ignored >= TUNING.restart
         if refusal == "gap" or restarts or self.t == -np.inf:
             self.low, self.high = -self.limit, self.limit
             self.path = q.copy()
         elif refusal not in IGNORED:
-            # changes of one encoder step are rounding, not motion
+            # Position changes of one encoder step are treated as rounding, not as motion.
             path = np.clip(self.path, q - self.levels.encoder, q + self.levels.encoder)
             moved = path - self.path
             if self.bristles.motors is not None:
@@ -66,7 +67,7 @@ class Intake:
             return "jump"
         if t - self.t > TUNING.gap:
             return "used" if self.t == -np.inf else "gap"
-        # allowance for one encoder step, and for a sample with a delayed time stamp
+        # The limit includes one encoder step, and motion for `TUNING.block` seconds, since time stamps may be delayed.
         furthest = speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
         if (np.abs(q - self.q) > furthest).any():
             return "jump"
@@ -80,12 +81,14 @@ def balance_along(
     t: np.ndarray,
     samples: Sequence[np.ndarray],
 ) -> tuple[list[Refusal], list[Balance | None]]:
-    """Check samples; return the reasons why they are not used, and the terms of each that is not ignored.
+    """Check samples; return the result of each check, and the terms of the momentum balance at each sample.
+
+    The terms of ignored samples are None.
 
     Args:
-        model: in double precision.
-        levels: with the point whose Jacobian is among the terms.
-        intake: is updated.
+        model: model in double precision.
+        levels: noise levels, which include the point whose Jacobian is among the terms.
+        intake: checks of the samples; its state is updated.
         t: times, (T,) [s].
         samples: q, qd and tau, (T, n).
     """
@@ -97,7 +100,7 @@ def balance_along(
     used = [k for k, refusal in enumerate(refusals) if refusal not in IGNORED]
     terms: list[Balance | None] = [None] * len(t)
     if used:
-        # all samples at once: a call of torch takes longer than the arithmetic of a sample
+        # All samples are computed in one call, since a call of torch takes longer than the arithmetic of one sample.
         low, high = np.array([bounds[k] for k in used]).swapaxes(0, 1)
         columns = balance(model, levels.point, [x[used] for x in samples], (low, high))
         for k, *row in zip(used, *columns, strict=True):

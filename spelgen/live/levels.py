@@ -1,6 +1,7 @@
-"""Noise levels of a fit: read from its run folder, or else estimated by cross-validation on its logs.
+"""Noise levels of a fit, which are read from the run folder or estimated by cross-validation on the training logs.
 
-The torque residual of each log is of a model that was fitted to other logs: the residual of the fit would be too small.
+The noise is estimated from the torque residual of a model that was fitted to other logs: the residual of the logs to
+which a model was fitted would be too small.
 """
 
 import itertools
@@ -38,7 +39,7 @@ from spelgen.settings.fits import TorqueFit
 
 
 def noise_levels(fit: Fit) -> NoiseLevels:
-    """Return the noise levels of a fit. Raises RunError if they are unknown, and cannot be found."""
+    """Return the stored or estimated noise levels of a fit. Raises RunError if they cannot be read or estimated."""
     levels = stored_levels(fit)
     if levels is not None:
         return levels
@@ -53,7 +54,7 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 
 
 def keep_levels(fit: Fit, levels: NoiseLevels | None = None) -> None:
-    """Write noise levels into the run folder of a fit; None: estimate them first, if the fit is to torques."""
+    """Write noise levels into the run folder of a fit; levels None: estimate them if the fit is to torques."""
     of_torques = isinstance(fit.config, TorqueFit) and isinstance(fit.model, RigidBodyDynamics)
     if levels is None and of_torques and fit.logs:
         levels = cross_validated_levels(fit)
@@ -73,7 +74,7 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
     """Return the noise levels by cross-validation: each fold of the logs is held out of a fit."""
     logs, count = list(fit.logs), TUNING.folds
     if len(logs) == 1:
-        # parts of one log
+        # A single log is divided into parts, so that a part can be held out.
         ends = np.linspace(0, len(logs[0]), count + 1).astype(int)
         logs = [logs[0][start:stop] for start, stop in itertools.pairwise(ends)]
     folds = [logs[k::count] for k in range(min(count, len(logs)))]
@@ -85,16 +86,15 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
         tested.append((fitted_to(fit, others), fold))
     levels = find_levels(tested, effort, tip)
-    # rounded to the digits that a run folder contains
+    # Serialization rounds the numbers: return the same numbers as a later read of the run folder.
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
 
 def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
-    """Return the model of a fit, fitted to other logs from its initial parameters. Raises LogError for too little
-    motion.
+    """Return a new model of the same kind as the model of a fit, fitted to other logs from the initial parameters.
 
-    A part of the samples suffices to estimate the error on other logs. Without residual terms in the fit, none are
-    selected.
+    A subset of the samples suffices to estimate the error on further logs. If the fit has no residual terms, none are
+    selected here. Raises LogError for too little motion.
     """
     model = assemble(required_spec(fit.model)).double()
     if residual_terms(without_idle_residuals(fit.model)) is None:
@@ -113,7 +113,10 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
 
 
 def limits(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
-    """Return the torque limits of an arm, (n,), infinite if unknown, and its tip in the last body's frame, (3,)."""
+    """Return the torque limits of an arm, (n,) [Nm, N], infinite if unknown, and the position of the tip, (3,) [m].
+
+    The position is in the frame of the last body; it is zero if another body carries the tip.
+    """
     effort = np.array([joint.effort or np.inf for joint in arm.chain.coordinates])
     tip = tip_frame(arm)
     is_last = tip.carrier == len(arm.chain.bodies) - 1
@@ -121,9 +124,10 @@ def limits(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
 
 
 class HeldOutSample(NamedTuple):
-    """A sample of a log, with its terms by a model that was not fitted to the log; vectors are (n,).
+    """A sample of a log, with the terms of a model that was not fitted to the log; vectors are (n,).
 
-    t [s]. is_resumed: whether it is the first one after a gap. block: that it ends.
+    t: time [s]. at: terms of the momentum balance. is_resumed: whether the sample is the first one after a gap. block:
+    the block that ends at this sample, or None.
     """
 
     t: float
@@ -153,17 +157,17 @@ def find_levels(
     """Return the noise levels of an arm from held-out logs.
 
     Args:
-        folds: models, each with the logs that it was not fitted to.
-        effort: limits of the torque, (n,) [Nm, N]; infinite if unknown.
-        point: the tip in the frame of the last body, (3,) [m].
+        folds: models, each with the held-out logs, to which the model was not fitted.
+        effort: torque limits, (n,) [Nm, N]; infinite if unknown.
+        point: position of the tip in the frame of the last body, (3,) [m].
     """
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    # without the noise, which is found with these
+    # These levels have no noise yet: they are needed to compute the samples from which the noise is estimated.
     levels = NoiseLevels.model_construct(
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
-        # no limit is below the largest logged torque
+        # A limit below the largest logged torque would be wrong.
         effort=np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest),
         minutes=sum(log.duration for log in logs) / 60,
         point=point,
@@ -180,9 +184,10 @@ def find_levels(
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
     """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
 
-    The logs are without payload: each estimate is an error. Windows of blocks in a row are independent trials. The
-    squared normalised estimates of the mass, and of mass and first moments, are averaged together with the prior. The
-    largest average counts: errors of the model average out slowly, so that longer windows may be worse.
+    The logs are without payload, so each estimated payload is an error. Windows of consecutive blocks are independent
+    trials. Two normalised squared errors are averaged over the trials together with the prior: of the mass, and of mass
+    and first moments. The factor is the largest average over both errors and all window lengths: errors of the model
+    average out slowly, so that longer windows may have larger normalised errors.
     """
     factors = []
     for window in TUNING.trial_blocks:
@@ -206,10 +211,10 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
 
 
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
-    """Return the noise of maximum likelihood over a grid, per joint; segments: consecutive blocks, for each log.
+    """Return the maximum-likelihood noise of each joint, over a grid; segments: consecutive blocks of each log.
 
-    The model is y = f a + b + d + w per joint (see `live.filters`); white noise has its own scale for each point of
-    the grid.
+    The model is y = f a + b + d + w per joint (see `live.filters`). The grid has the time constant of d, and the ratio
+    of the standard deviations of d and w. The scale of w is estimated for each point of the grid.
     """
     grid = np.array(list(itertools.product(TUNING.time_constants, TUNING.disturbance_ratios)))
     typical = np.median(np.abs([x.y for blocks in segments for x in blocks]), axis=0) + 1e-9
@@ -225,19 +230,19 @@ def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
 def _likelihood(
     segments: Sequence[Sequence[Block]], grid: np.ndarray, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the negative log likelihood and the mean normalised squared residual, (grid, n).
+    """Return the negative log likelihood and the mean normalised squared residual, (G, n) each.
 
     Args:
-        segments: consecutive blocks, for each log.
-        grid: time constants and ratios, (grid, 2).
-        scale: standard deviations of white noise, (grid, n).
+        segments: consecutive blocks of each log.
+        grid: time constant [s] and ratio at each of G points, (G, 2); see `block_noise`.
+        scale: standard deviations of white noise, (G, n) [Nm, N].
     """
     constant, ratio = grid.T[:, :, None]
     cost, squares, count = np.zeros((3, *scale.shape))
-    # of a, b and d; the offset is within a few standard deviations of the noise
+    # prior standard deviations of a, b and d; the offset b is within a few standard deviations of white noise
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
-        # the noise of motion is estimated from moving joints only
+        # Without drift, joints at rest do not update the filters: the noise in motion is estimated.
         filters = JointFilters(prior, scale, constant)
         for block in blocks:
             residual, expected = filters.update(block, block.y)
@@ -249,7 +254,7 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
-    """Return the levels completed by the noise of the momentum observer and the exponential tail of its peaks."""
+    """Return the levels with the noise of the momentum observer and the exponential tail of its peaks added."""
     columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     times = np.array([sample.t for samples in tested for sample in samples])
     for samples in tested:
@@ -267,7 +272,7 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
     levels = levels.model_copy(update=_observer_noise(signal, qd, levels))
     beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
     ratio = beyond / np.sqrt(variance + np.square(levels.observer))
-    # peaks of neighbouring samples are one event: the largest of each window counts
+    # Large values at neighbouring samples are one event, so only the largest value of each time window counts.
     starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
     peaks = np.maximum.reduceat(ratio, starts, axis=0)
     start = np.quantile(peaks, 1 - TUNING.tail, axis=0)
@@ -276,16 +281,20 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
 
 
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:
-    """Return the noise of the observer in motion and at rest, of maximum likelihood over a grid; arrays are (T, n)."""
+    """Return the maximum-likelihood noise of the observer in motion and at rest, over a grid.
+
+    signal: torque residual of the observer, (T, n) [Nm, N]. qd: velocities, (T, n).
+    """
     best: dict[str, np.ndarray] = {}
     lowest = np.full(len(levels.speed), np.inf)
     for speed, ratio in itertools.product(TUNING.resting_speeds, TUNING.resting_ratios):
         shape = 1 + np.square(ratio * np.exp(-np.abs(qd) / (speed * levels.speed)))
-        # 0.455 is the median of the squared standard normal distribution; peaks have their own distribution
+        # The median is used because peaks are modelled separately; 0.455 is the median of a squared standard normal
+        # variable.
         level = np.sqrt(np.median(signal**2 / shape, axis=0) / 0.455)
         level = np.maximum(level, TUNING.min_observer_noise * levels.effort)
         normalised = np.abs(signal) / (level * np.sqrt(shape))
-        # Huber's cost: quadratic up to the outliers, then linear
+        # Huber's cost is quadratic for residuals up to TUNING.outlier, and linear beyond.
         inner = np.minimum(normalised, TUNING.outlier)
         cost = np.mean(np.log(level**2 * shape) + inner * (2 * normalised - inner), axis=0)
         found = {

@@ -1,10 +1,10 @@
-"""Terms of the momentum balance of an arm and of a payload at its last body, at measured states.
+"""Terms of the momentum balance, at measured states, of an arm with a payload that is fixed to the last body.
 
 The generalised momentum p = M qd of the arm, and P theta of a payload with the ten inertial parameters theta, obey
 
     d/dt (p + P theta) = G (tau - offset) + dL/dq - friction + N theta + external torque,
 
-with L the Lagrangian (De Luca and Mattone, ICRA 2005): no acceleration is needed.
+with L the Lagrangian of the arm (De Luca and Mattone, ICRA 2005). The balance contains no accelerations.
 """
 
 from collections.abc import Sequence
@@ -19,15 +19,15 @@ from spelgen.dynamics.protocol import is_stateful
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
-_BLOCK = 2048  # samples that are computed at a time
+_BLOCK = 2048  # samples computed at a time, to limit the memory
 
 
 class Balance(NamedTuple):
     """Terms of the momentum balance at samples, (T, n) or (T, n, 10), in SI units.
 
-    momentum: p. torque: G (tau - offset) + friction compensation + dL/dq. friction: at the middle of the bounds of the
-    friction state. uncertainty: half the difference of friction at both bounds. load_momentum: P. load_torque: N.
-    jacobian: of a point of the last body, (T, 3, n), in root axes.
+    momentum: p. torque: G (tau - offset) + friction compensation + dL/dq. friction: mean of the friction torques at
+    both bounds of the friction state. uncertainty: half the difference of the friction torques at both bounds.
+    load_momentum: P. load_torque: N. jacobian: Jacobian of a point of the last body, (T, 3, n), in root axes.
     """
 
     momentum: np.ndarray
@@ -44,17 +44,17 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
 
     Args:
         chain: kinematics of the bodies.
-        q, qd: (T, n).
-        point: in the frame of the last body, (3,) [m].
+        q, qd: positions and velocities, (T, n).
+        point: position of the point in the frame of the last body, (3,) [m].
     """
-    # with the columns of the frames in place of points
+    # The columns of homogeneous transforms replace points of the bodies.
     pose = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
     velocities, _, turning = chain.motion(pose, qd)
     frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(-2, -3)  # (T, 1, 4, 4)
-    velocity = velocities[..., -1, :]  # of the frame, (T, 3, 4)
+    velocity = velocities[..., -1, :]  # velocity of the frame of the last body, (T, 3, 4)
     axes, turned = (torch.unflatten(x.mT @ chain.motions, -1, (3, 4)) for x in (pose.axes, turning))
-    # derivatives of the frame of the last body with respect to q, and their rates, (T, n, 3, 4): only the bodies that
-    # carry it contribute
+    # Derivatives of the frame of the last body with respect to q, and the rates of these derivatives, (T, n, 3, 4).
+    # Only joints that carry the last body contribute.
     ratios = chain.carriers[:, -1:] * chain.ratios
     changes = axes @ frame, turned @ frame + axes[..., :3] @ velocity.unsqueeze(-3)
     jacobian, rate = (torch.einsum("bn,tbxa->tnxa", ratios, change) for change in changes)
@@ -74,8 +74,8 @@ def balance(
     """Return the terms of the momentum balance at samples.
 
     Args:
-        model: in double precision.
-        point: of the last body, in its frame, whose Jacobian is returned, (3,) [m].
+        model: model in double precision.
+        point: point of the last body, in the frame of this body, whose Jacobian is returned, (3,) [m].
         samples: q, qd and tau, (T, n).
         bounds: lower and upper bound of the friction state, (T, n, K) [rad, m].
     """

@@ -1,4 +1,4 @@
-"""Noise levels of an arm, which are found from its training logs and stored with the run as estimator.json."""
+"""Noise levels of an arm, which are estimated from the training logs and stored in the run folder as estimator.json."""
 
 import math
 from typing import Annotated
@@ -20,14 +20,14 @@ def _vector(values: object) -> np.ndarray:
 Vector = Annotated[
     np.ndarray, BeforeValidator(_vector), PlainSerializer(lambda x: [float(f"{v:.6g}") for v in x.tolist()])
 ]
-"""Numbers of the joints, (n,)."""
+"""One number per joint, (n,)."""
 
 
 class BlockNoise(BaseModel):
     """Noise of the momentum balance over blocks of one length.
 
     white, disturbance: standard deviations of white noise and of a stationary Ornstein-Uhlenbeck process, (n,) [Nm, N].
-    time_constant: of the process, (n,) [s].
+    time_constant: time constant of the Ornstein-Uhlenbeck process, (n,) [s].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -40,12 +40,14 @@ class BlockNoise(BaseModel):
 class NoiseLevels(BaseModel):
     """Noise levels and limits of an arm that the estimator uses in addition to its model; vectors are (n,).
 
-    drift, load: noise of blocks of both filters. observer: standard deviation of the momentum observer of a moving
-    joint. resting: three more standard deviations of a joint at rest [Nm, N], which fall with exp(-|qd| /
-    resting_speed) [rad/s, m/s]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer,
-    beyond the largest fifth. load_variance: factor on the covariance of payloads, an estimate with load_freedom
-    degrees of freedom. speed: largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m]. effort:
-    torque limit [Nm, N]. minutes: duration of the training logs. point: tip in the frame of the last body, (3,) [m].
+    drift, load: noise of the blocks of the drift filter and of the payload filter. observer: standard deviation of the
+    momentum observer for a moving joint [Nm, N]. resting: additional threshold for a joint at rest, which is three
+    standard deviations of the additional noise [Nm, N] and decreases with exp(-|qd| / resting_speed). resting_speed:
+    [rad/s, m/s]. peak_start, peak_scale: start and scale of the exponential tail of the normalised observer's peaks;
+    the tail is the largest fifth of the peaks. load_variance: factor on the covariance of estimated payloads, an
+    estimate with load_freedom degrees of freedom. speed: largest speed of the training logs [rad/s, m/s]. encoder:
+    encoder step of positions [rad, m]. effort: torque limit [Nm, N]. minutes: duration of the training logs [min].
+    point: position of the tip in the frame of the last body, (3,) [m].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -74,8 +76,8 @@ class NoiseLevels(BaseModel):
     def load_quantile(self) -> float:
         """Half width of 95 % intervals of a payload, in standard deviations: Student's t, for an estimated variance.
 
-        The variance was found without payload, which is right for the evidence. With one, errors are not smaller than
-        in the prior: friction grows with the load.
+        `load_variance` was estimated without a payload, and is used as is to decide whether there is one. With a
+        payload, friction and its errors are larger, so that the variance in the intervals is at least the prior value.
         """
         with_load = max(TUNING.prior_variance / self.load_variance, 1.0)
         return float(stdtrit(self.load_freedom, 0.975)) * math.sqrt(with_load)
@@ -86,19 +88,23 @@ class NoiseLevels(BaseModel):
         return 1 / self.minutes
 
     def resting_torque(self, qd: np.ndarray) -> np.ndarray:
-        """Return the error of friction near standstill, at velocities (..., n), (..., n) [Nm, N].
+        """Return the bound of the friction error near standstill, (..., n) [Nm, N], at velocities qd (..., n).
 
-        It is bounded, and so it is added to thresholds, in which the noise is multiplied by its rarest peaks.
+        The error is bounded, so it is added to the thresholds. Noise in contrast has rare peaks, so thresholds contain
+        a multiple of it.
         """
         torque: np.ndarray = self.resting * np.exp(-np.abs(qd) / self.resting_speed)
         return torque
 
     @property
     def tail_peaks(self) -> float:
-        """Number of peaks of all joints in the exponential tail per minute."""
+        """Number of peaks in the exponential tail per minute, for all joints together [1/min]."""
         return 60 / TUNING.window * TUNING.tail * len(self.observer)
 
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
-        """Return the thresholds of the normalised observer, (n,), for a total rate of false alarms of all joints."""
+        """Return the thresholds of the normalised observer, (n,) [1].
+
+        alarms_per_minute: rate of false alarms of all joints together [1/min].
+        """
         tail = self.peak_start + self.peak_scale * math.log(self.tail_peaks / alarms_per_minute)
         return TUNING.other_days * np.maximum(tail, 1.0)

@@ -1,10 +1,10 @@
-"""The payload from the state of the payload filter: physically consistent, or none.
+"""Estimate of a physically consistent payload, or of "no payload", from the state of the payload filter.
 
-The likelihood of the ten inertial parameters theta is the filter's Gaussian with its prior removed. The prior of a
-payload is a Wishart distribution of its pseudo-inertia with 6 degrees of freedom, so that the negative log posterior
-is convex and its minimum is physically consistent (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018). Prior means of
-several masses are compared with "no payload" by Laplace's approximation of the evidence (MacKay, Neural Computation
-4:415, 1992).
+The likelihood of the ten inertial parameters theta is the Gaussian of the filter after removal of the filter's prior.
+The prior of a payload is a Wishart distribution of the pseudo-inertia with 6 degrees of freedom. The negative log
+posterior is then convex, and its minimum is physically consistent (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
+Priors with mean payloads of several masses are compared with "no payload" by Laplace's approximation of the evidence
+(MacKay, Neural Computation 4:415, 1992).
 """
 
 import math
@@ -26,12 +26,13 @@ _UNITS = pseudo_inertia(torch.eye(10).double()).numpy()
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """Inertial parameters that the last body carries in addition to the arm, in its frame; zero without a payload.
+    """Payload that is fixed to the last body, in the frame of this body; all values are zero without a payload.
 
-    status: "not yet" if the motion does not determine it. log_odds: of "no payload" against a payload. limit: upper
-    limit of the mass, 95 %, for any status [kg]. mass [kg], center (3,) [m], inertia about the centre of mass (xx,
-    xy, xz, yy, yz, zz) [kg m^2]: with lower and upper limits of 95 % intervals, (..., 2). parameters: (10,), m, m c,
-    and the inertia about the origin of the frame. covariance: of the parameters, (10, 10).
+    status: "payload", "no payload", or "not yet" if the motion does not determine which. log_odds: log odds of "no
+    payload" against a payload. limit: 95 % upper limit of the mass, for any status [kg]. mass [kg], center (3,) [m],
+    inertia about the centre of mass (xx, xy, xz, yy, yz, zz) [kg m^2]: each with lower and upper limits of 95 %
+    intervals, (..., 2). parameters: mass m, first moments m c, and inertia about the origin of the frame, (10,).
+    covariance: covariance of the parameters, (10, 10).
     """
 
     status: Status = "not yet"
@@ -51,14 +52,14 @@ NO_REPORT = Payload()
 
 
 def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quantile: float) -> Payload:
-    """Return the payload for the estimate of the payload filter, mean (10,) and covariance (10, 10).
+    """Return the payload for the estimate of the payload filter.
 
-    "not yet" also if rounding errors make a matrix indefinite.
+    The status is "not yet", too, if rounding errors make a matrix indefinite.
 
     Args:
-        mean, covariance: of the filter, whose prior is removed.
-        factor: on the covariance of the likelihood.
-        quantile: half width of the intervals in standard deviations.
+        mean, covariance: estimate of the filter, (10,) and (10, 10), including the filter's prior.
+        factor: factor by which the covariance of the likelihood is multiplied (`NoiseLevels.load_variance`).
+        quantile: half width of the 95 % intervals in standard deviations.
     """
     try:
         return _found_payload(mean, covariance, factor, quantile)
@@ -78,7 +79,7 @@ def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quan
     log_odds = float(math.log(len(found)) - logsumexp(evidence))
     weights = softmax(evidence)
     theta = weights @ thetas
-    # of a mixture: the mean covariance, and the covariance of the means
+    # covariance of a mixture = mean of the covariances + covariance of the means
     spread = np.tensordot(weights, inverses, 1) + np.cov(thetas.T, ddof=0, aweights=weights)
     limit = theta[0] + quantile * math.sqrt(spread[0, 0])
     if log_odds > TUNING.payload_odds:
@@ -87,7 +88,7 @@ def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quan
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive definite matrix, whose entries may differ by orders of magnitude."""
+    """Return the inverse of a positive definite matrix (k, k) whose entries may differ by orders of magnitude."""
     root = solve_triangular(np.linalg.cholesky(matrix), np.eye(len(matrix)), lower=True)
     inverse: np.ndarray = root.T @ root
     return inverse
@@ -98,12 +99,13 @@ def _at_scale(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the MAP estimate, its covariance, and the log evidence, for a prior mean of mass ``scale``.
 
-    Newton's method for weight (1/2 theta^T precision theta - linear . theta) - 1/2 log det J + 1/2 tr(W^-1 J), from
-    ``start``, or from the prior mean with an increasing weight: the likelihood may be largest far outside of the cone
-    of consistent parameters, at whose boundary Newton's method would stall (Boyd and Vandenberghe, Convex
-    Optimization, 2004, 11.3). Twice the cost is self-concordant: steps damped by its decrement are feasible (9.6.4).
+    Newton's method minimizes weight (1/2 theta^T precision theta - linear . theta) - 1/2 log det J + 1/2 tr(W^-1 J),
+    with the pseudo-inertia J of theta and the scale matrix W of the Wishart prior. It starts at ``start`` with a weight
+    of one, or at the prior mean with an increasing weight: the maximum of the likelihood may be far outside of the cone
+    of consistent parameters, at whose boundary Newton's method would stall (Boyd and Vandenberghe, Convex Optimization,
+    2004, 11.3). Twice the cost is self-concordant, so that steps damped by the Newton decrement are feasible (9.6.4).
     """
-    # a ball, whose centre is off the origin along z
+    # The prior mean is a ball whose centre is at a distance from the origin along z.
     height, about_z = TUNING.distance, 2 / 5 * TUNING.radius**2
     about_x = about_z + height**2
     mean = scale * np.array([1, 0, 0, height, about_x, 0, 0, about_x, 0, about_z])
@@ -121,7 +123,7 @@ def _at_scale(
             step = inverse @ gradient
             decrement = gradient @ step
             theta = theta - step / (1 + math.sqrt(2 * decrement) if decrement > 0.01 else 1)
-            # the error after a full step is about the square of the one before
+            # Newton's method converges quadratically, so this decrement is small enough.
             if decrement < (0.1 if power else 1e-12):
                 break
     inertia = np.einsum("i,iab->ab", theta, _UNITS)
@@ -133,9 +135,9 @@ def _at_scale(
 def _described(
     theta: np.ndarray, covariance: np.ndarray, quantile: float, log_odds: float, limit: float
 ) -> Payload:
-    """Return the payload with parameters (10,) and their covariance (10, 10); intervals by linearisation."""
+    """Return the payload with parameters theta (10,) and their covariance (10, 10); intervals are linearised."""
     values = _mass_center_inertia(theta)
-    # derivatives by complex steps, which have no rounding error (Squire and Trapp, SIAM Review 40:110, 1998)
+    # Complex-step derivatives have no cancellation errors (Squire and Trapp, SIAM Review 40:110, 1998).
     tiny = 1e-30
     steps = [_mass_center_inertia(theta + tiny * 1j * unit).imag for unit in np.eye(10)]
     jacobian = np.array(steps).T / tiny
@@ -149,7 +151,7 @@ def _described(
 
 
 def _mass_center_inertia(theta: np.ndarray) -> np.ndarray:
-    """Return mass, centre of mass and inertia about it (xx, xy, xz, yy, yz, zz), (10,), of parameters (10,)."""
+    """Return mass, centre of mass, and inertia (xx, xy, xz, yy, yz, zz) about it, (10,), of parameters (10,)."""
     center = theta[1:4] / theta[0]
     about_origin = theta[0] * (center @ center * np.eye(3) - np.outer(center, center))
     return np.concatenate([theta[:1], center, theta[4:] - about_origin[np.triu_indices(3)]])

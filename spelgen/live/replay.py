@@ -1,4 +1,4 @@
-"""The estimator along recorded logs: payload, contacts and drift, as `spelgen estimate` reports them."""
+"""Estimates of payload, contacts and friction drift along recorded logs, for `spelgen estimate`."""
 
 import textwrap
 from collections.abc import Sequence
@@ -18,7 +18,11 @@ from spelgen.logs.trajectory import Trajectory, require_torques
 
 @dataclass(frozen=True)
 class ContactEvent:
-    """A contact: begin and end from the start of the log [s], joints, their largest torques [Nm, N], force [N]."""
+    """A contact along a log.
+
+    begin, end: times from the start of the log [s]. joints: names of the joints in contact. torques: largest external
+    torque of each of these joints [Nm, N]. force: largest force at the tip [N].
+    """
 
     begin: float
     end: float
@@ -31,9 +35,9 @@ class ContactEvent:
 class LogEstimate:
     """The estimates along a log.
 
-    states: of each sample. payload: at the end. since: time of its first report [s], None without one. changes: times
-    of changed loads [s]. drift: friction at the end relative to the model, per joint [%]. refused: counts of samples
-    by reason.
+    states: estimates after each sample. payload: estimate at the end of the log. since: time at which this payload was
+    first reported [s]; None without a payload. changes: times of detected changes of the load [s]. drift: difference of
+    friction at the end of the log from the model, per joint [%]. refused: number of refused samples for each reason.
     """
 
     log: Trajectory
@@ -47,7 +51,7 @@ class LogEstimate:
     refused: dict[str, int]
 
     def to_dict(self) -> dict[str, object]:
-        """Return the content of the JSON result."""
+        """Return the estimates as content of a JSON file."""
         return {
             "log": self.log.name,
             "seconds": self.log.duration,
@@ -60,7 +64,7 @@ class LogEstimate:
         }
 
     def text(self) -> str:
-        """Return the lines of the text result."""
+        """Return the lines of the text for users."""
         lines = [f"{self.log.name}: {payload_sentence(self.payload)}"]
         if self.since is not None:
             lines.append(f"  reported first at {self.since:.1f} s")
@@ -83,7 +87,7 @@ class LogEstimate:
 
 
 def payload_content(payload: Payload) -> dict[str, object]:
-    """Return a payload as JSON."""
+    """Return a payload as content of a JSON file."""
     content: dict[str, object] = {"status": payload.status, "log_odds_of_no_payload": payload.log_odds}
     if np.isfinite(payload.limit):
         content["mass_limit"] = payload.limit
@@ -96,7 +100,7 @@ def payload_content(payload: Payload) -> dict[str, object]:
 
 
 def payload_sentence(payload: Payload) -> str:
-    """Return mass and centre of mass with their 95 % intervals, or why there are none."""
+    """Return a text with mass and centre of mass and their 95 % intervals, or the reason why there are none."""
     if payload.status == "payload":
         low, high = payload.mass_interval
         center = ", ".join(
@@ -111,12 +115,12 @@ def payload_sentence(payload: Payload) -> str:
 
 
 def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None = None) -> list[LogEstimate]:
-    """Return the estimates along logs, each from its start.
+    """Return the estimates along each log; the estimator is reset at the start of a log.
 
     Args:
-        fit: of an arm under torques.
-        logs: of this arm.
-        alarms_per_minute: rate of false alarms of contact; None: default.
+        fit: fit of an arm's model to torques.
+        logs: logs of the same arm.
+        alarms_per_minute: rate of false contact alarms [1/min]; None: default.
     """
     require_torques(logs)
     estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
@@ -146,11 +150,12 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
 
 
 def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
-    """Return the payload that an arm carries in all of these logs, one after the other."""
+    """Return the estimated payload of an arm that carries the same payload in all given logs."""
     estimator, begin = Estimator(fit), 0.0
     for log in logs:
         t = log.t - log.t[0] + begin
-        # the pause between two logs is longer than the longest gap
+        # The logs are processed as one recording with pauses. A pause exceeds the longest gap, so that the friction
+        # state is reset.
         begin = float(t[-1]) + 2 * TUNING.gap
         for _ in estimator.steps(t, log.q, log.qd, log.tau):
             pass
@@ -158,7 +163,7 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
 
 
 def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> list[ContactEvent]:
-    """Return the contacts in consecutive estimates."""
+    """Return the contacts in the estimates after consecutive samples; joints: names of the joints."""
     touching = [state for state in states if state.contact.touched.any()]
     ends = np.flatnonzero(np.diff([state.t for state in touching]) > TUNING.merged) + 1
     events = []
@@ -167,7 +172,7 @@ def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> l
         torques = np.array([state.contact.external_torque for state in group])
         touched = np.array([state.contact.touched for state in group])
         named = np.flatnonzero(touched.any(axis=0)).tolist()
-        # the largest torque of a joint, among the samples at which this joint is touched
+        # For each joint, find the largest torque among the samples at which it exceeds the threshold of the joint.
         peaks = np.where(touched, np.abs(torques), 0.0).argmax(axis=0)[named]
         events.append(
             ContactEvent(

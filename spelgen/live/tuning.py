@@ -1,4 +1,4 @@
-"""Constants of the estimator; noise levels are found from the training logs (`live.levels`)."""
+"""Constants of the online estimator. Noise levels are no constants: `live.levels` estimates them from training logs."""
 
 import math
 from dataclasses import dataclass
@@ -11,24 +11,25 @@ from scipy.special import multigammaln
 class LiveTuning:
     """Constants of the estimator, chosen by `benchmarks/live.py`."""
 
-    # Blocks and friction state (`live.estimator`).
+    # Constants of blocks and of the friction state (`live.estimator`).
 
     # [s] Length of a block of the drift filter; the payload filter has blocks of twice this length.
     block: float = 0.1
-    # [s] Longest time between two samples of a block; a gap makes the friction state unknown.
+    # [s] Longest time between two samples of a block. After a longer gap the friction state is unknown.
     gap: float = 0.25
     # [1] A sample whose positions change faster than this multiple of the largest speed of the training logs is
     # refused.
     jump: float = 10.0
-    # [1] Refused samples in a row after which the estimator restarts at the new positions.
+    # [1] Number of consecutive refused samples after which the estimator restarts at the new positions.
     restart: int = 5
     # [1] A joint is at rest below this fraction of its largest speed in the training logs.
     rest: float = 0.01
 
-    # Filters (`live.filters`).
+    # Constants of the filters (`live.filters`).
 
-    # [kg, kg m, kg m^2] Prior standard deviations of mass, first moments and inertia of a payload of 10 kg. The report
-    # removes this prior: larger ones only add rounding errors.
+    # [kg], [kg m], [kg m^2] The next three constants are prior standard deviations of the mass, the first moments and
+    # the inertia of a payload (as of 10 kg) in the payload filter. The final estimate removes this prior, so that a
+    # wider prior would only add rounding errors.
     load_mass: float = 10.0
     load_moment: float = 2.0
     load_inertia: float = 0.4
@@ -38,91 +39,97 @@ class LiveTuning:
     friction_walk: float = 3e-5
     # [1] Prior standard deviation of the torque offset, relative to the effort limit.
     offset: float = 0.01
-    # [1] Residuals beyond this number of standard deviations have a larger noise (Huber, Robust Statistics, 1981).
+    # [1] Residuals beyond this number of standard deviations are treated as outliers, with a larger noise variance
+    # (Huber, Robust Statistics, 1981).
     outlier: float = 3.0
-    # [1] Factor on the variance of friction whose state is unknown: a uniform distribution has 1/3 of the squared
-    # half width; friction within it is correlated over a block.
+    # [1] Variance of friction with an unknown friction state, divided by the squared half width of the possible
+    # friction torques. A uniform distribution has 1/3. The value is larger, since the error is correlated over a
+    # block.
     uncertainty: float = 3.0
 
-    # Changed loads (`live.estimator`).
+    # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
 
-    # [1] Number of standard deviations above which the squared residuals of a block start the hypothesis of a changed
-    # load.
+    # [1] The hypothesis of a changed load starts if the sum of the squared residuals of a block exceeds its mean by
+    # this number of standard deviations.
     surprise: float = 3.0
     # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
     contact_disturbance: float = 8.0
-    # [1] Log likelihood ratio, and [s] time in motion, from which on a changed load is accepted.
+    # A changed load is accepted if the log likelihood ratio exceeds `changed` [1], but not before `changed_after` [s]
+    # of motion.
     changed: float = 15.0
     changed_after: float = 1.0
-    # [s] Time in motion after which the hypotheses are dropped; after `changed_after` if the log likelihood ratio is
-    # below `unlikely`.
+    # The hypotheses are dropped after `dropped_after` [s] of motion, or already after `changed_after` if the log
+    # likelihood ratio is below `unlikely` [1].
     unlikely: float = -8.0
     dropped_after: float = 4.0
 
-    # Contacts (`live.contact`).
+    # Constants of the detection of contacts (`live.contact`).
 
     # [1/s] Bandwidth of the momentum observer.
     bandwidth: float = 20.0
-    # [1] Smallest standard deviation of the momentum observer, relative to the effort of a joint: logs without noise
-    # give positive thresholds.
+    # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so
+    # that logs without noise give positive thresholds.
     min_observer_noise: float = 1e-3
-    # [s] Time constant at which the disturbance is removed from the external torque: longer than it takes to find a
-    # contact, so that the disturbance does not absorb the contact.
+    # [s] Time constant with which the estimated disturbance is subtracted from the external torque. Contacts are
+    # detected in less time, so that the disturbance does not absorb them.
     baseline: float = 0.3
-    # [1] Factor on the thresholds: errors of models are larger on other days than between training logs.
+    # [1] Factor on the thresholds: errors of a model are larger on later days than between training logs.
     other_days: float = 1.22
-    # [1/min] Default rate of false alarms.
+    # [1/min] Default rate of false contact alarms.
     alarms_per_minute: float = 1.0
-    # [s] Window of the peaks from which thresholds are found, and the fraction of the peaks in the exponential tail.
+    # Thresholds are computed from the largest residual in each time window of `window` [s]. The fraction `tail` [1] of
+    # these peaks is modelled by an exponential distribution.
     window: float = 0.5
     tail: float = 0.2
 
-    # Payload (`live.payload`).
+    # Constants of the estimate of the payload (`live.payload`).
 
     # [s] Time in motion between two reports of the payload.
     report: float = 1.0
-    # [m] Radius of gyration and distance along z of the prior mean of a payload.
+    # [m] The prior mean of a payload is a ball: its radius, and the distance of its centre from the origin along z.
     radius: float = 0.2
     distance: float = 0.05
-    # [kg] Masses of the prior means that are compared.
+    # [kg] Masses of the prior means, of which the evidence is compared.
     scales: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-    # [1] Log odds of "no payload" below which a payload is reported, and above which there is none.
+    # [1] Log odds of "no payload" against a payload. A payload is reported below `payload_odds`, no payload above
+    # `no_payload_odds`, and "not yet" between both.
     payload_odds: float = -5.0
     no_payload_odds: float = 3.0
 
     # [1] Degrees of freedom of the Wishart prior of the pseudo-inertia.
     degrees: int = 6
-    # [1] Newton's method with an increasing weight of the likelihood: number of weights 4^-k below one, and largest
-    # number of steps for each.
+    # [1] Newton's method increases the weight of the likelihood from 4^-weights to 1 by factors of 4, with at most
+    # `iterations` steps for each weight.
     weights: int = 12
     iterations: int = 40
-    # [s] Predictions up to this time ahead contain the disturbance.
+    # [s] Torques that are predicted at most this time ahead include the estimated disturbance.
     disturbance_ahead: float = 0.3
 
-    # Noise levels (`live.levels`).
+    # Constants of the estimation of noise levels (`live.levels`).
 
-    # [1] Folds of the logs, samples of motion that a fit to the others needs, and samples that it uses at most.
+    # [1] The logs are divided into `folds`, which are held out one at a time. A fit to the other folds needs at least
+    # `min_samples` samples of motion, and uses at most `max_samples`.
     folds: int = 3
     min_samples: int = 300
     max_samples: int = 2**11
-    # [s] Time constants of the disturbance that are compared, and [1] its standard deviation divided by the one of
-    # white noise.
+    # The grid of the noise: time constants of the disturbance [s], and standard deviations of the disturbance divided
+    # by the standard deviation of white noise [1].
     time_constants: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
     disturbance_ratios: tuple[float, ...] = (0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5)
-    # [1] Lengths of the trials of the payload filter, in blocks: 5 and 10 s.
+    # [1] Lengths of the trials of the payload filter, as numbers of blocks: 5 and 10 s.
     trial_blocks: tuple[int, ...] = (25, 50)
-    # [1] Prior of the factor on the covariance of payloads, and the number of trials that it counts as: arms with few
-    # logs have too few trials of their own.
+    # [1] Prior value of the factor on the covariance of payloads, which has the weight of `prior_trials` trials: logs
+    # of an arm often have too few trials for an estimate.
     prior_variance: float = 2.25
     prior_trials: int = 4
-    # [1] Speeds below which friction errs more that are compared, relative to the largest speed, and ratios of the
-    # noise at rest to that in motion.
+    # [1] The grid of the noise near standstill: speeds below which the noise increases, relative to the largest speed,
+    # and additional noise at rest divided by the noise in motion.
     resting_speeds: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
     resting_ratios: tuple[float, ...] = (0, 1, 2, 4, 8, 16)
 
-    # Reports (`live.replay`).
+    # Constants of reports (`live.replay`).
 
-    # [s] Contacts closer than this are one.
+    # [s] Contacts separated by less than this time are reported as one contact.
     merged: float = 0.2
 
     @property
@@ -132,7 +139,7 @@ class LiveTuning:
 
     @property
     def evidence(self) -> float:
-        """Constant of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of Laplace's Gaussian."""
+        """Constant terms of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of the Gaussian."""
         wishart = 2 * self.degrees * math.log(2) + float(multigammaln(self.degrees / 2, 4))
         return 5 * math.log(2 * math.pi) - math.log(2) - wishart
 

@@ -12,7 +12,7 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.listing import Listing, number
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
-from spelgen.logs.checks import Findings, run_checks
+from spelgen.logs.checks import Check, Findings, run_checks
 from spelgen.logs.filtering import derivative
 from spelgen.logs.joint_signals import is_factor, mapping_line
 from spelgen.logs.trajectory import Trajectory, delayed_commands, require_commands, split_at_gaps
@@ -29,6 +29,42 @@ DELAYS = np.linspace(-0.1, 0.4, 51).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # [1] fewest samples of a gap-free piece, which the smoothing polynomial needs
 FOLLOWS = SIGNALS.agreement
+# Encoders of bus servos have 2**k counts per turn, with k from 10 to 14. Positions in degrees therefore have the same
+# quantisation step at all joints: 360/2**k, or 360/(2**k - 1) with LeRobot. LeRobot's normalised positions have another
+# step at each joint: 200 divided by the counts of the joint's calibrated range.
+# NORMALISED_RANGE: largest magnitude of a normalised position. NORMALISED_STEPS: smallest and largest quantisation step
+# of normalised positions, for calibrated ranges of 800 to 5000 counts.
+NORMALISED_RANGE, NORMALISED_STEPS = 100.001, (0.04, 0.25)
+# SAME_STEP: relative difference below which the steps of all joints count as equal. ENCODER_STEP: relative difference
+# below which a step counts as a step of an encoder.
+SAME_STEP, ENCODER_STEP = 1e-3, 4e-3
+
+
+def find_normalised(joints: Sequence[JointReport]) -> str | None:
+    """Find normalised positions of LeRobot that the mapping declares as degrees.
+
+    Normalised positions have another quantisation step at each joint, positions in degrees have the encoder's step.
+    """
+    if max(joint.largest("q") for joint in joints) > np.radians(NORMALISED_RANGE):
+        return None
+    found = {joint.name: float(np.degrees(joint.steps["q"])) for joint in joints if joint.steps["q"]}
+    steps = np.array(list(found.values()))
+    low, high = NORMALISED_STEPS
+    if len(steps) < 2 or steps.min() < low or steps.max() > high or np.ptp(steps) < SAME_STEP * steps.max():
+        return None
+    turns = 360 / steps
+    is_encoder = np.abs(turns / 2 ** np.round(np.log2(turns)) - 1) < ENCODER_STEP
+    if is_encoder.mean() > 0.5:
+        return None
+    values = ", ".join(f"{name} {step:.4f}" for name, step in found.items())
+    return f"degrees of another step for each joint ({values}), as LeRobot's normalised positions have"
+
+
+NORMALISED = Check(
+    "normalised", "error", find_normalised, expected="degrees, with the step of the encoders (4096 counts: 0.0879)",
+    do="write 'units: {q: normalised}' and 'calibration:' with the content of LeRobot's calibration file under 'logs' "
+    "in the robot's YAML",
+)  # fmt: skip
 
 
 class Following(NamedTuple):
@@ -134,6 +170,10 @@ class ServoLogs:
             kp = self._arm.settings.joint(coordinate.name).kp
             if coordinate.effort and kp:
                 saturation[k] = coordinate.effort / kp
+        mapping = self._logs[0].mapping
+        if all(mapping.unit("q", name) == "deg" for name in names):
+            for normalised, found in run_checks([NORMALISED], reports, self._logs[0].accepted):
+                summary.add(normalised, found.message, "all joints")
         following = measure_following(self._logs, saturation)
         if following is None:
             message = f"no {FILTER_SAMPLES} samples without a gap: no servo is determined"
@@ -145,7 +185,7 @@ class ServoLogs:
                 report = replace(report, following=following.joints[k])
                 # True if the logger wrote measured positions in place of commands
                 is_copy = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in self._logs)
-                odd = _odd_command(k, names, report, following, is_copy, self._logs[0].mapping)
+                odd = _odd_command(k, names, report, following, is_copy, mapping)
             completed.append(report)
             if isinstance(odd, LogError):
                 summary.errors.append(odd)
@@ -183,16 +223,16 @@ def _odd_command(
             "commands-are-positions",
             "u is q, to the last bit: are the commands those that were sent?",
         )
-    # a constant command contains no information on the servo
-    elif not following.moves[k]:
-        width = report.high["u"] - report.low["u"]
-        code, message = "idle-command", f"its command moves by {width:.3g} alone: its servo is not determined"
     # a ratio of amplitudes of about 57.3 or 1/57.3 shows that the command or the position is in degrees
     elif correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         units = {"q": "deg", "u": "rad"} if gain > 1 else {"q": "rad", "u": "deg"}
         do = mapping_line({"joints": {joints[k]: {"units": units}}})
         return LogError(got, element=where, expected="both in radians", do=do)
+    # a constant command contains no information on the servo
+    elif not following.moves[k]:
+        width = report.high["u"] - report.low["u"]
+        code, message = "idle-command", f"its command moves by only {width:.3g}: its servo is not determined"
     elif correlation < -FOLLOWS:
         got = f"positions that move against commands (correlation {correlation:.2g})"
         return LogError(got, element=where, expected="one sense", do="check the signs of q and u")

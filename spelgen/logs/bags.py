@@ -18,6 +18,7 @@ import pyarrow as pa
 from spelgen.errors import LogError, in_one_line
 from spelgen.files import limited_memory, require_regular_file
 from spelgen.labels import counted
+from spelgen.logs.joint_signals import mapping_line
 from spelgen.logs.tables import LogFormat, LogTable, table_layout
 from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
@@ -85,7 +86,8 @@ def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[st
                 f"a message with the joints {', '.join(state.name)}",
                 f"{', '.join(missing)} in it too",
             )
-            raise LogError(got, file=path, element=element, expected=expected)
+            do = "record one message with the states of all joints of the arm, as joint_state_broadcaster publishes"
+            raise LogError(got, file=path, element=element, expected=expected, do=do)
         indices, row = [state.name.index(name) for name in names], []
         for field in FIELDS.values():
             logged = np.asarray(getattr(state, field), dtype=float)
@@ -98,13 +100,25 @@ def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[st
         rows.append(row)
     if not rows:
         got = f"joint states of {', '.join(other_names) or 'no joint'} only"
-        raise LogError(got, file=path, expected=", ".join(names), do="map the joints' names under 'logs'")
+        raise LogError(got, file=path, expected=", ".join(names), do=_names_line(names, list(other_names)))
     columns = {"t": (np.array(times) - times[0]) * 1e-9}
     for quantity, by_joint in zip(FIELDS, np.array(rows).transpose(1, 2, 0), strict=True):  # (3, n, T)
         if not np.isnan(by_joint).all():
             for name, values in zip(names, by_joint, strict=True):
                 columns[PLAIN[quantity].replace("{joint}", name)] = values
     return pa.table(columns)
+
+
+def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
+    """Return the advice to map joint names to names in the log.
+
+    names: names of the joints that were not found. logged: joint names in the log. If exactly one logged name ends with
+    each joint's name, as with a prefix, the advice contains the settings.
+    """
+    found = {name: [x for x in logged if x.endswith(name)] for name in names}
+    if any(len(each) != 1 for each in found.values()):
+        return "map the joints' names under 'logs'"
+    return mapping_line({"joints": {name: {"name": each[0]} for name, each in found.items()}})
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:

@@ -75,7 +75,13 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         return _dataset_mapping(file, joints)
     if log_format is None or log_format.columns is None:
         suffixes = [x.suffixes[0] for x in FORMATS if x.columns is not None]
-        raise LogError(f"a file of kind {file.suffix!r}", file=file, expected=" or ".join(suffixes))
+        got = (
+            f"a file of kind {file.suffix!r}"
+            if log_format is None
+            else "messages of ROS, with names and units"
+        )
+        do = "other names of joints are mapped by 'name' under 'logs', 'joints'" if log_format else None
+        raise LogError(got, file=file, expected=" or ".join(suffixes), do=do)
     with reading(file):
         table = log_format.columns(file)
     columns = [_column_name(name) for name in _names(table)]

@@ -186,7 +186,12 @@ def _renaming(
     named = [
         joint for names in of_quantity.values() for x, joint in zip(names, joints, strict=True) if x == name
     ]
-    unused = [column for column in columns if column not in chain(*of_quantity.values())]
+    # columns of accelerations are not proposed for a missing torque: files of `excite` contain both
+    unused = [
+        x
+        for x in columns
+        if x not in chain(*of_quantity.values()) and not x.lower().startswith(("qdd", "acc"))
+    ]
     for close in difflib.get_close_matches(name, unused, n=5):
         if names_joint(close, "".join(named[-1:])):
             return f"rename the column {close!r} to {name!r}?"

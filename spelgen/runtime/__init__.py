@@ -1,4 +1,4 @@
-"""The classes that a module written by `spelgen build` is made of; they depend on PyTorch only."""
+"""The classes and functions that modules of `spelgen build` consist of; they depend on PyTorch only."""
 
 from spelgen.runtime.derived_mass import ConstantMass, DenseMass, DerivedMass
 from spelgen.runtime.friction_laws import FrictionLaws, SlidingFriction

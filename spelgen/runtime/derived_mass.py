@@ -1,6 +1,8 @@
-"""M(q) from the fewest functions and constants: M = sum_j f_j(q) B_j + sum_k c_k A_k + armature.
+"""Mass matrices M(q) from functions and constants: M = sum_j f_j(q) B_j + sum_k c_k A_k + armature.
 
-Also M from constants only, and M^-1(q) over all three axes of every joint, without any structure of the arm.
+The matrices B_j and A_k are derived from the structure of the arm, with the minimum number of functions
+and constants. Other classes have a constant M, or an M^-1(q) over three axes per joint without any
+structure.
 """
 
 import math
@@ -17,7 +19,7 @@ from spelgen.runtime.rows import Constant, Function, Joint, vector
 
 
 class LinearMass(nn.Module):
-    """The constants and the armature of an M that is linear in functions of q and constants."""
+    """Base class of an M that is linear in functions of q and constants: the constants and the armature."""
 
     parameter_groups = (
         ("raw_constants", "mass_constants", "kg m^2, kg m, kg"),
@@ -40,7 +42,7 @@ class LinearMass(nn.Module):
             self.function_scale = nn.Buffer(vector(f.scale for f in functions))
         self.raw_constants = nn.Parameter(vector(x.initial / x.scale for x in constants))
         self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
-        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # logarithm
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # log(ratio to nominal)
 
     def armature(self) -> Tensor:
         """Return the rotor inertia on the joint side, part of the diagonal of M, (n,) [kg m^2, kg]."""
@@ -52,9 +54,9 @@ class LinearMass(nn.Module):
 
 
 class ConstantMass(LinearMass):
-    """M, (..., n, n), that does not depend on q: ``entries(*constants)`` and the armature.
+    """A mass matrix that does not depend on q: M = ``entries(*constants)`` + armature, (..., n, n).
 
-    The absolute values of the constants are used, so that M stays positive definite.
+    The absolute values of the trained constants are used, so that M is positive definite.
     """
 
     def constants(self) -> Tensor:
@@ -66,27 +68,27 @@ class ConstantMass(LinearMass):
         return self.entries(*self.constants().unbind()) + torch.diag(self.armature())
 
     def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return M, (..., n, n), and the encoding, (..., 2 n), which has the shape of its derivatives."""
+        """Return M, (..., n, n), and the encoding, (..., 2 n), as the shape of the derivatives of M."""
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Tensor) -> Tensor:
-        """Return d(1/2 qd^T M qd) / d encoding, (..., 2 n): zero."""
+        """Return d(1/2 qd^T M qd) / d encoding, (..., 2 n), which is zero."""
         return torch.zeros_like(intermediates)
 
     def jvp(self, rate: Tensor, intermediates: Tensor) -> Tensor:
-        """Return dM/dt, (..., n, n): zero."""
+        """Return dM/dt, (..., n, n), which is zero."""
         n = len(self.raw_armature)
         return rate.new_zeros(*rate.shape[:-1], n, n)
 
 
 class DerivedMass(LinearMass):
-    """M(q), (..., n, n): ``entries(*functions, *constants)`` and the armature.
+    """A mass matrix linear in learned functions: M(q) = ``entries(*functions, *constants)`` + armature.
 
-    M is positive definite for all q and all parameters: if M - margin C is not, with C the nominal mean of
-    M, it is replaced by M' = C + t (M - C). t = 2^-k is the first such power with t |M - C| <= 1 - margin,
-    where |.| is an upper bound of the norm relative to C. t is piecewise constant, so that the derivatives
-    of M' are t times the derivatives of M. C has the zeros and linear relations of M, which therefore
-    hold in M'.
+    The result is positive definite for all q and all parameters. C is the nominal mean of M. M is
+    replaced by M' = C + t (M - C) if M - margin C is not positive definite, where t is the largest of
+    1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin, and |.| is an upper bound of the norm relative to
+    C. Since t is piecewise constant, the derivatives of M' are t times the derivatives of M. C has the
+    same zeros and linear relations between entries as M, so M' has them, too.
     """
 
     def __init__(
@@ -102,48 +104,49 @@ class DerivedMass(LinearMass):
         super().__init__(joints, entries, constants=constants, functions=functions)
         self.network = network
         center = self._by_outputs()[-1].detach()
-        self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)  # C and margin C
+        self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)  # C, margin C
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # bound of the norm relative to C per entry of M - C, divided by 1 - margin
+        # Factors on the entries of M - C: the Frobenius norm of the product is an upper bound of the
+        # norm of M - C relative to C, divided by 1 - margin.
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
-        """Return dM / d output per output of the network, then M at zero outputs, (outputs + 1, n, n)."""
-        # M is linear in the outputs: unit outputs, and then the means with the constants, give all
-        # coefficients.
+        """Return dM / d output for each network output, then M at zero outputs, (outputs + 1, n, n)."""
+        # M is linear in the outputs, so unit outputs give the derivatives; the last column has the
+        # means of the functions and the constants.
         functions = torch.cat([torch.diag(self.function_scale), self.function_mean.unsqueeze(-1)], dim=1)
         constants = F.pad(self.constants().unsqueeze(-1), (len(functions), 0))
         return self.entries(*functions.unbind(), *constants.unbind())
 
     def prepare(self) -> Layers:
-        """Return the layers that give the entries of M."""
+        """Return the layers of a network whose outputs are the entries of M."""
         rows = self._by_outputs()
-        # This linear map is composed with the last layer, so that the network returns the entries of M.
+        # The linear map from functions to entries of M is included in the weights of the last layer.
         offset = rows[-1] + torch.diag(self.armature())
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
-        """Return M'(q), (..., n, n), and the intermediates of its derivatives: of the network, and t."""
+        """Return M'(q), (..., n, n), and the intermediates of the network and t, for derivatives."""
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
         fraction = self.fraction(mass.detach())
         return torch.lerp(self.center, mass, fraction[..., None, None]), (intermediates, fraction)
 
     def fraction(self, mass: Tensor) -> Tensor:
-        """Return t, (...), of matrices M, (..., n, n)."""
-        # cholesky_ex reports a failure per matrix of the batch; cholesky would raise an error for all of
-        # them.
+        """Return the factor t, (...), for matrices M, (..., n, n); 1 if M needs no change."""
+        # cholesky_ex reports which matrices of a batch are not positive definite; cholesky would raise
+        # an error.
         indefinite = torch.linalg.cholesky_ex(mass - self.smallest).info != 0
-        # The Frobenius norm of the scaled difference: an upper bound of its spectral norm.
+        # The Frobenius norm of the scaled difference is an upper bound of the spectral norm.
         norm = torch.linalg.vector_norm(self.unit * (mass - self.center), dim=(-2, -1))
         return torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(norm)).clamp(min=1.0)), 1.0)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
         network, fraction = intermediates
-        # d(1/2 qd^T M' qd) / dM' = 1/2 qd qd^T and dM' = t dM, with the network's output M and constant t.
+        # The network's outputs are M. d(1/2 qd^T M' qd) / dM' = 1/2 qd qd^T, and dM' = t dM.
         half = 0.5 * fraction.unsqueeze(-1) * qd
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
@@ -155,19 +158,19 @@ class DerivedMass(LinearMass):
 
 
 class DenseIntermediates(NamedTuple):
-    """Values of the computation of M that its derivatives need."""
+    """Intermediate values of ``DenseMass.forward`` for the derivatives of M, in the symbols of the class."""
 
     network: Intermediates
-    factor: Tensor  # U
-    moved: Tensor  # U^-1 A, with A the moving columns of C^-1
-    scale: Tensor  # e
+    factor: Tensor  # U without its diagonal of ones, (..., 3 n, 3 n)
+    moved: Tensor  # U^-1 A, (..., 3 n, n)
+    scale: Tensor  # e, (..., 3 n)
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
-    """Return C, (3 n, 3 n), lower triangular: C C^T is the nominal mean of M^-1 over all axes.
+    """Return lower triangular C, (3 n, 3 n), with C C^T the nominal mean of M^-1 over three axes per joint.
 
-    ``mean`` is the lower triangle of the nominal mean of M without armature. A joint moves along z; its
-    inertia about the other axes is assumed to be equal.
+    ``mean`` is the lower triangle of the nominal mean of M without armature. A joint moves along z; the
+    inertia about x and y is assumed to be equal to the inertia about z.
     """
     n = len(joints)
     mass = torch.zeros(n, n, dtype=torch.float64)
@@ -181,12 +184,12 @@ def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
 
 
 class DenseMass(nn.Module):
-    """M(q), (..., n, n), from M^-1 = C U diag(e) U^T C^T over all axes, (3 n, 3 n).
+    """A mass matrix M(q), (..., n, n), from its inverse over three axes per joint: C U diag(e) U^T C^T.
 
-    C is the Cholesky factor of the nominal mean, U lower triangular with ones on its diagonal and
-    e > 0, both outputs of a network: the Cholesky factorisation without square roots. Joints do not move
-    along their axes x and y, so M is the moving block of the inverse:
-    (U^-1 A)^T diag(1 / e) U^-1 A, where A is the moving columns of C^-1.
+    C is the Cholesky factor of the nominal mean of M^-1. A network gives U, which is lower triangular
+    with ones on the diagonal, and e > 0: a Cholesky factorisation without square roots. Joints move
+    along their z axes only, so M is the z block of the inverted matrix: (U^-1 A)^T diag(1 / e) U^-1 A,
+    where A has the z columns of C^-1.
     """
 
     def __init__(self, joints: Sequence[Joint], *, mean: Rows, network: MaskedNetwork) -> None:
@@ -196,30 +199,30 @@ class DenseMass(nn.Module):
         self.nominal = nn.Buffer(factor)
         self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])
         row, column = torch.tril_indices(self.size, self.size, -1)
-        # positions in U of the entries below its diagonal, rows in sequence
+        # Indices of the entries below the diagonal in the flattened matrix U, rows in sequence.
         self.below = nn.Buffer(row * self.size + column)
-        # initially U is the identity, and e is one
+        # At zero outputs of the network U is the identity, and e = softplus(log(exp(1) - 1)) = 1.
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
         self.initial = nn.Buffer(initial)
         self.network = network
 
     def prepare(self) -> Layers:
-        """Return the layers of the network."""
+        """Return the layers of the network whose outputs are U and the argument of softplus in e."""
         return self.network.prepare(torch.diag(0 * self.initial + 1), self.initial)
 
     def inverse(self, encoded: Tensor, layers: Layers) -> Tensor:
-        """Return M^-1 over all three axes of every joint, of which z moves; (..., 3 n, 3 n)."""
+        """Return M^-1 over all three axes of every joint, (..., 3 n, 3 n)."""
         factor, scale = self._factor(self.network.forward(encoded, layers)[0])
         lower = self.nominal @ (factor + torch.eye(self.size).to(factor))
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return U without its diagonal of ones, (..., 3 n, 3 n), and e, (..., 3 n)."""
+        """Return U without its diagonal of ones, (..., 3 n, 3 n), and e, (..., 3 n), from network outputs."""
         entries, scale = raw.tensor_split((len(self.below),), dim=-1)
         return self._lower(entries), F.softplus(scale)
 
     def _lower(self, entries: Tensor) -> Tensor:
-        """Return the matrix, (..., 3 n, 3 n), with these entries below its diagonal, rows in sequence."""
+        """Return a matrix, (..., 3 n, 3 n), with entries below the diagonal, rows in sequence, else zero."""
         rows = entries.new_zeros(*entries.shape[:-1], self.size * self.size)
         rows = rows.index_copy(-1, self.below, entries)
         return rows.reshape(*entries.shape[:-1], self.size, self.size)
@@ -233,8 +236,8 @@ class DenseMass(nn.Module):
         """Return M(q), (..., n, n), and the intermediates of its derivatives."""
         raw, intermediates = self.network.forward(encoded, layers)
         factor, scale = self._factor(raw)
-        # Triangular solutions, not an inverse of M^-1, whose condition number is the square of its
-        # factor's.
+        # Triangular systems are solved in place of inverting M^-1, because the condition number of M^-1
+        # is the square of the condition number of its factor.
         moved = self._unit_solved(factor, self.moving)
         mass = moved.mT @ (moved / scale.unsqueeze(-1))
         return mass, DenseIntermediates(intermediates, factor, moved, scale)
@@ -244,10 +247,10 @@ class DenseMass(nn.Module):
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
-        # With w = U^-1 A qd and p = w / e: dT/dU = -U^-T p w^T, and dT/de = -p^2 / 2.
+        # For kinetic energy T, w = U^-1 A qd and p = w / e: dT/dU = -U^-T p w^T and dT/de = -p^2 / 2.
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
-        # e = softplus(s): de/ds = 1 - exp(-e) = -expm1(-e).
+        # For e = softplus(s), de/ds = 1 - exp(-e) = -expm1(-e).
         by_scale = 0.5 * momentum.squeeze(-1) ** 2 * torch.expm1(-scale)
         cotangent = torch.cat([by_entry, by_scale], dim=-1)
         return self.network.vjp(intermediates.network, cotangent)
@@ -257,7 +260,7 @@ class DenseMass(nn.Module):
         _, factor, moved, scale = intermediates
         pushed = self.network.jvp(intermediates.network, rate)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)
-        # d(U^-1 A) = -U^-1 dU U^-1 A.
+        # The differential of U^-1 A is -U^-1 dU U^-1 A.
         turned = self._unit_solved(factor, self._lower(entries) @ moved)
         by_factor = moved.mT @ (turned / scale.unsqueeze(-1))
         by_scale = raw_rate * torch.expm1(-scale) / scale**2

@@ -9,42 +9,41 @@ from torch import Tensor, nn
 from spelgen.runtime.parts import Row
 from spelgen.runtime.rows import Joint, vector
 
-# Initial velocity over which dry friction changes its direction, relative to the typical speed.
+# Initial width of the velocity range in which dry friction changes its sign, divided by the typical
+# speed.
 SMOOTHING_VELOCITY = 0.006
 
 
 class FrictionConstants(NamedTuple):
-    """The constants of all joints, (n,); not negative, and torques are zero for a joint without friction."""
+    """The friction constants of all joints, (n,). All are >= 0; torques are 0 at joints without friction."""
 
     viscous: Tensor  # [Nm s/rad, N s/m]
-    saturation: Tensor  # limit of the viscous friction that saturates [Nm, N]
+    saturation: Tensor  # limit of the saturating viscous friction [Nm, N]
     saturation_velocity: Tensor  # [rad/s, m/s]
     coulomb: Tensor  # [Nm, N]
     stribeck: Tensor  # additional dry friction at low velocity [Nm, N]
     stribeck_velocity: Tensor  # [rad/s, m/s]
     load_dependence: Tensor  # dry friction per magnitude of the gravity torque [1]
     stribeck_rounding: Tensor  # relative to the Stribeck velocity [1]
-    coulomb_smoothing_velocity: Tensor  # of dry friction without bristles [rad/s, m/s]
+    coulomb_smoothing_velocity: Tensor  # width of the sign change of dry friction [rad/s, m/s]
     min_load: Tensor  # [Nm, N]
-    bristle_fractions: (
-        Tensor  # of dry friction, (n, K); the sum over K is one, or zero at joints without bristles
-    )
+    bristle_fractions: Tensor  # of dry friction, (n, K); the sum over K is 1, or 0 at joints without bristles
     bristle_reach: Tensor  # break-away displacements, (n, K) [rad, m]
-    memoryless: Tensor  # 1 if dry friction depends on velocity only, 0 if on bristles
+    memoryless: Tensor  # 1: dry friction depends on velocity only, 0: on bristles
 
     def viscosity(self, qd: Tensor) -> Tensor:
-        """Return viscous torque per velocity, (..., n) [Nm s/rad, N s/m]."""
+        """Return the viscous friction torque divided by qd, (..., n) [Nm s/rad, N s/m]."""
         return self.viscous + self.saturation * turning(qd, self.saturation_velocity)
 
     def dry(self, qd: Tensor, gravity: Tensor) -> Tensor:
         """Return the magnitude of dry friction, (..., n) [Nm, N], under a gravity torque (..., n)."""
         speed = qd.abs() / self.stribeck_velocity
         rounding = self.stribeck_rounding
-        # (1 + x / 8)^-8 approximates exp(-x); x = (1 + r) v^2 / (v + r) is near v^2 for large r and near v
-        # for small r.
+        # (1 + x / 8)^-8 approximates exp(-x). With the rounding r, x = (1 + r) v^2 / (v + r) is
+        # approximately v^2 for large r and v for small r.
         slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
-        slow = slow.square().square().square()  # ** 8 takes twice the time
-        # A smooth |gravity torque|.
+        slow = slow.square().square().square()  # three squares: ** 8 takes twice the time
+        # The load is a smooth approximation of |gravity torque|.
         load = (gravity.square() + self.min_load**2).sqrt()
         return self.coulomb + self.stribeck * slow + self.load_dependence * load
 
@@ -56,48 +55,53 @@ class FrictionConstants(NamedTuple):
         Args:
             qd: velocities, (..., n) [rad/s, m/s].
             gravity: gravity torques, (..., n) [Nm, N].
-            z: bristle displacements, (..., n, K) [rad, m]; None: unknown, dry friction depends on velocity.
-            direction: direction of dry friction at joints without bristles, (..., n); None: of qd.
+            z: bristle displacements, (..., n, K) [rad, m]; None: unknown, and dry friction depends on
+                velocity.
+            direction: direction of dry friction at joints without bristles, (..., n); None: smooth sign
+                of qd.
         """
         if direction is None:
             direction = qd * turning(qd, self.coulomb_smoothing_velocity)
         if z is not None:
-            # Each bristle carries its fraction in proportion to its deflection, fully at its break-away
-            # displacement.
+            # The torque of a bristle is proportional to its displacement; at the break-away
+            # displacement it is the bristle's fraction of dry friction.
             deflection = (self.bristle_fractions / self.bristle_reach * z).sum(dim=-1)
             direction = deflection + self.memoryless * direction
         return self.viscosity(qd) * qd + self.dry(qd, gravity) * direction
 
     def stored_energy(self, z: Tensor) -> Tensor:
         """Return the elastic energy of the bristles of Coulomb friction, (...) [J]."""
-        # Springs of stiffness coulomb * fraction / breakaway; further dry friction counts as dissipated.
+        # Each bristle is a spring of stiffness coulomb * fraction / breakaway. Dry friction in excess
+        # of Coulomb friction is regarded as dissipation.
         stored = self.bristle_fractions * z.square() / self.bristle_reach
         return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
 
 class FrictionLaws(nn.Module):
-    """Friction that dissipates energy for all parameters (logarithms; of bristle fractions, logits):
+    """Friction with trained constants, which dissipates energy for any parameters. The friction torque is
 
     viscous qd + saturation s(qd, saturation_velocity)
     + (coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + load_dependence load) direction, with
     v = |qd| / stribeck_velocity, r the rounding, load = sqrt(gravity torque^2 + min_load^2) and
     s(x, width) = x / sqrt(x^2 + width^2).
 
-    The direction, from -1 to 1, is sum_k fraction_k z_k / breakaway_k over the bristles of a joint, which
-    may return elastic energy; at joints without bristles, or if z is unknown, it is s(qd,
-    coulomb_smoothing_velocity). No exponential depends on the state, so that a control loop takes a third
-    of the time. For large r the Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of
-    Machines with Friction, 1991); for small r, to the exponential of Bo and Pavelescu (Wear 82:277,
-    1982), without its corner at rest.
+    The parameters are logarithms of the constants, and logits of the bristle fractions. The direction,
+    from -1 to 1, is sum_k fraction_k z_k / breakaway_k over the bristles of a joint, which may return
+    elastic energy; at joints without bristles, or if z is unknown, the direction is s(qd,
+    coulomb_smoothing_velocity). No exponential depends on the state, which reduces the time of a
+    control loop to a third. For large r the Stribeck term is close to the Gaussian of
+    Armstrong-Helouvry (Control of Machines with Friction, 1991); for small r, to the exponential of Bo
+    and Pavelescu (Wear 82:277, 1982), but without a corner at rest.
 
-    Bristles are K elements per joint, elastic up to a break-away displacement and sliding beyond; z is
-    (..., n, K) [rad, m] (Maxwell-slip elements: Lampaert, Al-Bender and Swevers, A Generalized Maxwell-Slip
-    Friction Model, 2003). Reversals within the break-away displacement give closed hysteresis loops, so a
-    joint that stiction holds does not creep under an oscillating load.
+    A joint has K bristles: elements that are elastic up to a break-away displacement and slide beyond
+    it, with displacements z, (..., n, K) [rad, m] (Maxwell-slip elements: Lampaert, Al-Bender and
+    Swevers, A Generalized Maxwell-Slip Friction Model, 2003). Reversals within the break-away
+    displacement give closed hysteresis loops, so a joint that is held by stiction does not creep under
+    an oscillating load.
     """
 
-    # parameter, group, unit, and the constant for a parameter of zero, in units of typical friction and
-    # speed
+    # Name, group and unit of each parameter, and the constant at parameter zero, in units of typical
+    # friction and typical speed.
     parameter_groups: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "effects", "Nm, N", 1.0),
@@ -112,16 +116,17 @@ class FrictionLaws(nn.Module):
     def __init__(
         self, joints: Sequence[Joint], *, breakaway: Mapping[str, Row], stribeck_rounding: float = 10.0
     ) -> None:
-        """Set all parameters to zero.
+        """Create the friction of these joints, with all parameters zero.
 
-        breakaway: break-away displacements, (K,) [rad, m], by type of joint, shortest first.
+        breakaway: break-away displacements per joint type, (K,) [rad, m], shortest first.
         """
         super().__init__()
         self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
         self.speed = nn.Buffer(vector(joint.speed for joint in joints))
         rows = [breakaway[joint.joint_type] for joint in joints]
         self.reach = nn.Buffer(torch.tensor(rows, dtype=torch.float64))  # break-away displacements, (n, K)
-        # a buffer, since a fit to torques chooses the form of each joint
+        # This is a buffer, not a parameter: a fit to torques chooses for each joint whether it has
+        # bristles.
         self.memoryless = nn.Buffer(torch.zeros_like(self.speed))
         self.stribeck_rounding = nn.Buffer(torch.full_like(self.speed, stribeck_rounding))
         for name, *_ in FrictionLaws.parameter_groups[:-1]:
@@ -135,15 +140,14 @@ class FrictionLaws(nn.Module):
             "Nm s/rad, N s/m": friction / speed, "Nm, N": friction, "rad/s, m/s": speed, "1": friction.sign()
         }  # fmt: skip
         for name, _, unit, initial in FrictionLaws.parameter_groups[:-1]:
-            # Exponentials keep the constants positive; at zero they have the typical magnitude of the
-            # joint.
+            # Exponentials keep the constants positive; parameters of zero give typical magnitudes of
+            # the joint.
             constants.append(initial * units[unit] * getattr(self, name).exp())
-        # Below 1 % of typical friction the magnitude of a gravity torque is rounded: |x| has no derivative
-        # at zero.
+        # |gravity torque| has no derivative at zero, so it is smoothed below 1 % of typical friction.
         load = 0.01 * torch.where(friction > 0, friction, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
-        # Dry friction without bristles: a wider transition between the directions would be confounded with
-        # hysteresis.
+        # Without bristles, dry friction changes its sign within 0.1 % of the typical speed: a wider
+        # transition would be confounded with hysteresis.
         rounding, sharp = self.stribeck_rounding, 0.001 * speed
         return FrictionConstants._make(
             [*constants, rounding, sharp, load, fractions, self.reach, self.memoryless]
@@ -151,12 +155,12 @@ class FrictionLaws(nn.Module):
 
 
 def turning(velocity: Tensor, width: Tensor) -> Tensor:
-    """Return 1 / sqrt(velocity^2 + width^2), (..., n): times the velocity, a smooth sign of this width."""
+    """Return 1 / sqrt(velocity^2 + width^2), (..., n); the product with the velocity is a smooth sign."""
     return torch.rsqrt(velocity * velocity + width**2)
 
 
 class SlidingFriction(FrictionLaws):
-    """Friction without bristles or state: dry friction depends on velocity, with a trained width of its jump."""
+    """Friction without state: dry friction depends on velocity, with a trained width of the sign change."""
 
     parameter_groups = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", SMOOTHING_VELOCITY),)
 

@@ -1,4 +1,4 @@
-"""Motors: behind gears and couplings, and position servos, whose inputs are commanded positions."""
+"""Motors with gears and couplings, and position servos, whose inputs are commanded positions."""
 
 import math
 from collections.abc import Sequence
@@ -13,15 +13,15 @@ from spelgen.runtime.rows import vector
 
 
 class MotorInputs(nn.Module):
-    """A constant G, (n, n): torque of each joint, its rows, per input of each motor, its columns.
+    """A constant input matrix G, (n, n): joint torques, the rows, per input of each motor, the columns.
 
-    A joint without a motor is passive. trained: rows of G, true for gains that are trained; such a gain
-    keeps its sign.
+    A joint without a motor is passive. trained: True for entries of G that are trained, as rows; None:
+    no entry. A trained entry keeps its sign.
     """
 
     parameter_groups = (("raw_gains", "gains", "1"),)
 
-    raw_gains: nn.Parameter | None  # logarithms, relative to the initial values
+    raw_gains: nn.Parameter | None  # log(gain / initial gain)
 
     def __init__(self, gains: Rows, trained: Rows | None = None) -> None:
         super().__init__()
@@ -32,7 +32,7 @@ class MotorInputs(nn.Module):
             nn.Buffer(is_trained * matrix),
         )
         self.passive = nn.Buffer(1.0 - matrix.any(dim=1).double())  # 1 for a joint without a motor, (n,)
-        self.gain_rows = nn.Buffer(is_trained.nonzero()[:, 0])  # joints of the trained gains
+        self.gain_rows = nn.Buffer(is_trained.nonzero()[:, 0])  # row in G per trained gain
         raw = (
             nn.Parameter(torch.zeros(len(self.gain_rows), dtype=torch.float64))
             if len(self.gain_rows)
@@ -54,7 +54,7 @@ class MotorInputs(nn.Module):
         return applied(self.gains(), tau)
 
     def torque(self, force: Tensor) -> Tensor:
-        """Return the inputs, (..., n), for this force; at a passive joint, the force required there."""
+        """Return the inputs, (..., n), that give this force; at a passive joint, the force itself."""
         matrix = self.gains() + torch.diag(self.passive)
         tau: Tensor = torch.linalg.solve(matrix, force.unsqueeze(-1))
         return tau.squeeze(-1)
@@ -66,15 +66,16 @@ class ServoConstants(NamedTuple):
     kp: Tensor  # [Nm/rad, N/m]
     kd: Tensor  # [Nm s/rad, N s/m]
     limit: Tensor  # [Nm, N]
-    dead_zone: Tensor  # half width [rad, m]; may be 0
+    dead_zone: Tensor  # half the width [rad, m]; may be 0
 
 
 class PositionServo(nn.Module):
-    """tau = clip(kp d(u - q) - kd qd, -limit, limit), where u was commanded ``delay`` seconds earlier.
+    """Position servos: tau = clip(kp d(u - q) - kd qd, -limit, limit), u commanded ``delay`` seconds earlier.
 
-    d(x) is x reduced by the dead zone, zero within it: of gears with play, or of the controller itself. The
-    servo is a spring and a damper; the spring stores 1/2 kp d(q - u)^2, so that the arm is port-Hamiltonian
-    with the input u. The trained parameters are logarithms. A known kp is not trained.
+    d(x) reduces |x| by half the width of a dead zone and is zero within the zone, which is due to play
+    of gears or to the controller. A servo is a spring and a damper. The spring stores the energy 1/2 kp
+    d(q - u)^2, so that the arm with the input u is port-Hamiltonian. The trained parameters are
+    logarithms of the constants; a known kp is not trained.
     """
 
     parameter_groups = (
@@ -98,17 +99,17 @@ class PositionServo(nn.Module):
         self.trained = nn.Buffer(vector(float(not x) for x in known))
         self.limit = nn.Buffer(vector(math.inf if x is None else x for x in limit))
         self.delay = nn.Buffer(torch.zeros((), dtype=torch.float64))  # [s]
-        # a buffer: only a fit to commands may set it
+        # This is a buffer, not a parameter, because only a fit to commands may set it.
         self.dead_zone = nn.Buffer(torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kp = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kd = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))
 
     def kp(self) -> Tensor:
-        """Return the torque per distance from the command, (n,) [Nm/rad, N/m]."""
+        """Return kp, the torque per position error, (n,) [Nm/rad, N/m]."""
         return self.nominal_kp * (self.trained * self.raw_kp).exp()
 
     def kd(self) -> Tensor:
-        """Return the torque per velocity, (n,) [Nm s/rad, N s/m]."""
+        """Return kd, the torque per velocity, (n,) [Nm s/rad, N s/m]."""
         return self.nominal_kd * self.raw_kd.exp()
 
     def prepare(self) -> ServoConstants:
@@ -116,7 +117,7 @@ class PositionServo(nn.Module):
         return ServoConstants(self.kp(), self.kd(), self.limit, self.dead_zone.clamp(min=0))
 
     def forward(self, u: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the torque, (..., n) [Nm, N], for the delayed command u, (..., n)."""
+        """Return the servo torque, (..., n) [Nm, N], for the delayed command u, (..., n) [rad, m]."""
         kp, kd, limit, dead_zone = self.prepare()
         return (kp * beyond(u - q, dead_zone) - kd * qd).clamp(-limit, limit)
 
@@ -126,5 +127,5 @@ class PositionServo(nn.Module):
 
 
 def beyond(distance: Tensor, dead_zone: Tensor) -> Tensor:
-    """Return distances, (..., n), reduced by half the width of a dead zone, (n,); zero within it."""
+    """Return distances, (..., n), reduced by half the width of a dead zone, (n,); zero within the zone."""
     return distance - distance.clamp(-dead_zone, dead_zone)

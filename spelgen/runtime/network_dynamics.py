@@ -1,4 +1,4 @@
-"""A port-Hamiltonian model whose functions of q are networks, and friction from networks."""
+"""Port-Hamiltonian models whose M, V, D and G are networks."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from spelgen.runtime.rows import Joint, vector
 
 
 class NetworkConfiguration(NamedTuple):
-    """All that depends on q only."""
+    """Configuration cache: all quantities that depend on q, but not on qd or the input."""
 
-    encoded: Tensor  # input of the networks, see ``JointEncoding``
+    encoded: Tensor  # encoded positions, the inputs of networks, see ``JointEncoding``
     mass: Tensor  # M(q), (..., n, n)
-    intermediates: Intermediates  # intermediates of the derivatives of M
+    intermediates: Intermediates  # intermediate values for the derivatives of M
     parameters: dict[str, Parameters]
 
 
 class NetworkDynamics(PortHamiltonian):
-    """M, V and D are networks; the network of V is in units of ``potential_scale`` [J]."""
+    """A model whose M, V and D are networks; V is ``potential_scale`` [J] times the output of its network."""
 
     def __init__(
         self,
@@ -43,13 +43,14 @@ class NetworkDynamics(PortHamiltonian):
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
 
     def prepare(self) -> dict[str, Parameters]:
-        """Return the parameter caches of mass matrix, potential and friction."""
-        # No offset: a constant of V has no effect on the motion. The product keeps dtype and device.
+        """Return the parameter caches of mass matrix, potential and friction by name."""
+        # V has no offset, since a constant of V has no effect on the motion. The product 0 * scale has
+        # the right dtype and device.
         potential = self.potential.prepare(self.scale, 0 * self.scale[0])
         return {"mass": self.mass.prepare(), "potential": potential, "friction": self.friction.prepare()}
 
     def configuration(self, q: Tensor, parameters: dict[str, Parameters]) -> NetworkConfiguration:
-        """Return all that depends on q, (..., n), only."""
+        """Return the configuration cache at q, (..., n) [rad, m]."""
         encoded = self.encoding.forward(q)
         mass, intermediates = self.mass.forward(encoded, parameters["mass"])
         return NetworkConfiguration(encoded, mass, intermediates, parameters)
@@ -62,22 +63,23 @@ class NetworkDynamics(PortHamiltonian):
     def gravity(self, q: Tensor | NetworkConfiguration) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
         cache: NetworkConfiguration = self.at(q)
-        # At rest the gradient of the kinetic energy is zero.
+        # At rest, the gradient of the kinetic energy is zero, so the Lagrangian gradient is -dV/dq.
         return -self.lagrangian_gradient(cache, torch.zeros_like(cache.mass[..., 0]))
 
     def lagrangian_gradient(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         cache: NetworkConfiguration = self.at(q, qd)
         intermediates = self.potential.forward(cache.encoded, cache.parameters["potential"])[1]
-        # One reverse sweep per network, with 1/2 qd qd^T as the cotangent of M, then the chain rule of the
-        # encoding.
+        # Each network takes one reverse sweep, the network of M with the cotangent 1/2 qd qd^T. The
+        # results are multiplied by the Jacobian of the encoding.
         kinetic = self.mass.kinetic_vjp(qd, cache.intermediates)
         return self.encoding.vjp(cache.encoded, kinetic - self.potential.vjp(intermediates, qd.new_ones(1)))
 
     def nonlinear_effects(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
         cache: NetworkConfiguration = self.at(q, qd)
-        # dM/dt is one directional derivative: the n^3 Christoffel symbols are not needed.
+        # dM/dt is a single directional derivative along qd, so the n^3 Christoffel symbols are not
+        # computed.
         mass_rate = self.mass.jvp(self.encoding.jvp(cache.encoded, qd), cache.intermediates)
         return applied(mass_rate, qd) - self.lagrangian_gradient(cache, qd)
 
@@ -95,15 +97,16 @@ class NetworkDynamics(PortHamiltonian):
         )
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """Return the rate of (q, p), (..., 2 n), or of (q, p, tau) with a constant tau, (..., 3 n)."""
-        # ODE solvers integrate one vector; a constant input is a part of it with the rate zero.
+        """Return d/dt of the state (q, p), (..., 2 n), or (q, p, tau) with constant tau, (..., 3 n)."""
+        # ODE solvers integrate one vector, so a constant input is appended to the state, with rate
+        # zero.
         q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
         return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
 
 
 class DenseInputDynamics(NetworkDynamics):
-    """G(q) is diagonal: a network with an output for each of the three axes of a joint, of which z moves."""
+    """A model of networks with a diagonal G(q), from a network with three outputs per joint."""
 
     def __init__(self, *, input_network: MaskedNetwork, **parts: Any) -> None:
         super().__init__(**parts)
@@ -111,7 +114,7 @@ class DenseInputDynamics(NetworkDynamics):
         self.input_network = input_network
 
     def prepare(self) -> dict[str, Parameters]:
-        """Return the parameter caches of all networks: also of the input matrix."""
+        """Return the parameter caches of all networks by name, including the network of G."""
         return super().prepare() | {"input": self.input_network.prepare(self.moving, self.moving.sum(dim=1))}
 
     def _gains(self, cache: NetworkConfiguration) -> Tensor:
@@ -127,15 +130,16 @@ class DenseInputDynamics(NetworkDynamics):
         return self._gains(cache) * tau
 
     def input_torque(self, cache: NetworkConfiguration, force: Tensor) -> Tensor:
-        """Return the inputs, (..., n), that give this force."""
+        """Return the inputs, (..., n), for which G(q) tau is this force, (..., n) [Nm, N]."""
         return force / self._gains(cache)
 
 
 class NetworkFriction(nn.Module):
-    """Friction by a network, in units of typical friction and typical speed."""
+    """Base class of dissipation matrices D(q, qd) from a network, in units of typical friction and speed."""
 
-    prepare: Callable[[], Parameters]  # all that depends on the parameters only
-    # D(q, qd) right, (..., n, k), of the encoding, qd, the parameters and right, (..., n, k)
+    prepare: Callable[[], Parameters]  # returns the parameter cache
+    # Returns D(q, qd) right, (..., n, k), from encoded positions, qd, parameter cache and right, (...,
+    # n, k).
     forward: Callable[[Tensor, Tensor, Parameters, Tensor], Tensor]
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork) -> None:
@@ -146,15 +150,15 @@ class NetworkFriction(nn.Module):
 
 
 class JointFrictionParameters(NamedTuple):
-    """All that depends on the parameters only."""
+    """Parameter cache of ``JointFriction``: quantities that depend only on trained parameters."""
 
     layers: Layers
-    viscous: Tensor  # (n,) [Nm s/rad, N s/m]
-    smoothing: Tensor  # squared smoothing velocity, (n,)
+    viscous: Tensor  # viscous coefficients, (n,) [Nm s/rad, N s/m]
+    smoothing: Tensor  # squared smoothing velocity, (n,) [rad^2/s^2, m^2/s^2]
 
 
 class JointFriction(NetworkFriction):
-    """A diagonal D(q, qd), positive for all parameters: viscous constants, and a network for dry friction."""
+    """A diagonal, positive definite D(q, qd): viscous coefficients, and a network for dry friction."""
 
     parameter_groups = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m"),
@@ -172,7 +176,8 @@ class JointFriction(NetworkFriction):
 
     def prepare(self) -> JointFrictionParameters:
         """Return the parameter cache."""
-        # velocity below which dry friction goes to zero, relative to the typical speed: at first 0.03
+        # Below the smoothing velocity dry friction decreases to zero; initially it is 3 % of the
+        # typical speed.
         smoothing = self.speed**2 * (0.001**2 + (0.03 * self.raw_smoothing.exp()) ** 2)
         start = torch.full_like(self.speed, -2.0)
         layers = self.network.prepare(torch.diag(0 * start + 1), start)
@@ -185,30 +190,31 @@ class JointFriction(NetworkFriction):
         layers, viscous, smoothing = parameters
         smooth_speed = torch.sqrt(qd * qd + smoothing)
         inputs = torch.cat([encoded, qd, qd / smooth_speed], dim=-1)
-        # dry friction relative to its typical magnitude
+        # Dry friction, divided by typical friction; softplus keeps it positive.
         dry = F.softplus(self.network.forward(inputs, layers)[0])
         diagonal: Tensor = viscous + self.nominal * dry / smooth_speed
         return diagonal.unsqueeze(-1) * right
 
 
 class DenseFriction(NetworkFriction):
-    """D(q, qd) = L L^T, with ``axes`` rows of L for each joint.
+    """A dense, positive semi-definite D(q, qd) = L L^T, where L has ``axes`` rows per joint.
 
-    A joint moves along the last of its axes only, so only those rows of L are computed.
+    A joint moves only along its last axis, so only the rows of the last axes are computed.
     """
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:
         super().__init__(joints, network)
         rows = axes * len(joints)
         row, column = torch.tril_indices(rows, rows)
-        # from the entries of a lower triangle, rows in sequence, to the matrix: (rows, rows, entries)
+        # Linear map, (rows, rows, entries), from the entries of a lower triangle, rows in sequence, to
+        # the matrix.
         spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
-        # initial diagonal of L, relative to the root of typical friction per typical speed
+        # The initial L is diagonal, in units of the square root of typical friction / typical speed.
         self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
 
     def prepare(self) -> Layers:
-        """Return the layers that give the rows of L."""
+        """Return the layers of a network whose outputs are the computed rows of L, flattened."""
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
         output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)
         return self.network.prepare(output_map, (size * self.initial).flatten())

@@ -1,4 +1,4 @@
-"""Networks whose outputs depend on their own joints only, and the encoding of positions that they depend on."""
+"""Networks in which each output depends on specified joints only, and the encoding of positions as inputs."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -11,18 +11,18 @@ from torch import Tensor, nn
 from spelgen.runtime.parts import Intermediates, Layers, Rows
 from spelgen.runtime.rows import Joint, vector
 
-GRID = 4  # bumps on an edge
+GRID = 4  # Gaussian bumps per edge of a Kolmogorov-Arnold network
 SPACING = 2 / (GRID - 1)
 
 
 class JointEncoding(nn.Module):
-    """Two numbers per joint, (..., 2 n): first cos q of all joints, then sin q; prismatic: scaled q, 0."""
+    """Encoding of positions, (..., 2 n): cos q of all joints, then sin q; prismatic joints: scaled q, 0."""
 
     def __init__(self, joints: Sequence[Joint]) -> None:
         super().__init__()
         self.revolute = nn.Buffer(vector(joint.joint_type == "revolute" for joint in joints))
         self.center = nn.Buffer(vector(joint.center for joint in joints))
-        # derivative of the scaled q with respect to q
+        # d(scaled q)/dq of prismatic joints, zero for revolute joints
         self.slope = nn.Buffer((1 - self.revolute) / vector(joint.half_range for joint in joints))
 
     def forward(self, q: Tensor) -> Tensor:
@@ -31,29 +31,30 @@ class JointEncoding(nn.Module):
         return torch.cat([torch.addcmul(scaled, self.revolute, q.cos()), self.revolute * q.sin()], dim=-1)
 
     def jvp(self, encoded: Tensor, qd: Tensor) -> Tensor:
-        """Return the rate of the encoding, (..., 2 n), at the velocity qd."""
+        """Return the time derivative of the encoding, (..., 2 n), at the velocity qd, (..., n)."""
         first, second = encoded.chunk(2, dim=-1)
         return torch.cat([(self.slope - second) * qd, self.revolute * first * qd], dim=-1)
 
     def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
-        """Return the derivative with respect to q, (..., n), from that with respect to the encoding."""
+        """Return a gradient with respect to q, (..., n), from the gradient with respect to the encoding."""
         first, second = encoded.chunk(2, dim=-1)
         by_first, by_second = cotangent.chunk(2, dim=-1)
         return by_first * (self.slope - second) + by_second * self.revolute * first
 
 
 def hidden_units(outputs: Sequence[tuple[int, ...]], width: int, min_units: int) -> list[tuple[int, ...]]:
-    """Return the joints of each unit of a hidden layer.
+    """Return for each unit of a hidden layer the joints that the unit may depend on.
 
-    Outputs that depend on the same joints form a group. The ``width`` units are divided among the groups in
-    proportion to their numbers of outputs, with at least ``min_units`` for each group.
+    Outputs that depend on the same joints form a group. Each group gets units in proportion to its
+    number of outputs, ``width`` units in total, but at least ``min_units`` per group.
     """
     counts = Counter(outputs)
     groups = sorted(counts, key=lambda joints: (len(joints), joints))
     ideal = [width * counts[group] / len(outputs) for group in groups]
     units = [max(min_units, round(share)) for share in ideal]
     index = range(len(groups))
-    # after rounding the sum may differ from the width: the largest differences are corrected first
+    # Rounding may change the total number of units: groups with the largest rounding errors are
+    # corrected first.
     while sum(units) > width and max(units) > min_units:
         units[max(index, key=lambda k: units[k] - ideal[k] if units[k] > min_units else -width)] -= 1
     while sum(units) < width:
@@ -69,18 +70,18 @@ def joint_masks(
     depth: int,
     min_units: int,
 ) -> Iterator[Tensor]:
-    """Yield the factors on the weights of each layer, (units, inputs).
+    """Yield for each layer the factors that multiply the weights, (units, inputs).
 
-    A factor is 0 where the input depends on a joint that the unit must not depend on; the factors of the
-    first layer scale the inputs.
+    A factor is 0 if the input depends on a joint that the unit must not depend on. Other factors are 1,
+    but in the first layer they are the scales of the inputs.
 
     Args:
-        joints: of the arm.
-        scales: factors of the inputs, a row (n,) for each input per joint.
+        joints: joints of the arm.
+        scales: scales of the inputs; a row (n,) has the scales of one input of each joint.
         outputs: names of the joints that each output depends on.
         width: units of a hidden layer.
         depth: number of hidden layers.
-        min_units: smallest number of units for outputs that depend on the same joints.
+        min_units: smallest number of hidden units per group of outputs that depend on the same joints.
     """
     number = {joint.name: index for index, joint in enumerate(joints)}
     numbers = [tuple(number[name] for name in names) for names in outputs]
@@ -94,23 +95,24 @@ def joint_masks(
 
 
 class MaskedNetwork(nn.Module):
-    """A network whose outputs depend on their own joints only, with explicit derivatives.
+    """A network in which each output depends on specified joints only, with explicit derivatives.
 
     Args:
-        generator: of the initial weights; the last layer starts at zero.
-        joints: of the arm.
-        scales: a row (n,) of factors for each input per joint: cos q or the scaled q, sin q, and others.
-        outputs: names of the joints that each output depends on; no unit has a path to another joint.
-        width, depth: units of a hidden layer, and number of hidden layers.
-        min_units: smallest number of units of a hidden layer for outputs that depend on the same joints.
+        generator: random generator of the initial weights; the weights of the last layer are zero.
+        joints: joints of the arm.
+        scales: rows (n,) with the scales of the inputs: cos q or the scaled q, sin q, and any others.
+        outputs: names of the joints that each output depends on; masks remove all paths to other
+            joints.
+        width, depth: number of units of a hidden layer, and number of hidden layers.
+        min_units: smallest number of hidden units per group of outputs that depend on the same joints.
     """
 
-    points = 0  # grid points of the function on an edge; 0: a weight per edge
+    points = 0  # number of bumps of an edge's function; 0: each edge has one weight
 
-    # offset + output_map y, (..., rows), at encoded positions, and the intermediates of its derivatives
+    # Returns offset + output_map y, (..., rows), for the outputs y, and intermediates for derivatives.
     forward: Callable[[Tensor, Layers], tuple[Tensor, Intermediates]]
-    vjp: Callable[[Intermediates, Tensor], Tensor]  # cotangent (..., rows) times d/d encoded: (..., inputs)
-    jvp: Callable[[Intermediates, Tensor], Tensor]  # d/d encoded times a tangent: (..., rows)
+    vjp: Callable[[Intermediates, Tensor], Tensor]  # cotangent (..., rows) times the Jacobian: (..., inputs)
+    jvp: Callable[[Intermediates, Tensor], Tensor]  # Jacobian times a tangent: (..., rows)
 
     def __init__(
         self,
@@ -124,7 +126,7 @@ class MaskedNetwork(nn.Module):
         min_units: int = 1,
     ) -> None:
         super().__init__()
-        slopes = torch.ones((), dtype=torch.float64)  # of the initial function of an edge, at the grid points
+        slopes = torch.ones((), dtype=torch.float64)  # of the initial edge functions
         if self.points:
             slopes = torch.linspace(-1, 1, self.points, dtype=torch.float64)
             self.grid = nn.Buffer(slopes / SPACING)
@@ -137,10 +139,10 @@ class MaskedNetwork(nn.Module):
             self.weights.append(nn.Parameter(weight * slopes / readable.sqrt()))
             self.biases.append(nn.Parameter(torch.zeros(len(mask), dtype=torch.float64)))
             self.register_buffer(f"mask{index}", edges)
-        nn.init.zeros_(self.weights[-1])  # so that the outputs start at zero
+        nn.init.zeros_(self.weights[-1])  # The initial outputs are zero.
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return the masked layers of offset (rows,) + output_map (rows, outputs) y."""
+        """Return masked layers of a network whose output is offset (rows,) + output_map (rows, outputs) y."""
         weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
         biases = list(self.biases)
         weights[-1], biases[-1] = output_map @ weights[-1], offset + output_map @ biases[-1]
@@ -148,7 +150,7 @@ class MaskedNetwork(nn.Module):
 
 
 class MaskedMLP(MaskedNetwork):
-    """A tanh network; arguments: see ``MaskedNetwork``."""
+    """A multilayer perceptron with tanh units; arguments: see ``MaskedNetwork``."""
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
         """Return offset + output_map y, (..., rows), and the intermediates of ``vjp`` and ``jvp``."""
@@ -163,7 +165,7 @@ class MaskedMLP(MaskedNetwork):
         hidden, layers = intermediates
         layer: Tensor = cotangent @ layers[-1][0]
         for (weight, _), value in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
-            # layer * (1 - value^2) in one operation
+            # tanh_backward(x, y) = x (1 - y^2) in one operation
             layer = torch.ops.aten.tanh_backward(layer, value) @ weight
         return layer
 
@@ -176,19 +178,19 @@ class MaskedMLP(MaskedNetwork):
 
 
 class Bumps(NamedTuple):
-    """The inputs of a layer relative to the grid, (..., inputs, GRID)."""
+    """The bumps at the inputs of a layer of ``MaskedKAN``, (..., inputs, GRID) each."""
 
-    distance: Tensor  # distance from each grid point, in grid spacings
+    distance: Tensor  # distance of the input from each grid point, in grid spacings
     height: Tensor
 
 
 class MaskedKAN(MaskedNetwork):
     """A Kolmogorov-Arnold network; arguments: see ``MaskedNetwork``.
 
-    Each edge from an input to a unit has a learned function of its own: a sum of Gaussian bumps on
-    a grid over [-1, 1] (Li, arXiv 2405.06721, in place of the splines of Liu et al., arXiv
-    2404.19756). The initial functions are nearly linear with a random slope, because few samples do
-    not smooth a wavy one. tanh keeps the outputs of a layer within the grid.
+    Each edge from an input to a unit has a learned function: a sum of Gaussian bumps on a grid over
+    [-1, 1] (Li, arXiv 2405.06721, in place of the splines of Liu et al., arXiv 2404.19756). The initial
+    functions are nearly linear with random slopes, because training on few samples does not smooth a
+    function that is wavy at first. tanh keeps the outputs of a layer within the grid.
     """
 
     points = GRID

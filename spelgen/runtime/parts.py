@@ -1,4 +1,4 @@
-"""The interfaces between a model and its parts, and symmetric matrices from their lower triangle."""
+"""Interfaces between a model and its mass matrix and inputs, and symmetric matrices from lower triangles."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -8,33 +8,33 @@ from torch import Tensor
 
 Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
-Entries = Callable[..., Tensor]  # a symmetric matrix (..., n, n) of its functions and constants (...)
-Layers = tuple[tuple[Tensor, Tensor], ...]  # weights and biases of a network, masked and scaled
-# The types of these differ between models and parts.
-Intermediates = Any  # values of the forward pass that the derivatives of a part need
+Entries = Callable[..., Tensor]  # M, (..., n, n), from functions and constants, (...) each
+Layers = tuple[tuple[Tensor, Tensor], ...]  # masked weights, and biases, of each layer of a network
+# The following types are Any, because each model and each part of a model has its own type.
+Intermediates = Any  # values of a forward pass that its derivatives need
 Parameters = Any  # parameter cache: all that depends on the parameters only
 Configuration = Any  # configuration cache: all that depends on q only
 Position = Any  # q, (..., n), or the configuration at q
 
 
 class Mass(Protocol):
-    """The mass matrix M(q) and its derivatives."""
+    """Interface of a mass matrix M(q) with explicit derivatives."""
 
     def prepare(self) -> Parameters:
         """Return the parameter cache: all that depends on the parameters only."""
 
     def forward(self, encoded: Tensor, parameters: Parameters) -> tuple[Tensor, Intermediates]:
-        """Return M(q), (..., n, n), and the intermediates of its derivatives."""
+        """Return M(q), (..., n, n), and intermediate values for its derivatives."""
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Intermediates) -> Tensor:
         """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
 
     def jvp(self, rate: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), for this rate of the encoding."""
+        """Return dM/dt, (..., n, n), for a time derivative of the encoding, (..., 2 n)."""
 
 
 class Inputs(Protocol):
-    """The input matrix G of motors that drive several joints, or none."""
+    """Interface of a constant input matrix G, for motors that drive several joints and for passive joints."""
 
     def gains(self) -> Tensor:
         """Return G, (n, n): joint torque per motor torque."""
@@ -43,11 +43,11 @@ class Inputs(Protocol):
         """Return G tau, (..., n) [Nm, N]."""
 
     def torque(self, force: Tensor) -> Tensor:
-        """Return the inputs, (..., n), that give this force."""
+        """Return the inputs tau, (..., n), for which G tau is this force, (..., n) [Nm, N]."""
 
 
 def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
-    """Return the symmetric matrix, (..., n, n), from its lower triangle: rows of tensors (...) or numbers."""
+    """Return a symmetric matrix, (..., n, n), from rows of its lower triangle: tensors (...) or numbers."""
     n = len(rows)
     entries = [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)]
     like = next(entry for entry in entries if isinstance(entry, Tensor))

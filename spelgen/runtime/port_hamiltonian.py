@@ -1,4 +1,4 @@
-"""The equations of motion of an arm, for any model of its energies and friction."""
+"""The equations of motion of an arm in port-Hamiltonian form, for any model of energy and friction."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -11,8 +11,8 @@ from spelgen.runtime.rows import Joint
 
 
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Return matrix vector, (..., n)."""
-    if vector.dim() == 1:  # for one state the number of operations is the cost
+    """Return the product of a matrix, (..., n, m), and a vector, (..., m)."""
+    if vector.dim() == 1:  # one operation: for a single state their number determines the time
         return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
@@ -21,18 +21,19 @@ class PortHamiltonian(nn.Module):
     """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
 
     The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
-    q, qd, qdd, tau and p are (..., n), with any leading dimensions, in rad and Nm, or m and N if prismatic.
-    In place of q, methods also accept the configuration that ``at`` returns: all that depends on q, computed
-    once for several calls. inputs: how motors drive the joints; None: each input drives its own joint.
+    q, qd, qdd, tau and p are (..., n), with any leading dimensions, in rad and Nm for revolute joints,
+    in m and N for prismatic joints. In place of q, methods also accept the configuration cache that
+    ``at`` returns: all quantities that depend on q only, computed once for several calls. inputs: the
+    input matrix G; None: each input drives its own joint.
     """
 
     prepare: Callable[..., Parameters]
     configuration: Callable[[Tensor, Parameters], Configuration]
-    potential_energy: Callable[..., Tensor]  # V, (...) [J]
+    potential_energy: Callable[..., Tensor]  # V(q), (...) [J]
     gravity: Callable[[Position], Tensor]  # dV/dq, (..., n) [Nm, N]
-    lagrangian_gradient: Callable[[Position, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V
+    lagrangian_gradient: Callable[[Position, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V, (..., n)
     nonlinear_effects: Callable[[Position, Tensor], Tensor]  # Coriolis, centrifugal and gravity torque
-    friction_torque: Callable[..., Tensor]  # D(q, qd) qd
+    friction_torque: Callable[..., Tensor]  # D(q, qd) qd, (..., n)
 
     def __init__(self, joints: Sequence[Joint], inputs: Inputs | None = None) -> None:
         super().__init__()
@@ -46,23 +47,23 @@ class PortHamiltonian(nn.Module):
 
     @property
     def joint_types(self) -> tuple[str, ...]:
-        """``revolute`` or ``prismatic``, for each joint."""
+        """Type of each joint: ``revolute`` or ``prismatic``."""
         return tuple(joint.joint_type for joint in self.joints)
 
     @property
     def input_quantity(self) -> Literal["torque", "position"]:
-        """``torque``, or ``position`` for inputs that are commands of position servos."""
+        """Quantity of the inputs: ``torque``, or ``position`` for commands of position servos."""
         return "torque"
 
     def at(self, q: Position, *others: Tensor, prepared: Parameters = None) -> Configuration:
-        """Return the configuration at q. Raises TypeError or ValueError for a wrong dtype or shape.
+        """Return the configuration cache at q. Raises TypeError or ValueError for a wrong dtype or shape.
 
         Args:
-            q: (..., n), or a configuration, which is returned unchanged.
-            others: further vectors (..., n), which are only checked.
-            prepared: result of ``prepare``; None: computed here.
+            q: positions, (..., n), or a configuration cache, which is returned unchanged.
+            others: further vectors, (..., n), whose dtype and shape are checked.
+            prepared: parameter cache that ``prepare`` returned; None: the method calls ``prepare``.
         """
-        # A configuration of former calls, which has been checked.
+        # A cache is a named tuple from a previous call, in which q was checked.
         if isinstance(q, tuple):
             return q
         dtype = self.get_buffer("friction.nominal").dtype
@@ -81,7 +82,7 @@ class PortHamiltonian(nn.Module):
         return mass
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        """Return G(q), (..., n, n)."""
+        """Return the input matrix G(q), (..., n, n): joint torque per input."""
         matrix = torch.eye(self.n).to(q) if self.inputs is None else self.inputs.gains()
         return matrix.expand(*q.shape, -1)
 
@@ -90,7 +91,7 @@ class PortHamiltonian(nn.Module):
         return tau if self.inputs is None else self.inputs.force(tau)
 
     def input_torque(self, cache: Configuration, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), that give this force."""
+        """Return the inputs tau, (..., n), for which G tau is this force, (..., n) [Nm, N]."""
         return force if self.inputs is None else self.inputs.torque(force)
 
     def momentum(self, q: Position, qd: Tensor) -> Tensor:
@@ -99,35 +100,36 @@ class PortHamiltonian(nn.Module):
 
     def velocity(self, q: Position, p: Tensor) -> Tensor:
         """Return qd = M(q)^-1 p, (..., n)."""
-        # not by a Cholesky factor: its derivative costs several times one more linear solve
+        # A Cholesky factor would be slower: its derivative takes several times the time of a linear
+        # solve.
         qd: Tensor = torch.linalg.solve(self.at(q, p).mass, p.unsqueeze(-1))
         return qd.squeeze(-1)
 
     def hamiltonian(self, q: Position, p: Tensor, *state: Tensor) -> Tensor:
-        """Return H, (...) [J]."""
+        """Return the total energy H, (...) [J]; state: friction state, if the model has one."""
         cache = self.at(q, p)
-        # 1/2 p^T M^-1 p is 1/2 p^T qd.
+        # The kinetic energy 1/2 p^T M^-1 p is 1/2 p^T qd.
         return 0.5 * (p * self.velocity(cache, p)).sum(dim=-1) + self.potential_energy(cache, *state)
 
     def forward_dynamics(self, q: Position, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
-        """Return qdd, (..., n), under the input tau; state: of friction, if the model has one."""
+        """Return qdd, (..., n), under the input tau; state: friction state, if the model has one."""
         cache = self.at(q, qd, tau)
         force = self.input_force(cache, qd, tau) - self.nonlinear_effects(cache, qd)
         force = force - self.friction_torque(cache, qd, *state)
-        return self.velocity(cache, force)  # M^-1 times the force
+        return self.velocity(cache, force)  # M^-1 force
 
     def inverse_dynamics(self, q: Position, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the input tau, (..., n), that gives qdd; state: of friction, if the model has one."""
+        """Return the input tau, (..., n), that gives qdd; state: friction state, if the model has one."""
         cache = self.at(q, qd, qdd)
         force = applied(cache.mass, qdd) + self.nonlinear_effects(cache, qd)
         force = force + self.friction_torque(cache, qd, *state)
-        # Inputs may have an offset: it is the force at tau = 0.
+        # ``input_force`` may have an offset, the force at tau = 0, which is subtracted.
         return self.input_torque(cache, force - self.input_force(cache, qd, 0 * qd))
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Parameters, *state: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return q' and p', (..., n), under the input tau; None: no input."""
+        """Return the time derivatives q' and p', (..., n), under the input tau; None: no input."""
         cache = self.at(q, p, p if tau is None else tau, prepared=prepared)
         qd = self.velocity(cache, p)
         force = self.lagrangian_gradient(cache, qd) - self.friction_torque(cache, qd, *state)

@@ -1,4 +1,4 @@
-"""Residual terms: functions of single joints, and networks of several joints, in addition to rigid bodies."""
+"""Residual terms in addition to rigid bodies: functions of single joints, and networks of several joints."""
 
 import math
 from collections.abc import Sequence
@@ -14,11 +14,12 @@ from spelgen.runtime.port_hamiltonian import applied
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidConfiguration, RigidParameters
 from spelgen.runtime.rows import Joint, vector
 
-# Number of B-splines over the range of a joint.
+# Number of cubic B-splines over the range of a joint.
 SPLINES = 34
-# Harmonics of a revolution of the joint; two more belong to a revolution of the motor (teeth and poles).
+# Number of ripple harmonics per revolution of the joint. Two more are per revolution of the motor, for
+# gear teeth and motor poles.
 HARMONICS = 64
-# Bound of the logarithm of the friction factor: the factor stays between 0.1 and 10.
+# Bound of the magnitude of the friction factor's logarithm: the factor is between 0.1 and 10.
 LARGEST = math.log(10.0)
 
 
@@ -26,8 +27,8 @@ class ResidualParameters(NamedTuple):
     """All that depends on the parameters only."""
 
     splines: Tensor  # coefficients of the torque [Nm, N] and of the friction factor, (n, SPLINES, 2)
-    ripple: Tensor  # amplitudes [Nm], (n, 2 HARMONICS + 4)
-    constant: Tensor  # contribution of the constants to M, (n n,)
+    ripple: Tensor  # amplitudes of cosines, then sines [Nm], (n, 2 HARMONICS + 4)
+    constant: Tensor  # sum of the constants' contributions to M, (n n,)
     functions: Tensor  # largest contribution of each function to M, (functions, n n)
     mass: Layers | None
     potential: Layers | None
@@ -38,25 +39,27 @@ class ResidualConfiguration(NamedTuple):
 
     q: Tensor
     encoded: Tensor
-    torque: Tensor  # dV/dq of the functions of single joints, (..., n) [Nm, N]
-    friction: Tensor  # the factor on friction, (..., n)
+    torque: Tensor  # dV/dq due to functions of single joints, (..., n) [Nm, N]
+    friction: Tensor  # factor on friction, (..., n)
     mass: Tensor  # R(q), (..., n, n)
-    slope: Tensor | None  # derivative of the functions of R with respect to the outputs of the network
-    intermediates: Intermediates  # of the derivatives of these outputs
+    slope: Tensor | None  # d tanh(y) / dy for the outputs y of R's network, (..., functions)
+    intermediates: Intermediates  # of the network of R
     parameters: ResidualParameters
 
 
 class ResidualTerms(nn.Module):
-    """A residual R(q) of M, terms of V, and a factor on friction: zero, zero and one for zero parameters.
+    """Residual terms: R(q) is added to M, terms are added to V, and a factor multiplies friction.
 
-    For each joint: a torque dV/dq, the sum of cubic B-splines over its range and, if it is revolute, of
-    harmonics of a revolution of the joint and of its motor, in units of typical friction; and a factor on
-    friction, the exponential of such a spline, between 0.1 and 10. Splines are zero at the ends of the range.
+    Each joint has a torque dV/dq that is a function of its position: a sum of cubic B-splines over the
+    joint's range and, for a revolute joint, of harmonics of a revolution of the joint and of the motor,
+    in units of typical friction. The friction factor of a joint is the exponential of another sum of
+    splines, between 0.1 and 10. Sums of splines are zero at the ends of the range.
 
-    R is ``entries(*functions, *constants)``; a network ``potential`` in units of ``potential_scale`` [J] is
-    added to V. Each function is a bound times the tanh of an output of ``network``, each constant a bound
-    times the tanh of a parameter: the ``bounds`` make armature + R positive definite for all q and all
-    parameters.
+    R is ``entries(*functions, *constants)``. Each function is a bound times the tanh of an output of
+    ``network``, each constant a bound times the tanh of a parameter; the ``bounds`` make armature + R
+    positive definite for all q and all parameters. ``potential_scale`` [J] times the output of the
+    network ``potential`` is added to V. If all parameters are zero, R and the terms of V are zero, and
+    the factor is one.
     """
 
     parameter_groups = (
@@ -81,8 +84,8 @@ class ResidualTerms(nn.Module):
         n = len(joints)
         zeros = torch.zeros(n, SPLINES, dtype=torch.float64)
         self.encoding = JointEncoding(joints)
-        # The range has SPLINES - 3 intervals; the middles of the outermost splines are one spacing beyond
-        # it.
+        # The range is divided into SPLINES - 3 intervals; the first and the last spline have their
+        # middles one interval beyond the ends.
         spacing = 2 * vector(joint.half_range for joint in joints).unsqueeze(-1) / (SPLINES - 3)
         knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2
         self.spacing = nn.Buffer(spacing)
@@ -90,7 +93,7 @@ class ResidualTerms(nn.Module):
         self.middles = nn.Buffer(center + spacing * knots)
         self.unit = nn.Buffer(vector(joint.friction for joint in joints).unsqueeze(-1))
         self.revolute = nn.Buffer(vector(joint.joint_type == "revolute" for joint in joints).unsqueeze(-1))
-        # periods of the ripple per revolution of the joint, (n, HARMONICS + 2)
+        # Number of ripple periods per revolution of the joint, (n, HARMONICS + 2).
         frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(n, 1)
         for index, joint in enumerate(joints):
             if joint.gear > HARMONICS:
@@ -103,33 +106,36 @@ class ResidualTerms(nn.Module):
         self.mass, self.potential = network, potential
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
-        # one divided by the coefficient of each function and constant in an entry; no bound if it is zero
+        # 1 / |coefficient| of each function and constant in each entry of M; a very large number, which
+        # causes no bound, for the coefficient zero.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
-        # at most 90 % of the armature may be subtracted
-        self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())  # divided among all terms in a row of M
+        # R may reduce the armature by at most 90 %. This share is divided by the largest number of
+        # terms in a row of M.
+        self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())  # per term
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
-        """Return the contribution of each function and constant to M, (functions + constants, n, n)."""
+        """Return the contribution to M, (functions + constants, n, n), of each function and constant."""
         rows = torch.diag(sizes).unbind()
         return self.entries(*rows)
 
     def bounds(self, armature: Tensor) -> Tensor:
-        """Return the bounds of functions and constants, (functions + constants,), for an armature (n, n).
+        """Return bounds of the functions and constants, (functions + constants,), for an armature (n, n).
 
-        armature - diag(d) is positive semi-definite for d = 1 / (row sums of |armature^-1|), and so is
-        diag(d) - R if no row of |R| / sqrt(d d^T) has a sum above one: both by diagonal dominance.
+        For d = 1 / (row sums of |armature^-1|), armature - diag(d) is positive semi-definite. If the
+        row sums of |R| / sqrt(d d^T) are at most one, diag(d) - R is also positive semi-definite. Both
+        follow from diagonal dominance.
         """
         root = torch.linalg.inv(armature).abs().sum(dim=-1).rsqrt()
         smallest: Tensor = (root.unsqueeze(-1) * root * self.inverse).amin(dim=(-2, -1))
         return self.part * smallest
 
     def friction_logarithms(self) -> Tensor:
-        """Return the spline coefficients of the logarithm of the friction factor, (n, SPLINES)."""
+        """Return the spline coefficients of the friction factor's logarithm, (n, SPLINES)."""
         return LARGEST * (self.raw_friction_splines / LARGEST).tanh()
 
     def prepare(self, armature: Tensor) -> ResidualParameters:
-        """Return the parameter cache, for an armature matrix (n, n)."""
+        """Return the parameter cache; armature: armature matrix, (n, n)."""
         splines = [self.unit * self.raw_torque_splines, self.friction_logarithms()]
         rows = self._by_entry(self.bounds(armature)).flatten(1)
         functions, constants = rows.tensor_split((self.functions,))
@@ -152,13 +158,13 @@ class ResidualTerms(nn.Module):
         """Return all that depends on q, (..., n), only."""
         encoded = self.encoding.forward(q)
         splines = torch.einsum("...ik,ikm->...im", self.splines(q), parameters.splines)
-        # Both kinds of splines have the same basis: one product for torque and friction factor.
+        # The splines of torque and friction factor have the same basis, so one product gives both.
         smooth, friction = splines.unbind(-1)
         torque = smooth + (self.waves(q) * parameters.ripple).sum(dim=-1)
         mass, slope, intermediates = parameters.constant.expand(*q.shape[:-1], -1), None, None
         if self.mass is not None and parameters.mass is not None:
             y, intermediates = self.mass.forward(encoded, parameters.mass)
-            # Bounded outputs keep M + R positive definite, see ``bounds``.
+            # tanh bounds the outputs, so that M + R is positive definite, see ``bounds``.
             output = y.tanh()
             mass = F.linear(output, parameters.functions.mT, parameters.constant)
             slope = 1 - output * output
@@ -167,13 +173,13 @@ class ResidualTerms(nn.Module):
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, cache: ResidualConfiguration) -> Tensor:
-        """Return the residual of V, (...) [J]; the energy of each spline is zero in its middle."""
+        """Return the residual of V, (...) [J]; the energy of each B-spline is zero at the spline's middle."""
         distance = self._distances(cache.q)
         size = distance.abs()
-        # integral of the B-spline from its middle
+        # Integral of a B-spline of unit spacing from its middle to the distance `size`.
         step = 0.5 - (2 - size).relu() ** 4 / 24 + (1 - size).relu() ** 4 / 6
         smooth = (self.spacing * distance.sign() * step * cache.parameters.splines[..., 0]).sum(dim=-1)
-        # The integral of cos(f q) is sin(f q) / f, of sin(f q) it is -cos(f q) / f.
+        # The integral of cos(f q) is sin(f q) / f, the integral of sin(f q) is -cos(f q) / f.
         by_cos, by_sin = (self.waves(cache.q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
         ripple = (torch.cat([by_sin, -by_cos], dim=-1) * cache.parameters.ripple).sum(dim=-1)
         energy = (smooth + ripple).sum(dim=-1)
@@ -185,7 +191,8 @@ class ResidualTerms(nn.Module):
         """Return d/dq of the residual of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         by_encoded = torch.zeros_like(cache.encoded)
         if self.mass is not None and cache.slope is not None:
-            # Cotangent of R, 1/2 qd qd^T, through the linear map, tanh and the network.
+            # The cotangent of R is 1/2 qd qd^T. It is propagated back through the linear map, tanh and
+            # the network.
             kinetic = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2) @ cache.parameters.functions.mT
             by_encoded = self.mass.vjp(cache.intermediates, cache.slope * kinetic)
         if self.potential is not None and cache.parameters.potential is not None:
@@ -194,7 +201,7 @@ class ResidualTerms(nn.Module):
         return self.encoding.vjp(cache.encoded, by_encoded) - cache.torque
 
     def nonlinear(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
-        """Return dR/dt qd - ``gradient``, (..., n)."""
+        """Return the contribution to ``nonlinear_effects``: dR/dt qd - ``gradient``, (..., n) [Nm, N]."""
         if self.mass is None or cache.slope is None:
             return -self.gradient(cache, qd)
         rate = self.mass.jvp(cache.intermediates, self.encoding.jvp(cache.encoded, qd))
@@ -202,23 +209,24 @@ class ResidualTerms(nn.Module):
         return applied(mass_rate, qd) - self.gradient(cache, qd)
 
     def splines(self, q: Tensor) -> Tensor:
-        """Return the cubic B-splines at q, (..., n, SPLINES), each 2/3 high."""
-        # ((2 - d)^3 - 4 (1 - d)^3) / 6 with the positive parts: a cubic B-spline of unit spacing.
+        """Return the values of the cubic B-splines at q, (..., n, SPLINES); their maximum is 2/3."""
+        # A cubic B-spline of unit spacing is ((2 - d)^3 - 4 (1 - d)^3) / 6 at the distance d from its
+        # middle, where negative brackets are replaced by zero.
         wide = (2 - self._distances(q).abs()).relu()
         return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4) / 6
 
     def waves(self, q: Tensor) -> Tensor:
-        """Return cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4)."""
+        """Return cos(f q) for all frequencies f, then sin(f q), (..., n, 2 HARMONICS + 4)."""
         phase = q.unsqueeze(-1) * self.frequencies
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
 
     def _distances(self, q: Tensor) -> Tensor:
-        """Return the distance of q from the middle of each spline, in spacings, (..., n, SPLINES)."""
+        """Return the signed distance of q from each spline's middle, in knot spacings, (..., n, SPLINES)."""
         return (q.unsqueeze(-1) - self.middles) / self.spacing
 
 
 class ResidualDynamics(RigidBodyDynamics):
-    """Rigid bodies with residual terms in M, V and friction; ``residuals`` is None if they were removed."""
+    """Rigid bodies with residual terms in M, V and friction; ``residuals`` is None after their removal."""
 
     residuals: ResidualTerms | None
 

@@ -1,4 +1,4 @@
-"""A port-Hamiltonian model of rigid bodies, with the inertia of four points per body."""
+"""A port-Hamiltonian model of rigid bodies, each represented by four point masses."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -17,8 +17,8 @@ from spelgen.runtime.rows import Joint, Link, vector
 class RigidParameters(NamedTuple):
     """All that depends on the parameters only."""
 
-    points: Tensor  # points of the bodies in body frames, block diagonal, (4 bodies, 4 bodies)
-    armature: Tensor  # inertia of the rotors, part of M, (n, n)
+    points: Tensor  # point masses in body frames, block diagonal, (4 bodies, 4 bodies)
+    armature: Tensor  # rotor inertia, added to M, (n, n)
     friction: FrictionConstants
     residual: Parameters = None  # parameter cache of the residual terms
 
@@ -28,19 +28,19 @@ class RigidConfiguration(NamedTuple):
 
     chain: ChainConfiguration
     mass: Tensor  # M(q), (..., n, n)
-    gravity: Tensor  # dV/dq of the bodies, (..., n)
+    gravity: Tensor  # dV/dq of the rigid bodies, (..., n) [Nm, N]
     prepared: RigidParameters
-    varied: Tensor | float = 1.0  # factor of the residual terms on friction, (..., n)
+    varied: Tensor | float = 1.0  # factor on friction, a residual term, (..., n)
     residual: Configuration = None  # configuration cache of the residual terms
 
 
 class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction and a torque offset.
 
-    z, (..., n, K) [rad, m], is the state of the friction bristles; their energy is part of H. Without z,
-    dry friction depends on velocity. motor_speeds: rows of C, the motors rotate at C qd and have the
-    friction, its state and the armature; None: every motor drives its own joint. servo: position
-    servos of the joints, if there are any.
+    The friction state z, (..., n, K) [rad, m], has the displacements of the bristles, whose energy is
+    part of H. Without z, dry friction depends on velocity. motor_speeds: rows of C, for motors that
+    rotate at C qd; friction, z and armature then belong to the motors. None: every motor drives its
+    own joint. servo: position servos; None: inputs are torques.
     """
 
     parameter_groups = (
@@ -57,7 +57,7 @@ class RigidBodyDynamics(PortHamiltonian):
         *,
         joints: Sequence[Joint],
         links: Sequence[Link],
-        gravity: Row,  # acceleration in the base frame [m/s^2]
+        gravity: Row,  # gravitational acceleration in the base frame [m/s^2]
         friction: FrictionLaws,
         inputs: Inputs | None = None,
         motor_speeds: Rows | None = None,
@@ -68,26 +68,26 @@ class RigidBodyDynamics(PortHamiltonian):
         self.friction, self.servo = friction, servo
         self.elements = friction.reach.shape[1]
         self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
-        # 1 for a joint that an input drives, (n,)
+        # 1 for an input that drives a joint, 0 for the input of a passive joint, (n,).
         self.actuated = nn.Buffer(self.input_matrix(self.nominal_armature).any(dim=0).double())
-        self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))  # logarithm of the ratio to nominal
-        # offset of the measured torque, in units of typical friction
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))  # log(ratio to nominal)
+        # The offset of the measured torque is in units of typical friction.
         self.raw_offset = nn.Parameter(torch.zeros_like(self.actuated))
-        # friction compensation, in units of typical friction per typical speed; a buffer, which only a
-        # fit to torques sets
+        # Friction compensation is in units of typical friction / typical speed. This is a buffer, not a
+        # parameter, because only a fit to torques sets it.
         self.raw_friction_compensation = nn.Buffer(torch.zeros_like(self.actuated))
         motors = None if motor_speeds is None else torch.stack([vector(row) for row in motor_speeds])
-        self.register_buffer("motors", motors)  # C, (n, n), and its inverse
+        self.register_buffer("motors", motors)  # C; loads: its inverse
         self.register_buffer("loads", None if motors is None else torch.linalg.inv(motors))
 
     @property
     def input_quantity(self) -> Literal["torque", "position"]:
-        """``torque``, or ``position`` for inputs that are commands of position servos."""
+        """Quantity of the inputs: ``torque``, or ``position`` for commands of position servos."""
         return "torque" if self.servo is None else "position"
 
     @property
     def inertial_parameters(self) -> Tensor:
-        """(m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of bodies about the origin of their joints, (bodies, 10)."""
+        """(m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) per body, about the joint frame's origin, (bodies, 10)."""
         root = self.bodies.forward()
         row, column = torch.triu_indices(4, 4)
         xx, xy, xz, x, yy, yz, y, zz, z, m = (root @ root.mT)[..., row, column].unbind(dim=-1)
@@ -110,12 +110,12 @@ class RigidBodyDynamics(PortHamiltonian):
 
     @property
     def torque_offset(self) -> Tensor:
-        """Measured torque at zero torque, (n,) [Nm, N]."""
+        """Torque that the sensors measure if the true torque is zero, (n,) [Nm, N]."""
         return self.raw_offset * self.friction.nominal * self.actuated
 
     @property
     def friction_compensation(self) -> Tensor:
-        """Torque per velocity that the drives add and that the measured torque does not contain, (n,)."""
+        """Torque per velocity that drives add, not part of measured torque, (n,) [Nm s/rad, N s/m]."""
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self) -> RigidParameters:
@@ -127,7 +127,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return RigidParameters(points, armature, self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return all that depends on q, (..., n), only."""
+        """Return the configuration cache at q, (..., n) [rad, m]."""
         chain, ratios = self.chain.forward(q, prepared.points), self.chain.ratios
         mass = ratios.mT @ (chain.jacobian @ chain.jacobian.mT) @ ratios + prepared.armature
         return RigidConfiguration(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
@@ -160,13 +160,13 @@ class RigidBodyDynamics(PortHamiltonian):
         return qd @ self.motors.mT, cache.gravity @ self.loads
 
     def friction_torque(self, q: Tensor | RigidConfiguration, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: see ``FrictionConstants``."""
+        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: z, or None if it is unknown."""
         cache: RigidConfiguration = self.at(q, qd)
         torque = cache.varied * cache.prepared.friction.torque(*self._at_motors(cache, qd), *state)
         return torque if self.motors is None else torque @ self.motors
 
     def dissipation(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
-        """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
+        """Return D(q, qd) of friction without bristles, (..., n, n) [Nm s/rad, N s/m]."""
         cache: RigidConfiguration = self.at(q, qd)
         friction = cache.prepared.friction
         qd, gravity = self._at_motors(cache, qd)
@@ -175,32 +175,34 @@ class RigidBodyDynamics(PortHamiltonian):
         return matrix if self.motors is None else self.motors.mT @ matrix @ self.motors
 
     def _motor(self, qd: Tensor) -> Tensor:
-        """Return velocities or displacements of the motors, (..., n), from the joints' (..., n)."""
+        """Return motor velocities (or displacements), (..., n), from joint velocities (or displacements)."""
         return qd if self.motors is None else qd @ self.motors.mT
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return the state z, (..., n, K), of drives that have moved at qd for a long time.
+        """Return the friction state z, (..., n, K), after a long motion at constant qd, (..., n).
 
-        Near the smoothing velocity friction is up to 7.4 % larger than without z, far above it equal.
+        Friction with this z is up to 7.4 % larger than friction without z near the smoothing velocity,
+        and equal far above it.
         """
-        # tanh reaches its limit within a few widths: an algebraic sign would be a stiff transient
+        # tanh reaches one within a few widths. The smooth sign of friction without z does so slowly,
+        # and the initial z would cause a stiff transient.
         direction = (self._motor(qd) / self.friction.prepare().coulomb_smoothing_velocity).tanh()
         return direction.unsqueeze(-1) * self.friction.reach
 
     def memory_rate(self, z: Tensor, qd: Tensor) -> Tensor:
-        """Return z', (..., n, K): qd, or zero for a bristle that slides."""
+        """Return dz/dt, (..., n, K): the motor velocity, or zero for a bristle that slides."""
         qd = self._motor(qd).unsqueeze(-1)
         return qd * (qd.sign() * z < self.friction.reach)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return z, (..., n, K), after a monotonic displacement of the joints, (..., n): exact."""
+        """Return z, (..., n, K), exactly, after a joint displacement without reversals, (..., n)."""
         moved = z + self._motor(displacement).unsqueeze(-1)
         return moved.clamp(-self.friction.reach, self.friction.reach)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """Return the rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau) with a constant tau.
+        """Return d/dt of the state (q, p, z), (..., 2 n + n K), or of (q, p, z, tau) with constant tau.
 
-        A state without z, (..., 2 n), is for friction without bristles.
+        A state without z, (..., 2 n), gives friction that depends on velocity.
         """
         n, size = self.n, self.n * self.elements
         if state.shape[-1] < 2 * n + size:

@@ -1,4 +1,4 @@
-"""The rows of an emitted module: joints, links, and the functions and constants of the mass matrix."""
+"""Classes of the rows of an emitted module: joints, links, and functions and constants of the mass matrix."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -12,33 +12,33 @@ Tensor6 = tuple[float, float, float, float, float, float]  # (xx, xy, xz, yy, yz
 
 
 def _rounded(value: float) -> float:
-    """Return a value to six significant digits."""
+    """Return a value, rounded to six significant digits."""
     return float(f"{value:.6g}")
 
 
 class Joint(NamedTuple):
-    """A joint. Positions are in rad and torques in Nm if it is revolute, in m and N if it is prismatic."""
+    """A joint. Units are rad and Nm for a revolute joint, m and N for a prismatic joint."""
 
     name: str
     joint_type: Literal["revolute", "prismatic"]
-    lower: float | None  # limits of the position; None: unlimited
+    lower: float | None  # position limits [rad, m]; None: unlimited
     upper: float | None
     speed: float  # typical velocity [rad/s, m/s]
-    friction: float  # typical friction torque [Nm, N]
-    armature: float  # nominal rotor inertia times gear ratio squared [kg m^2, kg]
+    friction: float  # typical magnitude of the friction torque [Nm, N]
+    armature: float  # nominal rotor inertia times gear^2 [kg m^2, kg]
     gear: float = 1.0  # motor revolutions per revolution of the joint
-    typical_range: tuple[float, float] | None = None  # center and half range; None: from the limits
+    typical_range: tuple[float, float] | None = None  # center, half range; None: see limits
 
     @property
     def center(self) -> float:
-        """Middle of the range of motion."""
+        """Middle of the range of motion [rad, m]."""
         if self.typical_range is not None:
             return self.typical_range[0]
         return 0.0 if self.lower is None or self.upper is None else _rounded((self.lower + self.upper) / 2)
 
     @property
     def half_range(self) -> float:
-        """Half the range of motion: networks depend on (q - center) / half_range of a prismatic joint."""
+        """Half the range of motion [rad, m]; scaled q of a prismatic joint: (q - center) / half_range."""
         if self.typical_range is not None:
             return self.typical_range[1]
         return (
@@ -47,23 +47,23 @@ class Joint(NamedTuple):
 
 
 class Link(NamedTuple):
-    """A rigid body that a joint moves, in the frame of that joint: z is its axis."""
+    """A rigid body that a joint moves. Its frame is the joint's frame, whose z is the joint axis."""
 
     name: str
-    parent: str | None  # the link that carries it; None: the base
-    joint: str  # moves it by ratio * q + offset
-    position: Triple  # origin of the joint's frame in the parent's frame at q = 0 [m]
+    parent: str | None  # name of the link that carries the joint; None: the base
+    joint: str  # name; its coordinate q moves the link by ratio * q + offset
+    position: Triple  # origin in the parent's frame, at displacement 0 [m]
     mass: float  # [kg]
-    center_of_mass: Triple  # [m]
+    center_of_mass: Triple  # in the joint's frame [m]
     inertia: Tensor6  # about the center of mass [kg m^2]
     rotation: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     ratio: float = 1.0
     offset: float = 0.0  # [rad, m]
-    joint_type: Literal["revolute", "prismatic"] | None = None  # None: as the joint
+    joint_type: Literal["revolute", "prismatic"] | None = None  # None: type of `joint`
 
 
 class Function(NamedTuple):
-    """A learned function of the positions of some joints: mean + scale * network."""
+    """A learned function of joint positions: mean + scale * output of a network."""
 
     joints: tuple[str, ...]
     mean: float = 0.0
@@ -71,7 +71,7 @@ class Function(NamedTuple):
 
 
 class Constant(NamedTuple):
-    """A trained constant and its initial value, in units of ``scale``."""
+    """A trained constant. initial: initial value; scale: unit of the trained parameter."""
 
     initial: float
     scale: float

@@ -1,6 +1,6 @@
-"""Configurations of fits: one class per objective, which has exactly the options that apply to it.
+"""Configurations of fits: one class per objective, with exactly the options that apply to the objective.
 
-`OWNERS` lists the objectives of each option; an option of another objective is an `OptionError`.
+`OWNERS` lists the objectives to which each option applies; an option of another objective is an `OptionError`.
 """
 
 from collections.abc import Mapping
@@ -18,22 +18,22 @@ Optimizer = Literal["adamw", "lbfgs"]
 Adaptation = Literal["load", "friction", "unit"]
 Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
-Substeps = Annotated[Count, Field(le=1000)]  # a limit for the duration of a fit
+Substeps = Annotated[Count, Field(le=1000)]  # a bound on the duration of a fit
 
 
 @dataclass(frozen=True)
 class WindowFitDefaults:
-    """Defaults of the optimizers of window fits, chosen on the arms of `benchmarks/arms.py`."""
+    """Defaults of the optimizers of fits on windows of a log, chosen on the arms of `benchmarks/arms.py`."""
 
-    # [1] Largest number of windows for which L-BFGS, with all windows in each step, is the default; else AdamW.
+    # [1] Up to this number of windows the default optimizer is L-BFGS, with all windows in each step; above, AdamW.
     few_windows: int = 1024
-    # [1] Weight decay of L-BFGS: factor of half the sum of squared weights, in units of the loss.
+    # [1] Weight decay of L-BFGS: factor of half the sum of squared weights that is added to the loss.
     lbfgs_decay: float = 2e-5
     # [1] Weight decay of AdamW (Loshchilov and Hutter, ICLR 2019).
     adamw_decay: float = 0.2
     # [1] Windows per step of AdamW.
     batch: int = 256
-    # [1] Largest learning rate of AdamW: the default of its authors.
+    # [1] Largest learning rate of AdamW: the default value of the authors of this optimizer.
     learning_rate: float = 1e-3
 
 
@@ -87,7 +87,11 @@ class GaussianPrior(Group):
 
 
 class FitConfig(Group):
-    """Options of one objective. of_rigid_bodies, of_networks: options for models of this type only."""
+    """Base class of the options of one objective.
+
+    of_rigid_bodies, of_networks: names of the options that apply only to models of rigid bodies, or only to models of
+    networks.
+    """
 
     objective: ClassVar[Objective]
     of_rigid_bodies: ClassVar[tuple[str, ...]] = ()
@@ -97,7 +101,7 @@ class FitConfig(Group):
     @classmethod
     def _refuse_foreign(cls, options: object) -> object:
         for name in options if isinstance(options, Mapping) else ():
-            # an option of another objective has a message of its own, since it exists
+            # An option of another objective exists: the message names its objectives and not a similar option.
             if name not in cls.model_fields:
                 owners = OWNERS.get(name)
                 if owners is None:
@@ -115,8 +119,11 @@ class FitConfig(Group):
         return self
 
     def require(self, *, rigid_bodies: bool) -> None:
-        """Raise OptionError if an option was set that does not apply to this type of model."""
-        # rigid bodies are fitted to torques directly, without the weak form
+        """Raise OptionError if the objective, or an option that was set, does not apply to this type of model.
+
+        rigid_bodies: whether the model consists of rigid bodies, not of networks.
+        """
+        # Models of rigid bodies are fitted to torques directly: the momentum objective is not needed for them.
         if rigid_bodies and self.objective == "momentum":
             raise OptionError(
                 "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
@@ -127,14 +134,14 @@ class FitConfig(Group):
                 raise OptionError(name, f"with the objective {self.objective} belongs to {models}")
 
     def record(self, *, rigid_bodies: bool) -> dict[str, object]:
-        """Return the options that apply, for config.json."""
+        """Return the options that apply to this type of model and are not None, for config.json."""
         return self.model_dump(
             mode="json", exclude_none=True, exclude=set(self.unused(rigid_bodies=rigid_bodies))
         )
 
     @classmethod
     def unused(cls, *, rigid_bodies: bool) -> tuple[str, ...]:
-        """Return the options that do not apply to this type of model."""
+        """Return the names of the options that do not apply to this type of model."""
         return cls.of_networks if rigid_bodies else cls.of_rigid_bodies
 
 
@@ -191,8 +198,11 @@ class OnWindows(FitConfig):
     max_minutes: NonNegative | None = None
 
     def resolved(self, windows: int) -> Self:
-        """Return the configuration with optimizer, batch, learning rate and weight decay for a number of windows."""
-        # L-BFGS with all windows per step converges in few steps, but each one takes all windows
+        """Return the configuration with the defaults of optimizer, batch, learning rate and weight decay set.
+
+        windows: number of training windows, on which the default optimizer depends.
+        """
+        # L-BFGS converges in few steps, but each step needs all windows: it is the default for few windows only.
         optimizer = self.optimizer or ("lbfgs" if windows <= DEFAULTS.few_windows else "adamw")
         update: dict[str, object] = {"optimizer": optimizer, "batch": None, "learning_rate": None}
         decay = DEFAULTS.lbfgs_decay
@@ -262,10 +272,10 @@ def fit_config(
     """Return the configuration of an objective.
 
     Args:
-        objective: Key of ``CONFIGS``.
-        rigid_bodies: Whether the model is one of rigid bodies.
-        options: Options of the caller. Raises OptionError for an option that does not apply.
-        defaults: Settings of the robot; options that do not apply are ignored.
+        objective: Name of the objective, a key of ``CONFIGS``.
+        rigid_bodies: Whether the model consists of rigid bodies, not of networks.
+        options: Options of the caller. An option that does not apply raises OptionError.
+        defaults: Options in the settings of the robot. Options that do not apply are ignored.
     """
     config_type, options = CONFIGS[objective], dict(options or {})
     applicable = config_type.model_fields.keys() - config_type.unused(rigid_bodies=rigid_bodies)
@@ -273,7 +283,7 @@ def fit_config(
     for name, (condition, _, excluded) in UNLESS.items():
         if options.get(condition, settings.get(condition)) == excluded:
             settings.pop(name, None)
-        # an option of the caller implies the choice that it depends on
+        # An option of the caller takes precedence over a setting that excludes it: `batch` implies AdamW, for example.
         elif name in options and condition not in options and settings.get(condition) == excluded:
             settings.pop(condition)
     config = validated(config_type, settings | options)

@@ -1,7 +1,8 @@
 """Names, units and signs of logged columns: the group `logs` of a settings file, or a separate mapping file.
 
-q = sign * unit * value + offset, and so is u, a commanded position; qd = sign * unit * value,
-tau = sign * gain * unit * value + torque_offset. Register words are decoded before by `sign_bit` and `period`.
+With `value` the logged number and `unit` the factor to SI units: q = sign * unit * value + offset,
+qd = sign * unit * value, tau = sign * gain * unit * value + torque_offset. A commanded position u is converted like q.
+Words of motor registers are first decoded by `sign_bit` and `period`.
 """
 
 from __future__ import annotations
@@ -18,26 +19,27 @@ from spelgen.settings.values import Group, Number, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
-# factors to SI units; SI units themselves are not listed
+# Factors from units to SI units, for units other than SI units.
 LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mrad": _MILLI, "mm": _MILLI}
 SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
-# of a torque that only a gain converts: currents, and parts of a torque that the log does not state
+# Units of `tau` that need a gain: currents, and fractions of a rated torque that the log does not contain.
 CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
-# -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
+# Positions from -100 to 100 over the calibrated range of a motor, which LeRobot stores by default.
 NORMALISED = "normalised"
-ONLY = {  # units that a joint of this type cannot have
+ONLY = {  # joint type: units that such a joint cannot have
     "revolute": {"m", "mm", "m/s", "mm/s", "N"},
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", *LENGTHS, *SPEEDS} - {"mm", "mm/s"},
 }
 
-LONGEST_DELAY = 1.0  # s
+LONGEST_DELAY = 1.0  # [s] largest magnitude of `torque_delay`
 
 Accepted = Literal[
     "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",
     "velocity-is-no-derivative", "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "motion-order",
     "joint-sense", "joint-order", "joint-unit", "joint-zero", "gravity", "gravity-compensated", "torque-clipped",
+    "normalised",
 ]  # fmt: skip
 """Codes of errors of `spelgen logs` that a user can accept."""
 
@@ -68,11 +70,11 @@ class LogColumns(Group):
 
 
 PLAIN = LogColumns().model_dump()
-"""Columns of files that spelgen writes."""
+"""Names of the columns in files that spelgen writes."""
 
 
 class JointColumns(Group):
-    """Names of the columns of one joint, in place of the names for all joints.
+    """Names of the columns of one joint, in place of the names in `columns` for all joints.
 
     Attributes:
         q: Position.
@@ -88,13 +90,13 @@ class JointColumns(Group):
 
 
 class JointUnits(Group):
-    """Units of the columns of one joint, in place of the units of all joints.
+    """Units of the columns of one joint, in place of the `units` of all joints.
 
     Attributes:
         q: Position.
         qd: Velocity.
         tau: Torque, force or motor current.
-        u: Commanded position; default: as q.
+        u: Commanded position; default: the unit of q.
     """
 
     q: Position | None = None
@@ -104,7 +106,7 @@ class JointUnits(Group):
 
 
 class LogUnits(JointUnits):
-    """Units of all columns; default: SI units. Positions in degrees are then still detected.
+    """Units of all columns; default: SI units. Without a unit, positions in degrees are detected.
 
     Attributes:
         t: Time.
@@ -114,7 +116,7 @@ class LogUnits(JointUnits):
 
 
 class JointWords(Group):
-    """Period or sign bit of the register words of one joint, in logged units; default: the values are plain numbers.
+    """Period, or sign bit, of the register words of one joint, in logged units; default: plain numbers, no words.
 
     Attributes:
         q: Position.
@@ -136,8 +138,8 @@ class MotorCalibration(Group):
         range_min: Lower end of the range of motion [counts].
         range_max: Upper end of the range of motion [counts].
         drive_mode: 1 for a motor whose direction is reversed.
-        homing_offset: Offset of the position, which is not used.
-        id: Number of the motor on its bus, which is not used.
+        homing_offset: Offset of the position [counts]; it is not used.
+        id: Number of the motor on its bus; it is not used.
     """
 
     range_min: Number
@@ -148,7 +150,7 @@ class MotorCalibration(Group):
 
     @model_validator(mode="after")
     def _has_range(self) -> MotorCalibration:
-        # An empty range cannot be normalised to -100..100.
+        # Positions are normalised to -100..100 over the range, which must not be empty.
         if not self.range_min < self.range_max:
             raise ValueError("a range_max above range_min")
         return self
@@ -159,8 +161,8 @@ class JointLog(Group):
 
     Attributes:
         name: Name of the joint in the log; default: its name in the URDF.
-        columns: Names of its columns.
-        units: Units of its columns.
+        columns: Names of the columns of the joint.
+        units: Units of the columns of the joint.
         counts_per_turn: Encoder counts per revolution of the joint.
         counts_per_metre: Encoder counts per metre of the joint.
         sign: -1 if position, velocity and torque in the log have the opposite sense of the URDF's axis.
@@ -168,9 +170,9 @@ class JointLog(Group):
         gain: Torque per logged unit, e.g. gear times motor constant; negative if current and velocity have opposite
             senses [Nm/A].
         torque_offset: Torque at the logged value 0 [Nm, N].
-        period: Interval after which logged values start again, e.g. 65536 counts of a 16-bit register or 360 degrees;
+        period: Interval after which logged values wrap around, e.g. 65536 counts of a 16-bit register or 360 degrees;
             default: one turn for the positions of joints without limits.
-        sign_bit: Logged value from which on values are negative: 32768 + x of a servo is -x.
+        sign_bit: Value of the sign bit, if logged values are sign and magnitude: with 32768, 32768 + x means -x.
     """
 
     name: str | None = None
@@ -187,7 +189,7 @@ class JointLog(Group):
 
     @model_validator(mode="after")
     def _moves(self) -> JointLog:
-        # A gain of zero would map every logged torque to zero.
+        # A gain of zero is an error, because it would convert every logged torque to zero.
         if self.gain == 0.0:
             raise ValueError("a gain that is not 0")
         return self
@@ -199,7 +201,7 @@ class LogMapping(Group):
     It does not apply to files that spelgen has written.
 
     Attributes:
-        topic: Topic of a ROS bag that has joint states in several topics.
+        topic: Topic to read, for a ROS bag with joint states in several topics.
         columns: Names of the columns.
         units: Units of the columns.
         input: "position" for position servos: u is read instead of qd and tau.
@@ -228,45 +230,45 @@ class LogMapping(Group):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Required quantities of a log."""
-        # fits of position servos compare positions only: velocities are not needed
+        """Names of the quantities that a log must contain, besides the time."""
+        # Fits of position servos compare positions only, so that velocities are not needed.
         if self.input == "position":
             return ("q", "u")
-        # Velocities are computed from the positions: no column is read for them.
+        # No column of velocities is read, because velocities are computed from the positions.
         if self.velocity == "differentiated":
             return ("q", "tau")
         return ("q", "qd", "tau")
 
     def signals(self, joints: Sequence[str]) -> list[tuple[str, str]]:
-        """Return quantity and joint of each column, in their order."""
+        """Return (quantity, joint) of each column: all joints of the first quantity, then of the next."""
         return list(product(self.quantities, joints))
 
     def joint(self, name: str) -> JointLog:
-        """Return the columns of a joint, by its URDF name."""
+        """Return the mapping of the columns of a joint, by the name of the joint in the URDF."""
         return self.joints.get(name, JointLog())
 
     def log_name(self, joint: str) -> str:
-        """Return a joint's name in the log."""
+        """Return the name in the log of a joint, which is given by its name in the URDF."""
         return self.joint(joint).name or joint
 
     def column(self, quantity: str, joint: str) -> str:
-        """Return the column of "q", "qd", "tau" or "u" of a joint."""
+        """Return the name of the column of a quantity ("q", "qd", "tau" or "u") of a joint."""
         name: str | None = getattr(self.joint(joint).columns, quantity)
         return name or self.pattern(quantity).replace("{joint}", self.log_name(joint))
 
     def pattern(self, quantity: str) -> str:
-        """Return the name of the columns of a quantity, with `{joint}`."""
+        """Return the name of the columns of a quantity for all joints, with the placeholder `{joint}`."""
         name: str = getattr(self.columns, quantity)
         return name
 
     def of_trajectory(self, text: str) -> LogMapping:
-        """Return the mapping for one recording of a file: `{trajectory}` in the columns' names is its text."""
-        # without a pattern in a name the column is common to all recordings
+        """Return the mapping for one recording of a file: `{trajectory}` in names of columns is replaced by `text`."""
+        # A name without `{trajectory}` is unchanged: its column belongs to all recordings.
         named = {key: name.replace("{trajectory}", text) for key, name in self.columns}
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
-        """Return the mapping with these columns: joint -> quantity -> column."""
+        """Return the mapping with other names of columns. columns: joint -> quantity -> name of the column."""
         joints = dict(self.joints)
         for joint, names in columns.items():
             logged = self.joint(joint)
@@ -274,11 +276,11 @@ class LogMapping(Group):
         return self.model_copy(update={"joints": joints})
 
     def with_turns(self, joints: Sequence[str]) -> LogMapping:
-        """Return the mapping with a period of one turn for positions of these joints, unless they have one."""
+        """Return the mapping with a period of one turn for the positions of these joints that have no period."""
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
-            # a stated period may be the range of a register, which is larger than a turn
+            # A period in the mapping is kept, because it may be the range of a register, which is larger than a turn.
             unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
             turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
             period = logged.period.model_copy(update=turns)
@@ -286,35 +288,38 @@ class LogMapping(Group):
         return self.model_copy(update={"joints": changed})
 
     def in_si(self) -> LogMapping:
-        """Return the mapping of a file in SI units with default names; only input and periods of one turn are kept."""
-        # angles of turning joints may be logged in any interval of one turn, also in files of spelgen
+        """Return the mapping for a file in SI units with default names of columns.
+
+        From this mapping it has `input`, `accept`, and a period of one turn for each joint with a period.
+        """
+        # Positions of joints without limits may be in any interval of one turn, also in files that spelgen writes.
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
     def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
-        """Return the period or the sign bit of a joint's quantity in logged units, None if it has none."""
+        """Return the period or the sign bit of a quantity of a joint, in logged units; None without a setting."""
         size: float | None = getattr(getattr(self.joint(joint), key), quantity)
         return size
 
     def unit(self, quantity: str, joint: str) -> str | None:
         """Return the unit of "q", "qd", "tau" or "u" of a joint, None without a setting; u has the unit of q."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
-        # commands and positions come from one controller
+        # The default unit of commanded positions is the unit of measured ones: both come from one controller.
         if unit is None and quantity == "u":
             return self.unit("q", joint)
         return unit
 
     def scale(self, quantity: str, joint: str) -> float:
-        """Return the factor from a logged value to SI units, with its sign."""
+        """Return the factor from a logged value of a quantity of a joint to SI units, including `sign`."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain
-        # -100..100 covers the calibrated range, and drive_mode 1 reverses it
+        # The 200 units from -100 to 100 are the calibrated range in counts; drive_mode 1 reverses the direction.
         elif unit == NORMALISED:
             motor = self.calibration[self.log_name(joint)]
             counts = (motor.range_max - motor.range_min) / 200
-            # counts in a revolution of the servos that LeRobot calibrates
+            # The servos that LeRobot calibrates have 4,096 counts per revolution.
             factor = (1 - 2 * motor.drive_mode) * counts * 2 * pi / (logged.counts_per_turn or 4096)
         elif unit in COUNTS:
             turn = logged.counts_per_turn
@@ -322,14 +327,14 @@ class LogMapping(Group):
         return logged.sign * factor
 
     def offset(self, quantity: str, joint: str) -> float:
-        """Return the offset that is added after multiplication by `scale`."""
+        """Return the offset of a quantity of a joint in SI units, which is added after multiplication by `scale`."""
         logged = self.joint(joint)
         if quantity == "tau":
             return logged.torque_offset
         return logged.offset if quantity in ("q", "u") else 0.0
 
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
-        """Return the errors of the mapping for these joints: missing keys, and units of the wrong joint type."""
+        """Return the errors of the mapping for these joints: absent keys, and units that the joint type excludes."""
         errors = []
         kinds: dict[str, str | None] = dict.fromkeys(joints)
         kinds.update(zip(joints, joint_types or (), strict=joint_types is not None))
@@ -342,13 +347,13 @@ class LogMapping(Group):
         return errors
 
     def _missing(self, unit: str | None, joint: str, logged: JointLog, kind: str | None) -> str | None:
-        # a motor current has no torque without its motor constant
+        # A motor current, or a fraction of a rated torque, cannot be converted to a torque without a gain.
         if unit in CURRENTS and logged.gain is None:
             return "a gain beside it"
         if unit == NORMALISED and joint not in self.calibration:
             return f"the content of LeRobot's calibration file as 'calibration', with {joint!r} in it"
         if unit in COUNTS:
-            # for an unknown joint type, either key is accepted
+            # If the joint type is unknown, counts per turn and counts per metre are both accepted.
             in_turns = logged.counts_per_turn if kind != "prismatic" else None
             in_metres = logged.counts_per_metre if kind != "revolute" else None
             if not (in_turns or in_metres):

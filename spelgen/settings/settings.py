@@ -1,6 +1,7 @@
 """Read the settings of a robot, `rpr.yaml` for `rpr.urdf`, and check them key by key.
 
-An error in a group of keys that only one step reads is raised by that step only.
+Some groups of keys, such as `training`, are used by one step only. An error in such a group is raised only when the
+group is used.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from spelgen.settings.values import Group, Inputs, NonNegative, Number, Positive
 from spelgen.settings.yaml_document import Location, YamlDocument, read_document, unknown_name, validated
 
 OF_A_STEP = ("simulation", "tracking", "training", "comparison", "logs")
-"""Groups that only one step reads; all others belong to the arm."""
+"""Groups of keys that only one step uses, such as simulation or training; all other keys describe the arm."""
 
 
 class JointSettings(Group):
@@ -51,13 +52,13 @@ class JointSettings(Group):
     @property
     def armature(self) -> float:
         """Rotor inertia on the joint side of the gear [kg m^2]."""
-        # a rotor turns gear times as fast, and its torque acts gear times as strongly
+        # The rotor turns `gear` times as fast as the joint, and the gear multiplies its torque by `gear` once more.
         return self.rotor_inertia * self.gear**2
 
     @field_validator("coulomb")
     @classmethod
     def _resists(cls, value: tuple[float, float]) -> tuple[float, float]:
-        # friction of the opposite sense would drive the joint
+        # Friction in the direction of motion would drive the joint.
         if value[0] < 0 or value[1] > 0:
             raise ValueError("the torque for qd > 0 (not negative), then for qd < 0 (not positive)")
         return value
@@ -79,7 +80,7 @@ class MotorCoupling(Group):
         if {len(self.matrix), *map(len, self.matrix)} != {len(self.joints)}:
             raise ValueError("as many rows, and as many numbers in each, as joints")
         rows = np.array(self.matrix)
-        # the rank is tested after scaling each row, as the motors of different joints may have different units
+        # Each row is scaled before the rank is tested, because joint torques (rows) may have different units.
         largest = np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
         if np.linalg.matrix_rank(rows / np.where(largest > 0, largest, 1.0)) < len(self.joints):
             raise ValueError("a matrix with an inverse: as many independent motors as joints")
@@ -87,13 +88,13 @@ class MotorCoupling(Group):
 
 
 class Unusable:
-    """Placeholder of a group with errors, which it raises when an attribute is read."""
+    """Placeholder for a group of settings with errors; it raises these errors when an attribute is read."""
 
     def __init__(self, errors: Sequence[SpelgenError]) -> None:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> NoReturn:
-        # names with underscores are asked for by copy and pickle, which must not fail
+        # copy and pickle read attributes with double underscores, for which the errors must not be raised.
         if not name.startswith("__"):
             collect(self.errors)
         raise AttributeError(name)
@@ -136,20 +137,20 @@ class Settings(Group):
     @field_validator("joints", mode="before")
     @classmethod
     def _by_name(cls, joints: object) -> object:
-        # a frequent confusion, for which the message of pydantic would not name the other key
+        # A list in `joints` is often meant for `moving_joints`, which the message of pydantic would not name.
         if isinstance(joints, list):
             raise ValueError("settings by the name of a joint; `moving_joints` lists the joints that move")
         return joints
 
     @model_validator(mode="after")
     def _drives(self) -> Settings:
-        # `tip` and `moving_joints` both determine the last joint, and could contradict each other
+        # `tip` and `moving_joints` both determine the last joint, and could contradict each other.
         if self.tip is not None and self.moving_joints is not None:
             raise ValueError("'tip' or 'moving_joints', not both")
-        # a position servo commands a joint, and its logs have no torques
+        # These keys are defined for logged torques, which logs of position servos do not have.
         if self.input == "position" and (self.torque == "motor" or self.couplings):
             raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
-        # A joint in two couplings would have two different motor torques.
+        # A joint in two couplings would be driven by two different sets of motors.
         coupled = [name for coupling in self.couplings for name in coupling.joints]
         for name in coupled:
             if coupled.count(name) > 1:
@@ -160,13 +161,13 @@ class Settings(Group):
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """Warnings of groups with errors, which the steps that read these groups will raise."""
+        """One warning per error in a group that only one step uses; the step raises the error."""
         unusable = [group for _, group in self if isinstance(group, Unusable)]
         errors = [error for group in unusable for error in group.errors]
         return tuple(Diagnostic("warning", "unusable-settings", "settings", None, str(x)) for x in errors)
 
     def joint(self, name: str) -> JointSettings:
-        """Return the settings of a joint; the defaults if the file does not list it."""
+        """Return the settings of the joint of this name; the defaults if the settings file does not list it."""
         return self.joints.get(name, JointSettings())
 
 
@@ -175,15 +176,15 @@ def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) 
 
     Args:
         urdf_path: Path of the URDF.
-        joints: Names of all its joints; settings of any other joint are then errors.
+        joints: Names of all joints in the URDF; settings of any other joint are errors. None: names are not checked.
 
     Raises:
         SettingsError, SpelgenErrors: One or several errors, with file, line and key. The errors of a group in
-            ``OF_A_STEP`` are raised when the group is read.
+            ``OF_A_STEP`` are raised when an attribute of the group is read.
     """
     path = Path(urdf_path).with_suffix(".yaml")
     if not path.exists():
-        # A file with the other suffix would be ignored without a message.
+        # Without this error a file with the suffix .yml would be ignored silently.
         misnamed = path.with_suffix(".yml")
         if misnamed.exists():
             raise SettingsError(repr(misnamed.name), file=misnamed, expected=repr(path.name), do="rename it")
@@ -199,25 +200,25 @@ def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) 
             break
         except SpelgenError as error:
             errors = error.errors if isinstance(error, SpelgenErrors) else (error,)
-        # a group that only one step reads must not stop the other steps: it is replaced by a placeholder
+        # A group with errors that only one step uses is replaced by a placeholder, so that other steps can run.
         for each in errors:
             group = (each.element or "").partition(".")[0]
             if group not in OF_A_STEP:
                 collect([*errors, *chain(*unusable.values())])
             unusable[group] = (*unusable.get(group, ()), each)
-            # Read again without the group: its errors may have hidden errors of other groups.
+            # The content is checked again without the group, whose errors may have hidden errors of other groups.
             content.pop(group, None)
     update: dict[str, object] = {group: Unusable(group_errors) for group, group_errors in unusable.items()}
-    # the logs have the input of the arm, so that a file states it only once
+    # `input` of the arm applies to the logs too, so that a settings file states it only once.
     if settings.input == "position" and "logs" not in unusable:
         update["logs"] = settings.logs.model_copy(update={"input": "position"})
     return settings.model_copy(update=update)
 
 
 def load_mapping(path: Path | str, joints: Collection[str]) -> LogMapping:
-    """Return the mapping of logs in a separate YAML file, which has the keys of `logs` in the settings.
+    """Return the mapping of log columns in a separate YAML file, with the keys of the group `logs` of the settings.
 
-    Raises SettingsError as `load_settings` does, and for joints that are not among `joints`.
+    Raises SettingsError as `load_settings` does, also for joints that are not among `joints`.
     """
     document = read_document(Path(path))
     mapping = validated(LogMapping, document.value(), document)
@@ -228,14 +229,17 @@ def load_mapping(path: Path | str, joints: Collection[str]) -> LogMapping:
 def _require_joints(
     found: Iterable[tuple[Location, str]], names: Collection[str], document: YamlDocument
 ) -> None:
-    """Raise SettingsError, or SpelgenErrors, for the joints of a file that are not among `names`."""
+    """Raise SettingsError, or SpelgenErrors, for joints in a file that are not among `names`.
+
+    found: location and name of each joint in the file.
+    """
     collect(
         [unknown_name(place, "joint", name, names, document) for place, name in found if name not in names]
     )
 
 
 def _joint_names(settings: Settings) -> Iterator[tuple[Location, str]]:
-    """Yield the name of each joint in a file with its location."""
+    """Yield location and name of each joint that the settings mention."""
     for name in settings.joints:
         yield ("joints", name), name
     for name in settings.simulation.positions or ():

@@ -12,16 +12,17 @@ class SimulationSettings(Group):
 
     Attributes:
         protocol: random-inputs: random torques; tracking: controlled motions, see `tracking`; prescribed: exact
-            motions with torques by inverse dynamics. If neither a protocol nor `inputs` are set: tracking.
+            motions with torques by inverse dynamics; default: tracking, and random-inputs if `inputs` are set.
         trajectories: Number of trajectories; each starts at rest from a random position.
         duration: Duration of each trajectory [s].
         sample_rate: Sample rate; random inputs are constant between samples [Hz].
         inputs: Torques from which random-inputs draws one per actuated joint and sample [Nm].
         positions: Lowest and highest initial position of each joint; default: its limits, +-pi without limits [rad].
         coulomb_smoothing_velocity: Velocity scale of the tanh that replaces the step of Coulomb friction [rad/s].
-        test_fraction: Fraction of the trajectories for testing; with tracking, of each trajectory, at its end.
-        presliding: Displacement over which dry friction builds up after a reversal (hysteresis) in prescribed motions,
-            0.1 times this number in m for prismatic joints; 0: no hysteresis [rad].
+        test_fraction: Fraction of the trajectories that is used for testing; with tracking, the fraction at the end of
+            each trajectory.
+        presliding: Displacement over which dry friction builds up after a reversal (hysteresis) in prescribed motions;
+            for prismatic joints, 0.1 m per rad of this value; 0: no hysteresis [rad].
         torque_noise: Standard deviation of the white torque noise of prescribed motions, divided by the standard
             deviation of each joint's torque.
         delay: Delay of the commands of position servos [s].
@@ -51,7 +52,7 @@ class SimulationSettings(Group):
 
 
 class ControlledSimulation(SimulationSettings):
-    """Defaults of controlled arms, if neither a protocol nor inputs are set."""
+    """Defaults of simulations of controlled motions, which are made if neither `protocol` nor `inputs` is set."""
 
     protocol: Literal["random-inputs", "tracking", "prescribed"] = "tracking"
     trajectories: Count = 4
@@ -61,7 +62,7 @@ class ControlledSimulation(SimulationSettings):
 
 
 class ServoSimulation(SimulationSettings):
-    """Defaults of arms with position servos."""
+    """Defaults of simulations of arms with position servos."""
 
     trajectories: Count = 6
     duration: Positive = 20.0
@@ -98,7 +99,7 @@ class TrackingSettings(Group):
 
     @model_validator(mode="after")
     def _used(self) -> Self:
-        # without this error the keys would have no effect
+        # Without this error, users would not notice that these keys have no effect on excitation motions.
         sines = {"amplitude", "frequency"} & self.model_fields_set
         if self.paths == "excitation" and sines:
             raise ValueError(f"{' and '.join(sorted(sines))} of sines, beside paths: excitation")

@@ -46,13 +46,16 @@ ARM = """\
 #   {{protocol: tracking, trajectories: 4, duration: 8.0, sample_rate: 125.0, test_fraction: 0.25, seed: 0}}
 # tracking: {{control: computed-torque, paths: own, frequency: 0.125, control_rate: 125.0}}
 
-## Defaults of `spelgen train`: its options, with _ in place of -.
+## Defaults of `spelgen train`, which --set replaces: the keys of docs/cli_runs.md.
 # training: {{validation_fraction: 0.25, seed: 0}}
 """
 
 
 class StarterJoint(NamedTuple):
-    """A joint of a URDF. joint_type: "revolute" or "prismatic"; damping, friction: attributes of its <dynamics>."""
+    """A joint of a URDF, for the settings file that `spelgen init` writes.
+
+    joint_type: "revolute" or "prismatic". damping [Nm s/rad, N s/m], friction [Nm, N]: attributes of its <dynamics>.
+    """
 
     name: str
     joint_type: str
@@ -61,7 +64,10 @@ class StarterJoint(NamedTuple):
 
 
 def starter(urdf: str, joints: Sequence[StarterJoint], tip: str) -> str:
-    """Return YAML for a URDF of this name and last link: explanations begin with ``##``, settings with ``# ``."""
+    """Return the text of a settings file, in which explanations begin with ``##`` and settings with ``# ``.
+
+    urdf: name of the URDF. joints: moving joints from the root to the tip. tip: name of the last link.
+    """
     drives, logs = "", ""
     for joint in joints:
         drive = {
@@ -80,6 +86,6 @@ def starter(urdf: str, joints: Sequence[StarterJoint], tip: str) -> str:
 
 
 def _flow(keys: Mapping[str, object]) -> str:
-    """Return keys and values on one line of YAML."""
+    """Return keys and values as a mapping on one line of YAML."""
     pairs = [f"{key}: {_flow(x) if isinstance(x, dict) else json.dumps(x)}" for key, x in keys.items()]
     return f"{{{', '.join(pairs)}}}"

@@ -15,8 +15,8 @@ class TrainingSettings(Group):
     """Defaults of `spelgen train` for one robot; options of the command line take precedence.
 
     Attributes:
-        objective: Objective of the fit; default: torque for rigid bodies, rollout for networks only, servo for
-            position servos. With an objective, options of other objectives are errors.
+        objective: Objective of the fit; default: torque for models with rigid bodies, rollout for models of networks
+            only, servo for arms with position servos. If it is set, options of other objectives are errors.
         cutoff: Cutoff frequency of the zero-phase low-pass filter on q, qd and tau; 0: no filter; default: 8 Hz, and
             no filter for windows of logs at 50 Hz or less [Hz].
         decimation: Samples from one sample of a window to the next; default: the largest number that the filter allows.
@@ -53,8 +53,7 @@ class TrainingSettings(Group):
     @field_validator("*")
     @classmethod
     def _belongs(cls, value: object, info: ValidationInfo) -> object:
-        # Fields are validated in order, and `objective` is the first: an option of another objective is an error
-        # here.
+        # `objective` is the first field and is validated first, so that its value is available for all other fields.
         objective, owners = info.data.get("objective"), OWNERS.get(str(info.field_name))
         if objective and owners and objective not in owners:
             raise ValueError(
@@ -64,17 +63,17 @@ class TrainingSettings(Group):
 
     @property
     def options(self) -> dict[str, object]:
-        """Options of any objective that are set."""
+        """The options of fits, of any objective, that are not None."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property
     def preprocessing(self) -> dict[str, Any]:
-        """Options of `Preprocessing` that are set."""
+        """The options of `Preprocessing` that are not None."""
         return self.model_dump(include=PREPROCESSING, exclude_none=True)
 
 
 class PublishedFigures(Group):
-    """Figures of one preset on this robot in a publication; without a value: not published.
+    """Published figures of one preset on this robot; a figure without a value was not published.
 
     Attributes:
         parameters: Number of trained parameters.
@@ -101,7 +100,8 @@ class ComparisonSettings(Group):
     Attributes:
         first: Duration of the initial part of each training motion that is used; default: the whole motion [s].
         steps: Smallest number of training steps on predicted windows.
-        momentum_steps: Number of training steps on the weak form before these.
+        momentum_steps: Number of training steps on the weak form of the equations, before the steps on predicted
+            windows.
         weight_decay: Weight decay of all presets; default: as in `training`.
         seeds: Number of runs of each preset.
         width: Units per hidden layer.

@@ -4,18 +4,18 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-MAX_MAGNITUDE = 1e12  # of a number in settings, so that products of several numbers do not overflow
+MAX_MAGNITUDE = 1e12  # largest magnitude of a number in settings: products of several numbers do not overflow
 
 
 def no_bool(value: object) -> object:
-    """Return the value. Raises ValueError for true and false."""
-    if isinstance(value, bool):  # float(True) is 1.0: a misplaced `yes` would be accepted as a number
+    """Return the value unchanged. Raises ValueError if it is a bool."""
+    if isinstance(value, bool):  # float(True) is 1.0: without this test `yes` would be accepted as a number
         raise ValueError("a number")
     return value
 
 
 def bounded(value: float) -> float:
-    """Return the value. Raises ValueError if its magnitude exceeds MAX_MAGNITUDE."""
+    """Return the value unchanged. Raises ValueError if its magnitude exceeds MAX_MAGNITUDE."""
     if abs(value) > MAX_MAGNITUDE:
         raise ValueError(f"a number within +-{MAX_MAGNITUDE:g}")
     return value
@@ -31,6 +31,6 @@ Inputs = Annotated[tuple[Number, ...], Field(min_length=1)]
 
 
 class Group(BaseModel):
-    """A group of keys; an unknown key is an error."""
+    """Base class of a group of keys in a settings file; an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

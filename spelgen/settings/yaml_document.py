@@ -14,7 +14,7 @@ from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.files import read_bytes
 
 Location: TypeAlias = tuple[int | str, ...]
-"""Keys and numbers of list items that lead to a place in a file."""
+"""Place of a value in a YAML file: keys, and indices of list items from 0, from the outermost group inwards."""
 
 EXPECTED = {"missing": "a value", "model_type": "keys with values", "dict_type": "keys with values"}
 
@@ -23,13 +23,13 @@ Checked = TypeVar("Checked", bound=BaseModel)
 
 @dataclass(frozen=True, eq=False)
 class YamlDocument:
-    """A YAML file and its node tree, None for an empty file."""
+    """A YAML file. path: path of the file. root: root of the node tree of PyYAML; None for an empty file."""
 
     path: Path
     root: yaml.Node | None
 
     def value(self) -> Any:
-        """Return the file's content as dicts, lists and scalars. Raises SettingsError for an invalid date."""
+        """Return the content of the file as dicts, lists and scalars. Raises SettingsError for an invalid value."""
         if self.root is None:
             return None
         try:
@@ -54,7 +54,10 @@ class YamlDocument:
 
 
 def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | None:
-    """Return the nodes of a key and of its value, or the node of a list item twice; None if it does not exist."""
+    """Return the nodes of a key and of its value in a mapping, or the node of a list item twice.
+
+    The result is None if the key or the item does not exist. key: key, or index of a list item from 0.
+    """
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:
             if name.value == str(key):
@@ -65,20 +68,20 @@ def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | Non
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-    """The safe loader, without tags, aliases (a small file could grow huge), deep nesting and repeated keys."""
+    """The safe loader of PyYAML, for which tags, aliases, deep nesting and repeated keys are errors."""
 
     depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: object) -> yaml.Node:
         event = self.peek_event()
         mark = event.start_mark
-        # aliases of aliases expand a small file to gigabytes
+        # Aliases are errors, because aliases of aliases expand a small file to gigabytes.
         if self.check_event(yaml.AliasEvent):
             raise ComposerError(None, None, "an alias", mark)
         is_tagged = isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag is not None
         if is_tagged:  # a tag may contradict its value, as in "!!bool maybe"
             raise ComposerError(None, None, f"the tag {event.tag}", mark)
-        # settings have six levels at most; the parser is recursive
+        # The depth is bounded, because the parser is recursive. Settings have at most six levels.
         if self.depth == 16:
             raise ComposerError(None, None, "more than 16 levels", mark)
         self.depth += 1
@@ -92,7 +95,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 raise ComposerError(None, None, "a key that is no plain word", key.start_mark)
-            # YAML would silently keep the last one
+            # A repeated key is an error, because PyYAML would silently use its last value.
             if key.value in seen:
                 raise ComposerError(None, None, f"the key {key.value!r} a second time", key.start_mark)
             seen.add(key.value)
@@ -100,8 +103,9 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
 
 
 def read_document(path: Path) -> YamlDocument:
-    """Return the content of a small YAML file with one document. Raises SettingsError for any other file."""
-    content = read_bytes(path, SettingsError, "a YAML file", 256 * 1024)  # 300 joints with all keys: 60 kB
+    """Return a YAML file of at most 256 KiB with one document. Raises SettingsError for any other file."""
+    # Settings of 300 joints with all keys have 60 kB.
+    content = read_bytes(path, SettingsError, "a YAML file", 256 * 1024)
     try:
         return YamlDocument(path, _Loader(content.decode("utf-8")).get_single_node())
     except UnicodeDecodeError as error:
@@ -113,15 +117,20 @@ def read_document(path: Path) -> YamlDocument:
 def _yaml_error(error: yaml.YAMLError, path: Path) -> SettingsError:
     problem, mark = "characters that YAML does not allow", None
     if isinstance(error, yaml.MarkedYAMLError) and error.problem:
-        # PyYAML begins the second half of some sentences with "but"
+        # Some messages of PyYAML are the second half of a sentence and begin with "but".
         problem, mark = error.problem.removeprefix("but "), error.problem_mark
     return SettingsError(f"not plain YAML: {problem}", file=path, line=mark.line + 1 if mark else None)
 
 
 def validated(group: type[Checked], content: object, document: YamlDocument | None = None) -> Checked:
-    """Return the content of a file, or arguments of a caller, as a group of settings; None: the defaults.
+    """Return a group of settings with validated values.
 
     Raises SettingsError, or SpelgenErrors for several errors; see `explain`.
+
+    Args:
+        group: Class of the group.
+        content: Content of a YAML file, or a dict of arguments; None: all values are defaults.
+        document: The YAML file, for the lines in errors; None if the content is not from a file.
     """
     try:
         return group.model_validate({} if content is None else content)
@@ -131,18 +140,18 @@ def validated(group: type[Checked], content: object, document: YamlDocument | No
 
 
 def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[BaseModel]) -> SettingsError:
-    """Return one of pydantic's `ValidationError.errors` as an error with its line and the expected value.
+    """Return a `SettingsError` with line and expected value for one item of pydantic's `ValidationError.errors`.
 
-    document: None for values of the command line, which have no lines.
+    document: the YAML file; None for values of the command line, which have no lines. group: the validated class.
     """
     location, error_type = detail["loc"], detail["type"]
-    # misspelt keys are the most frequent error: the closest known key is named
+    # An unknown key, the most frequent error, is mostly misspelt: the message names the most similar known key.
     if error_type == "extra_forbidden":
         names = _group_at(group, location[:-1]).model_fields
         return unknown_name(location, "key", str(location[-1]), names, document)
     message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     expected = EXPECTED.get(error_type, message)
-    # this is pydantic's location of an invalid key of a dict
+    # pydantic marks an invalid key of a dict by "[key]" at the end of the location.
     if location[-1:] == ("[key]",):
         location, expected = location[:-1], "a name; write it in quotes"
         if error_type == "string_pattern_mismatch":
@@ -162,14 +171,17 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
 def unknown_name(
     location: Location, noun: str, name: str, names: Iterable[str], document: YamlDocument | None
 ) -> SettingsError:
-    """Return the error for a name that is not among `names`, with the nearest known name; noun: key or joint."""
+    """Return the error for a name that is not among `names`; it suggests the most similar known name.
+
+    noun: "key" or "joint", for the message.
+    """
     error = _error_at(location, document, f"unknown {noun} {name!r}")
     error.element, error.do = dotted(location[:-1]), suggestion(name, names)
     return error
 
 
 def dotted(location: Location) -> str | None:
-    """Return the location in a file as `joints.joint1.gear`; None for the whole file."""
+    """Return a location in a file as text such as `joints.joint1.gear`; None for the whole file."""
     return ".".join(map(str, location)) or None
 
 
@@ -180,7 +192,10 @@ def _error_at(location: Location, document: YamlDocument | None, got: str) -> Se
 
 
 def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
-    """Return the group of keys at a location; the location may contain keys of dicts and indices of lists."""
+    """Return the class of the group of keys at a location within `group`.
+
+    The location may contain keys of dicts and indices of lists, which are skipped.
+    """
     for key in map(str, location):
         if key in group.model_fields:
             group = _first_group(group.model_fields[key].annotation) or group
@@ -188,7 +203,7 @@ def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
 
 
 def _first_group(annotation: object) -> type[BaseModel] | None:
-    """Return the first group of keys in an annotation such as `dict[str, Group] | None`."""
+    """Return the first class of a group of keys in a type annotation such as `dict[str, Group] | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next(filter(None, map(_first_group, get_args(annotation))), None)

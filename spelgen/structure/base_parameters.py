@@ -1,7 +1,8 @@
 """Base inertial parameters of an arm: the minimal set of combinations in which M and V are linear, exactly.
 
-An entry of M(q), and V(q) - V(q0), is a row of coefficients of the ten parameters of each body. Rows at random
-rational configurations span the row space of the regressor; its reduced row echelon form defines the base parameters.
+Each entry of M(q), and V(q) - V(q0), is linear in the ten inertial parameters of each body; its coefficients are a row
+of a matrix (the energy regressor). Rows at random rational configurations span the row space of this matrix; the
+reduced row echelon form of the rows defines the base parameters.
 Gautier and Khalil, *Direct calculation of minimum set of inertial parameters of serial robots*, IEEE Trans. Robotics
 and Automation 6(3), 1990, derive the same parameters by symbolic rules.
 """
@@ -26,9 +27,10 @@ from spelgen.structure.sampling import regressor_rows
 class BaseParameter:
     """A linear combination of inertial parameters that can be identified from the motion.
 
-    ``index`` and ``name`` are the first parameter's, with the suffix R if others are regrouped into it. ``weights`` are
-    pairs (parameter, coefficient); parameter i of a body, in the order of ``INERTIAL_PARAMETERS``, has the index
-    10 body + i. ``value`` follows from the URDF; it is None if a body has no inertial.
+    ``index`` and ``name`` are the index and the name of the first inertial parameter of the combination; the name has
+    the suffix R if the combination has other parameters too. ``weights`` are pairs (index, coefficient); parameter i of
+    a body, in the order of ``INERTIAL_PARAMETERS``, has the index 10 body + i. ``value`` is computed from the inertials
+    of the URDF; it is None if one of these bodies has no inertial.
     """
 
     name: str
@@ -50,7 +52,7 @@ def base_parameter_count(arm: Chain) -> int:
         points *= 2
 
 
-@lru_cache(maxsize=16)  # least squares, checks of logs and closed forms use the same arm
+@lru_cache(maxsize=16)  # cached, since least squares, checks of logs and closed forms use the same arm
 def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     """Return the base parameters of ``arm``, in the order of the bodies from the root."""
     indices = [INERTIAL_PARAMETERS.index(name) for name in BASE_ORDER]
@@ -67,7 +69,7 @@ def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
 
 
 def _value(arm: Chain, weights: Sequence[tuple[int, Fraction]]) -> Fraction | None:
-    """Return the value of a base parameter from the URDF; None if a body has no inertial."""
+    """Return the value of a base parameter for the inertials of the URDF; None if one of its bodies has no inertial."""
     total = Fraction(0)
     for index, coefficient in weights:
         inertia = arm.bodies[index // 10].inertia
@@ -78,9 +80,12 @@ def _value(arm: Chain, weights: Sequence[tuple[int, Fraction]]) -> Fraction | No
 
 
 def _reduced_rows(arm: Chain, order: list[int]) -> list[list[fmpq]]:
-    """Return the reduced row echelon form of the regressor, with its columns in this order."""
+    """Return the reduced row echelon form of the energy regressor, (base parameters, 10 B) for B bodies.
+
+    order: column k of the result is the inertial parameter with the index order[k].
+    """
     generator = random.Random(0)
-    # A constant part of V has no effect on the motion: V is relative to its value at the first configuration.
+    # A constant added to V has no effect on the motion: the value of V at the first configuration is subtracted.
     reference = _rows(arm, generator)[-1]
     basis: list[list[fmpq]] = []
     while len(basis) < base_parameter_count(arm):
@@ -92,9 +97,9 @@ def _reduced_rows(arm: Chain, order: list[int]) -> list[list[fmpq]]:
 
 
 def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
-    """Return the coefficients of the entries of M, and of V, at a random configuration, (m, 10 B) of fmpq.
+    """Return the coefficients of the inertial parameters in the entries of M, and in V, at a random configuration.
 
-    m = n(n+1)/2 + 1 for n joints, B bodies.
+    The result has m = n(n+1)/2 + 1 rows for n joints and 10 B columns for B bodies, of type fmpq.
     """
     parameters = 10 * len(arm.bodies)
     positions = []
@@ -105,10 +110,10 @@ def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
         positions.append(Position((1 - t * t) / norm, 2 * t / norm, value))
     units = list(np.eye(parameters, dtype=int).astype(object))
     elements = coefficients(arm, positions, units, rational)
-    # an entry that is always zero is a plain 0
+    # The recursion returns an integer 0, without columns, for an entry that is always zero.
     return np.stack([np.broadcast_to(element, parameters) for element in elements])
 
 
 def rational(number: Fraction) -> fmpq:
-    """Return the number in FLINT's exact arithmetic."""
+    """Return the fraction as a rational number of FLINT, whose arithmetic is faster."""
     return fmpq(number.numerator, number.denominator)

@@ -1,10 +1,10 @@
 """Minimal exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, in which each f_j depends on a minimal set of joints.
 
-U is the span of all changes of M, W the span of M. A linear functional of M is a weighted sum of the entries of M; it
-depends only on the joints in a set J if and only if it vanishes on all changes caused by joints outside J. The
-functionals f_j are selected greedily: sets of joints close to the tip first, small sets before large ones, single
-entries of M before sums of entries. Independent functionals are the independent sets of a matroid, for which the
-greedy selection is optimal.
+U is the span of all changes M(q) - M(q'), and W the span of all M(q). A linear functional of M is a weighted sum of the
+entries of M. It depends only on the joints in a set J if and only if it vanishes on all changes of M caused by joints
+outside J. The functionals f_j are selected greedily: sets of joints close to the tip first, small sets before large
+ones, single entries of M before sums of entries. The sets of linearly independent functionals form a matroid, for which
+the greedy selection is optimal.
 """
 
 from collections.abc import Iterator
@@ -20,11 +20,11 @@ from spelgen.structure import field
 from spelgen.structure.sampling import Spans
 
 Weights = tuple[tuple[int, int, Fraction], ...]
-"""A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
+"""The nonzero elements (row, column, value) of the lower triangle of a symmetric matrix; indices are 0-based."""
 
 
 def row_of(weights: Weights, n: int) -> np.ndarray:
-    """Return the lower triangle of a sparse symmetric (n, n) matrix as a vector, row after row: n(n+1)/2 numbers."""
+    """Return the lower triangle of a sparse symmetric (n, n) matrix as a vector (n(n+1)/2,), row after row."""
     row = np.zeros(n * (n + 1) // 2)
     for i, j, value in weights:
         row[i * (i + 1) // 2 + j] = float(value)
@@ -33,10 +33,10 @@ def row_of(weights: Weights, n: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Term:
-    """A term of M: an unknown function f(q) of ``joints``, or a constant if there are none.
+    """A term of M: an unknown function f(q) of the positions of ``joints``, or a constant if ``joints`` is empty.
 
-    The value of the term is the sum of ``functional`` times M over the lower triangle; its contribution to M is the
-    value times ``basis``.
+    The value of the term is the sum over the lower triangle of the elements of ``functional`` times the entries of M.
+    The contribution of the term to M is this value times ``basis``.
     """
 
     joints: tuple[int, ...]
@@ -45,7 +45,11 @@ class Term:
 
 
 class _Functional(NamedTuple):
-    """A linear functional of M, (n(n+1)/2,), in the prime field (``weights``) and in double precision (``values``)."""
+    """A linear functional of M that depends on ``joints`` only: coefficients of the entries of M, (n(n+1)/2,).
+
+    The coefficients are elements of the prime field (``weights``) and the same numbers in double precision
+    (``values``).
+    """
 
     joints: tuple[int, ...]
     weights: np.ndarray
@@ -53,13 +57,13 @@ class _Functional(NamedTuple):
 
 
 def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
-    """Return the outputs and constants of the minimal exact form of M."""
+    """Return the varying terms (outputs) and the constant terms of the minimal exact form of M."""
     functionals = list(_functionals(spans))
     entries = len(spans.keys)
     weights = np.array([r.weights for r in functionals], dtype=np.uint64).reshape(-1, entries)
     values = np.array([r.values for r in functionals]).reshape(-1, entries)
-    # With functionals R (m, entries) and a basis U (m, entries) of the changes of M, B = (U R^T)^-1 U: then R B^T = 1,
-    # that is, B_j is the change of M for f_j = 1 and all other f = 0.
+    # R (m, entries): coefficients of the functionals. U (m, entries): a basis of the changes of M. The matrices B_j
+    # are the rows of B = (U R^T)^-1 U, because then R B^T = 1: f_j is 1 on B_j and 0 on all other matrices.
     basis = field.product(field.inverse(field.product(spans.varying, weights.T)), spans.varying)
     changes = spans.float_changes(frozenset(range(spans.n)))
     basis_values = _solved(changes @ values.T, changes)
@@ -67,7 +71,7 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     for r, row, row_values in zip(functionals, basis, basis_values, strict=True):
         functional = _weights(spans, r.weights, r.values)
         outputs.append(Term(r.joints, functional, _weights(spans, row, row_values)))
-    # M - sum_j f_j B_j does not vary: its span is the span of the constants.
+    # The constant terms are a basis of the span of M - sum_j f_j B_j, which does not depend on q.
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     constant_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
     return tuple(outputs), _constants(spans, functionals, (constant, constant_values), (basis, basis_values))
@@ -81,10 +85,11 @@ def _constants(
 ) -> tuple[Term, ...]:
     """Return the constant terms: a basis of M - sum_j f_j B_j.
 
-    constant: samples of this difference, (S, entries), in the field and in double precision. basis: B, (m, entries), in
-    the field and in double precision.
+    constant: samples of this difference, (S, entries), in the prime field and in double precision. basis: the m
+    matrices B_j, (m, entries), in the prime field and in double precision.
     """
-    # Pivots fall on the first columns: entries of M that are constant, or depend on few joints, define the constants.
+    # Row reduction prefers pivots in the first columns. The entries of M that depend on the fewest joints come
+    # first, so that these entries define the constants.
     order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(constant[0][:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
@@ -112,7 +117,7 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
     for joints in _joint_sets(spans):
         outside = field.row_basis(spans.outside(joints))
         kernel = field.null_space(outside)
-        # number of functionals of this set of joints that are independent of the chosen ones
+        # Number of functionals of this set of joints that are linearly independent of the functionals chosen so far.
         missing = 0
         if len(kernel):
             missing = field.rank(np.concatenate([chosen, kernel])) - len(chosen)
@@ -120,10 +125,10 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
         while missing:
             pairs = next(candidates)
             weights = np.array([w for w, _ in pairs], dtype=np.uint64).reshape(-1, len(spans.keys))
-            # Functionals as vectors of their values on the basis of U: two functionals with equal rows agree on all
-            # changes.
+            # A row has the values of a functional on a basis of U: functionals with equal rows agree on all changes
+            # of M, and count as equal.
             rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
-            # The pivot columns of the transposed matrix are the rows that do not depend on earlier rows.
+            # The pivot columns of the transposed matrix are the rows that are linearly independent of earlier rows.
             independent = field.pivots(field.row_basis(rows.T))
             for index in independent[len(chosen) :]:
                 yield _Functional(tuple(sorted(joints)), *pairs[index - len(chosen)])
@@ -132,8 +137,8 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
-    """Yield sets of joints that M depends on: sets close to the tip first, small sets before large ones."""
-    # An arm with many joints has too many subsets: only sets of consecutive joints are tried.
+    """Yield sets of the joints on which M depends: sets close to the tip first, small sets before large ones."""
+    # An arm of more than eight joints has too many subsets: only sets of consecutive joints are tried.
     all_subsets_up_to = 8
     active = [k for k in range(spans.n) if len(spans.change_bases[k])]
     for position in reversed(range(len(active))):
@@ -151,8 +156,9 @@ def _candidates(
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the functionals may depend on.
-        outside: echelon basis of the changes caused by all other joints, (m, dim U), in the basis of U.
-        tried: entries that were candidates for smaller sets of joints, which are skipped; this function extends it.
+        outside: echelon basis of the changes of M caused by all other joints, (m, dim U), in the basis of U.
+        tried: indices of the entries that were candidates for a set of joints before; they are skipped. This function
+            adds its candidates.
     """
     singles = []
     for index in reversed(range(len(spans.keys))):
@@ -161,7 +167,8 @@ def _candidates(
             singles.append(_single(spans, index))
     yield singles
     order = spans.order
-    rows = spans.changes_of(outside)[:, order]  # an echelon form, because both factors are echelon forms
+    # The product of two echelon forms is an echelon form: no further row reduction is needed.
+    rows = spans.changes_of(outside)[:, order]
     bound = [order[pivot] for pivot in field.pivots(rows)]
     reduced = field.null_space(rows)
     kernel = np.zeros_like(reduced)
@@ -190,26 +197,29 @@ def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the least-squares solution X (k, p) of A X = B, with A = matrix (S, k) and B = right (S, p)."""
     width = matrix.shape[1]
-    # The triangular factor of [A, B] has the same normal equations and far fewer rows.
+    # The triangular factor of the QR decomposition of [A, B] has the same normal equations and far fewer rows.
     factor = np.asarray(np.linalg.qr(np.concatenate([matrix, right], axis=1), mode="r"))
     return np.asarray(np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0])
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
-    """Return the nonzero elements of a vector over the lower triangle, (entries,), as fractions."""
+    """Return the nonzero elements of a vector over the lower triangle as fractions.
+
+    exact, values: the same vector (entries,) in the prime field and in double precision.
+    """
     nonzero = np.flatnonzero(exact).tolist()
     return tuple((*spans.keys[k], _fraction(int(exact[k]), float(values[k]))) for k in nonzero)
 
 
 def _fraction(element: int, value: float) -> Fraction:
-    """Return the rational number that a field element represents; ``value`` is its approximation.
+    """Return the rational number that an element of the prime field represents.
 
-    Rational reconstruction succeeds if numerator and denominator are below 2^30 (von zur Gathen and Gerhard, *Modern
-    Computer Algebra*, section 5.10). Geometry with irrational lengths gives longer fractions; for these the float is as
-    accurate as the URDF.
+    value: the same number in double precision. Rational reconstruction succeeds if numerator and denominator are below
+    2^30 (von zur Gathen and Gerhard, *Modern Computer Algebra*, section 5.10). Geometry with irrational lengths gives
+    longer fractions; ``value`` is then returned, which is as accurate as the URDF.
     """
-    # Extended Euclidean algorithm for (PRIME, element), stopped early: numerator = denominator * element modulo
-    # PRIME.
+    # Extended Euclidean algorithm for (PRIME, element), stopped as soon as the remainder is at most 2^30. Each
+    # remainder is a numerator with numerator = denominator * element modulo PRIME.
     previous, current = (field.PRIME, 0), (element, 1)
     while current[0] > 2**30:
         quotient = previous[0] // current[0]
@@ -218,7 +228,7 @@ def _fraction(element: int, value: float) -> Fraction:
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         candidate = Fraction(numerator, denominator)
-        # A fraction that differs from the float is a coincidence of the reconstruction modulo PRIME.
+        # A short fraction always exists modulo PRIME. If it differs from `value`, the number has no short fraction.
         if abs(candidate - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
             return candidate
     return Fraction(value)

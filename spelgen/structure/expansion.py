@@ -1,8 +1,9 @@
-"""Entries of M, and V, as exact polynomials, for one inertial parameter at a time and within a budget.
+"""Entries of M, and V, as exact polynomials in the sines, cosines and positions of the joints.
 
-The recursion runs once and records its operations (lazy evaluation). The operations of an entry are then executed with
-one inertial parameter set to 1 and all others to 0. Only requested entries are expanded, memory is limited to the
-polynomials of one parameter, and an expansion that is too expensive is refused before it starts.
+The recursion of ``structure.recursion`` runs once and records its operations (lazy evaluation). The operations of an
+entry are then executed with one inertial parameter set to 1 and all others to 0, which gives the polynomial that is the
+coefficient of this parameter. Only requested entries are expanded, memory is limited to the polynomials of one
+parameter, and an expansion is stopped before it exceeds its budget of multiplications.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ Value: TypeAlias = fmpq_mpoly | fmpq | int
 
 
 class Deferred:
-    """A recorded operation of the recursion, or a leaf of the expression."""
+    """A recorded operation of the recursion, or a leaf of the expression (a constant or an inertial parameter)."""
 
     __slots__ = ("action", "operands")
 
@@ -31,7 +32,7 @@ class Deferred:
         self.operands = operands
 
     def __add__(self, operand: Deferred | int) -> Deferred:
-        # Zeros are common: an operation that is not recorded costs nothing.
+        # Zeros are common: a sum with zero is not recorded, so that it takes no time later.
         if isinstance(operand, int) and operand == 0:
             return self
         return Deferred("add", self, operand)
@@ -62,20 +63,26 @@ class TooLarge(Exception):
 
 
 class Budget:
-    """Number of multiplications of terms that remain."""
+    """Number of multiplications of polynomial terms that an expansion may still use."""
 
     def __init__(self, remaining: int):
         self.remaining = remaining
 
     def spend(self, cost: int) -> None:
-        """Subtract ``cost``. Raises TooLarge, before anything is computed, if it exceeds the budget."""
+        """Subtract ``cost`` from the remaining multiplications. Raises TooLarge if fewer remain.
+
+        It is called before the multiplications are made.
+        """
         if cost > self.remaining:
             raise TooLarge
         self.remaining -= cost
 
 
 class Expansion:
-    """The recorded recursion of ``arm`` over the variables s1, c1, q1, s2, ..., three per coordinate."""
+    """The recorded recursion of ``arm`` for polynomials in s1, c1, q1, s2, ...
+
+    s, c and q are sine, cosine and position of a coordinate (``Position``).
+    """
 
     def __init__(self, arm: Chain):
         n = len(arm.coordinates)
@@ -92,8 +99,12 @@ class Expansion:
         self.energies = energies(arm, positions, inertias, _number)
 
     def polynomial(self, element: Deferred | int, parameter: int, budget: Budget) -> fmpq_mpoly:
-        """Return the coefficient of ``parameter`` (10 body + i) in ``element``. Raises TooLarge."""
-        # Values by the identity of the recorded operation: a shared subexpression is computed once.
+        """Return the coefficient, a polynomial, of an inertial parameter in an entry of M or in V.
+
+        element: the recorded expression of the entry. parameter: the index of the inertial parameter, 10 body + i.
+        Raises TooLarge.
+        """
+        # The keys are identities of recorded operations: a subexpression that occurs twice is computed once.
         values: dict[int, Value] = {}
         for index, leaf in enumerate(self._parameters):
             values[id(leaf)] = int(index == parameter)
@@ -121,7 +132,7 @@ def _executed(node: Deferred, values: dict[int, Value], budget: Budget) -> Value
         return x + y
     if _is_zero(x) or _is_zero(y):
         return 0
-    # Every product of two terms is computed before like terms are collected.
+    # The cost is the number of products of two terms: FLINT computes all of them before it collects like terms.
     budget.spend(_terms(x) * _terms(y))
     return x * y
 

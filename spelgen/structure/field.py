@@ -12,10 +12,12 @@ from fractions import Fraction
 import numpy as np
 from flint import fmpz_mat, nmod_mat
 
-# A Mersenne prime: 2^61 = 1, so a remainder is the sum of the low and the shifted high bits.
+# A Mersenne prime: 2^61 = 1 modulo this prime, so that the bits from bit 61 on are added to the low 61 bits in place
+# of a division.
 PRIME = 2**61 - 1
 _P = np.uint64(PRIME)
-# Shifts and masks of halves of 31 and 30 bits, whose products fit into 64 bits.
+# Shifts and masks that split an element into a low part of 31 bits and a high part of 30 bits: products of two such
+# parts fit into 64 bits.
 _BITS_61, _BITS_31, _BITS_30 = map(np.uint64, (61, 31, 30))
 _LOW_31, _LOW_30 = _P >> _BITS_30, _P >> _BITS_31
 
@@ -58,17 +60,17 @@ class Residues:
 
 
 def residue(number: Fraction) -> int:
-    """Return the field element of a rational number."""
+    """Return the element of the prime field that represents a rational number."""
     return number.numerator * pow(number.denominator, -1, PRIME) % PRIME
 
 
 def random_residues(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Return uniform field elements; shape: of the result, such as (m, n)."""
+    """Return uniformly distributed field elements in an array of this shape."""
     return rng.integers(0, PRIME, shape, dtype=np.uint64)
 
 
 def random_circle_points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return random solutions c, s (count,) of c^2 + s^2 = 1 from the tangent of the half-angle."""
+    """Return random field elements c, s (count,) with c^2 + s^2 = 1, from a random tangent of the half-angle."""
     cosines, sines = [], []
     for t in random_residues(rng, (count,)).tolist():
         # 1 + t^2 is never 0: -1 has no square root modulo a prime of the form 4k + 3.
@@ -79,7 +81,7 @@ def random_circle_points(rng: np.random.Generator, count: int) -> tuple[np.ndarr
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a - b, elementwise; a and b have the same shape (...,)."""
+    """Return a - b modulo the prime, elementwise; a and b are field elements of the same shape (...,)."""
     return _folded(a + (_P - b))
 
 
@@ -98,14 +100,14 @@ def rank(rows: np.ndarray) -> int:
 
 
 def pivots(basis: np.ndarray) -> list[int]:
-    """Return the first nonzero column of each row of an echelon form (m, n)."""
+    """Return the index of the first nonzero column of each row of an echelon form (m, n)."""
     return (basis != 0).argmax(axis=1).tolist() if basis.size else []
 
 
 def null_space(basis: np.ndarray) -> np.ndarray:
-    """Return a basis (n - rank, n) of {x : basis x = 0} for a result ``basis`` (rank, n) of ``row_basis``.
+    """Return a basis (n - rank, n) of {x : basis x = 0}; ``basis`` (rank, n) is a result of ``row_basis``.
 
-    A row of the result is 1 at one free column; all other nonzero elements are at pivots.
+    Each row of the result is 1 at one column without a pivot; all other nonzero elements are at pivots.
     """
     width = basis.shape[1]
     bound = pivots(basis)
@@ -125,25 +127,25 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def inverse(square: np.ndarray) -> np.ndarray:
-    """Return the inverse of a regular matrix (n, n)."""
+    """Return the inverse of a nonsingular matrix (n, n)."""
     return _array(_matrix(square).inv()) if square.size else square
 
 
 def _matrix(rows: np.ndarray) -> nmod_mat:
     """Return an array (m, n) as a matrix of FLINT."""
-    # The conversion of an integer matrix is faster than the conversion of every element.
+    # A conversion by way of an integer matrix is faster than a conversion element by element.
     return nmod_mat(fmpz_mat(rows.shape[0], rows.shape[1], rows.ravel().tolist()), PRIME)
 
 
 def _array(matrix: nmod_mat, rows: int | None = None) -> np.ndarray:
-    """Return the first ``rows`` rows of a matrix of FLINT, all by default, as an array (rows, n)."""
+    """Return the first ``rows`` rows (None: all rows) of a matrix of FLINT as an array (rows, n)."""
     height, width = matrix.nrows() if rows is None else rows, matrix.ncols()
     entries = map(int, matrix.entries()[: height * width])
     return np.fromiter(entries, dtype=np.uint64, count=height * width).reshape(height, width)
 
 
 def _values(operand: Residues | int) -> np.ndarray | np.uint64:
-    """Return the field elements of an operand, (...,) or a scalar."""
+    """Return an operand of `Residues` as field elements: an array (...,), or a scalar for an integer."""
     return operand.values if isinstance(operand, Residues) else np.uint64(operand % PRIME)
 
 

@@ -1,7 +1,7 @@
 """Initial values and scales of the numbers of a model, from the inertial parameters of the URDF.
 
-They affect the training of a model, not its structure. Links of 1 kg replace a URDF whose inertials are absent or
-physically inconsistent.
+These values affect the training of a model, not its structure. If the inertials of a URDF are absent or physically
+inconsistent, default bodies of 1 kg are used.
 
 Ten parameters (m, h, I) of a body are physically consistent, that is, belong to a distribution of mass, if and only if
 its pseudo-inertia J = [[S, h], [h^T, m]] with S = tr(I)/2 1 - I is positive definite (Wensing, Kim and Slotine, IEEE
@@ -23,10 +23,13 @@ from spelgen.structure.structure import Structure
 
 @dataclass(frozen=True)
 class Nominal:
-    """Means and standard deviations over the workspace, rounded to six digits for reproducibility across machines.
+    """Means and standard deviations over the joint ranges, rounded to six digits for reproducibility across machines.
 
-    ``output_*``: per output of the structure. ``constant*``: per constant. Others: per coordinate.
-    ``joint_torque``: root mean square of the gravity torque and of the diagonal of M times unit acceleration [Nm, N].
+    ``output_means`` and ``output_scales`` have one value per output of the structure, ``constants`` and
+    ``constant_scales`` one per constant; all other tuples have one value per coordinate. ``potential_scale``: standard
+    deviation of V [J]. ``joint_torque``: root sum of squares of the root mean square gravity torque and of the root
+    mean square torque for unit acceleration [Nm, N]. ``mass_sensitivities`` and ``potential_sensitivities``: change of
+    M and of V with a coordinate, relative to the coordinate with the largest change.
     """
 
     output_means: tuple[float, ...]
@@ -38,20 +41,20 @@ class Nominal:
     mass_sensitivities: tuple[float, ...]
     potential_sensitivities: tuple[float, ...]
     min_eigenvalue: float
-    """Smallest eigenvalue of M(q) relative to the mean of M, over the workspace."""
+    """Smallest generalised eigenvalue of M(q) relative to the mean of M, over random positions."""
     from_urdf: bool
     """Whether the inertials of the URDF are usable."""
 
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
     """Return the nominal values of ``arm`` for the outputs and constants of its ``structure``."""
-    # A fixed seed: these numbers are part of the emitted module, which must be reproducible.
+    # The seed is fixed, because these numbers are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = list(map(working_range, arm.coordinates))
     q = np.stack([rng.uniform(lower, upper, 512) for lower, upper in ranges], axis=-1)
     from_urdf = arm.inertials_complete and _gives_usable_mass(arm, q)
     inertias = nominal_inertias(arm, from_urdf)
-    # Averages over the workspace: at zero position many couplings vanish.
+    # M is averaged over random positions, because many of its off-diagonal entries vanish at zero position.
     mass, potential = float_energies(arm, q, inertias)
     means = mass.mean(axis=0)
     rows, columns = np.tril_indices(len(ranges))
@@ -62,10 +65,10 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
     constant_rows = _functionals(structure.constants, len(ranges))
     outputs = mass @ output_rows.T
     constants = constant_rows @ means
-    # An output that hardly varies for the nominal parameters may vary for the true ones: a lower bound of its scale.
+    # Lower bounds of the scales: an output that hardly varies for the nominal parameters may vary for the true ones.
     output_floor = 0.05 * (np.abs(output_rows) @ typical)
     constant_floor = 0.05 * (np.abs(constant_rows) @ typical)
-    # Friction of drives scales with the torque that they carry.
+    # The scale of a joint's friction is the torque that its drive carries: gravity, and unit acceleration.
     torque = _gravity_torque(arm, q, inertias)
     inertial = np.sqrt((mass[:, diagonal] ** 2).mean(axis=0))
     return Nominal(
@@ -73,7 +76,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
         output_scales=_rounded(np.maximum(outputs.std(axis=0), output_floor), zero_below=0.0),
         constants=_rounded(constants),
         constant_scales=_rounded(np.maximum(np.abs(constants), constant_floor), zero_below=0.0),
-        # V is determined up to a constant: its scale is its variation.
+        # V is determined up to a constant: its standard deviation is the scale, not its magnitude.
         potential_scale=_round(max(float(potential.std()), 1e-3)),
         joint_torque=_rounded(np.hypot(torque, inertial)),
         mass_sensitivities=_sensitivities(_mass_changes(arm, q, inertias, mass, typical)),
@@ -84,10 +87,14 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
 
 
 def working_range(coordinate: Coordinate) -> tuple[float, float]:
-    """Return the range of a coordinate [rad, m]: its limits if usable, else one revolution or one metre."""
+    """Return the lower and upper end of the range of a coordinate [rad, m].
+
+    The range is given by the limits, cut at +-2 pi for a revolute joint. Without usable limits it is one revolution, or
+    1 m, about zero.
+    """
     lower, upper = coordinate.lower, coordinate.upper
     is_revolute = coordinate.joint_type == "revolute"
-    # Exporters write +-1e16 or equal limits for a joint without limits.
+    # Huge or equal limits are not usable: exporters write +-1e16, or equal limits, for a joint without limits.
     if coordinate.continuous or lower is None or upper is None or not 0 < upper - lower < 1e3:
         half_range = pi if is_revolute else 0.5
         return -half_range, half_range
@@ -103,16 +110,16 @@ def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
 
 
 def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
-    """Test that every joint moves a mass and M is positive definite at q (S, n), for the inertials of the URDF."""
+    """Whether, for the inertials of the URDF, every joint moves a mass and M is positive definite at q (S, n)."""
     mass, _ = float_energies(arm, q, nominal_inertias(arm, True))
     rows, columns = np.tril_indices(q.shape[1])
     lightest = mass.mean(axis=0)[rows == columns].min()
-    # A mass of 1e-12 kg is a placeholder of the order of rounding errors.
+    # Some URDFs have masses of 1e-12 kg as placeholders; M would then be of the order of rounding errors.
     return bool(lightest > 1e-11 and _min_eigenvalue(mass) > 1e-6)
 
 
 def nominal_inertias(arm: Chain, from_urdf: bool) -> list[list[float]]:
-    """Return ``exact_inertias`` as floats."""
+    """Return the ten inertial parameters of each body as floats; see ``exact_inertias``."""
     return [list(map(float, ten)) for ten in exact_inertias(arm, from_urdf)]
 
 
@@ -124,13 +131,17 @@ def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | 
 
 
 def _default_inertia(arm: Chain, index: int) -> list[float]:
-    """Return a ball of 1 kg half-way to the next joint; of the last body: 0.1 m from the joint along x and z."""
+    """Return the inertial parameters (m, h, I) of a sphere of 1 kg about the origin of the body's joint.
+
+    Its centre is half-way to the next joint; for the last body, or a next joint closer than 0.2 m, it is at
+    (0.1, 0, 0.1) m.
+    """
     gyration = 0.1  # [m] radius of gyration
     center = np.zeros(3)
     for body in reversed(arm.bodies):
         if body.parent == index:
             center = np.array(body.translation, dtype=float) / 2
-    # A centre of mass on the axis would have neither gravity torque nor coupling.
+    # A centre of mass on the joint's axis would cause neither gravity torque nor coupling between joints.
     if np.linalg.norm(center) < gyration:
         center = np.array([gyration, 0.0, gyration])
     tensor = (gyration**2 + center @ center) * np.eye(3) - np.outer(center, center)
@@ -138,9 +149,9 @@ def _default_inertia(arm: Chain, index: int) -> list[float]:
 
 
 def _min_eigenvalue(mass: np.ndarray) -> float:
-    """Return the smallest eigenvalue of M relative to its mean over S samples; 0 if the mean is not positive definite.
+    """Return the smallest generalised eigenvalue of S samples of M relative to their mean.
 
-    mass: lower triangles of M, (S, n(n+1)/2).
+    The result is 0 if the mean is not positive definite. mass: lower triangles of M, (S, n(n+1)/2).
     """
     n = isqrt(2 * mass.shape[1])
     matrices = np.zeros((len(mass), n, n))
@@ -169,38 +180,39 @@ def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> n
 def _mass_changes(
     arm: Chain, q: np.ndarray, inertias: list[list[float]], mass: np.ndarray, typical: np.ndarray
 ) -> np.ndarray:
-    """Return the root mean square change of the entries of M with each coordinate, (n,).
+    """Return the root mean square change, without unit, of the entries of M if one coordinate changes, (n,).
 
     Args:
         arm: the arm.
         q: sampled positions, (S, n) [rad, m].
         inertias: ten inertial parameters of each body.
         mass: lower triangles of M at q, (S, n(n+1)/2).
-        typical: magnitudes of the entries, in units of which the changes are, (n(n+1)/2,).
+        typical: magnitudes of the entries of M, (n(n+1)/2,), by which the changes are divided.
     """
     moved = np.stack([q] * q.shape[1])
     for index in range(q.shape[1]):
-        moved[index, :, index] = np.roll(q[:, index], 1)  # the position in another sample
+        moved[index, :, index] = np.roll(q[:, index], 1)  # the position of the sample before
     moved_mass, _ = float_energies(arm, moved, inertias)
     return np.asarray(np.sqrt((((moved_mass - mass) / typical) ** 2).mean(axis=(1, 2))))
 
 
 def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
-    """Return magnitudes (n,) relative to the largest, with a lower bound that retains every joint as an input."""
+    """Return magnitudes (n,) divided by the largest, and at least 0.02, so that every joint remains an input."""
     if magnitudes.max() <= 0:
         return (1.0,) * len(magnitudes)
     return _rounded(np.maximum(magnitudes / magnitudes.max(), 0.02), 3)
 
 
 def _rounded(values: np.ndarray, digits: int = 6, zero_below: float = 1e-12) -> tuple[float, ...]:
-    """Return values (n,) rounded to a number of significant digits by ``_round``."""
+    """Return values (n,), each rounded by ``_round``."""
     return tuple(_round(value, digits, zero_below) for value in values.tolist())
 
 
 def _round(value: float, digits: int = 6, zero_below: float = 1e-12) -> float:
-    """Return a value rounded to significant digits, equal on every machine; 0 for magnitudes up to ``zero_below``.
+    """Return a value rounded to ``digits`` significant digits, so that it is equal on every machine.
 
-    Scales are divisors, and may be small for an arm of 1e-12 kg: their ``zero_below`` is 0.
+    Magnitudes up to ``zero_below`` become 0. For scales ``zero_below`` is 0, because scales are divisors, and are small
+    for an arm of 1e-12 kg.
     """
     if abs(value) <= zero_below:
         return 0.0
@@ -208,7 +220,7 @@ def _round(value: float, digits: int = 6, zero_below: float = 1e-12) -> float:
 
 
 def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
-    """Return J (..., 4, 4) of (m, h, I), (..., 10), in the order of ``Body.inertia``."""
+    """Return pseudo-inertias J (..., 4, 4) of inertial parameters (m, h, I), (..., 10), ordered as ``Body.inertia``."""
     values = np.asarray(parameters, dtype=float)
     tensor = np.zeros((*values.shape[:-1], 3, 3))
     rows, columns = np.triu_indices(3)
@@ -222,7 +234,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
 
 
 def parameters_of(pseudo: np.ndarray) -> np.ndarray:
-    """Return the inverse of ``pseudo_inertia``: (..., 4, 4) -> (..., 10)."""
+    """Return the inertial parameters (m, h, I), (..., 10), of pseudo-inertias (..., 4, 4)."""
     second_moment = pseudo[..., :3, :3]
     tensor = _trace(second_moment) * np.eye(3) - second_moment
     mass, first_moment = pseudo[..., 3, 3:], pseudo[..., :3, 3]
@@ -245,7 +257,8 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # relative to the largest eigenvalue: a smallest eigenvalue below the square of it is raised to it (slender body)
+    # [1] Relative to the largest eigenvalue. J of a slender body is consistent with a small smallest eigenvalue:
+    # eigenvalues are raised to this fraction only if the smallest one is below its square.
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)

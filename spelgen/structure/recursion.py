@@ -1,9 +1,10 @@
 """M(q) and V(q) of an arm by the composite-rigid-body algorithm (CRBA), over any commutative ring.
 
 The recursion (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, ch. 6) consists of additions, negations and
-multiplications. The same code therefore serves floating-point numbers (nominal values), a prime field (``structure``)
-and polynomials (``expansion``). Each body has ten inertial parameters (m, h = m c, I about the origin of its joint's
-frame), in which M and V are linear. A body rotates about, or translates along, the z axis of its joint's frame.
+multiplications. The same code therefore computes with floating-point numbers (``nominal``), elements of a prime field
+(``sampling``) and polynomials (``expansion``). M and V are linear in the ten inertial parameters of each body: m,
+h = m c, and I about the origin of the frame of the body's joint. A joint rotates about, or translates along, the z axis
+of its frame.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 from spelgen.arm.arm import Body, Chain
 
 Element = Any
-"""An element of the ring: an object with +, - and *, with other elements and with integers."""
+"""An element of the ring: an object that supports +, - and * with other elements and with integers."""
 
 Number = Callable[[Fraction], Element]
 """Conversion of the exact constants of an arm to elements of the ring."""
@@ -28,7 +29,10 @@ TENSOR = tuple(combinations_with_replacement(range(3), 2))
 
 
 class Position(NamedTuple):
-    """The position of a coordinate: cosine and sine of its base angle (see ``base_denominators``), and its value."""
+    """The position of a coordinate q: cosine and sine of q / d, and q itself.
+
+    d is the integer of ``base_denominators``; it is 1 for a coordinate without mimic joints.
+    """
 
     cos: Element
     sin: Element
@@ -36,14 +40,17 @@ class Position(NamedTuple):
 
 
 class Energies(NamedTuple):
-    """The lower triangle of the mass matrix, {(row, column): element} from 0, and the potential energy."""
+    """The lower triangle of the mass matrix, {(row, column): element}, 0-based, and the potential energy."""
 
     mass: dict[tuple[int, int], Element]
     potential: Element
 
 
 class _Inertia(NamedTuple):
-    """A composite inertia: mass, first moment, and inertia tensor about the origin of the frame."""
+    """Inertia of a rigid set of bodies: mass, first moment of mass, and inertia tensor about the origin of a frame.
+
+    ``tensor`` has six components in the order of ``TENSOR``.
+    """
 
     mass: Element
     moment: Vector
@@ -51,7 +58,10 @@ class _Inertia(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """The pose of a body in its parent, or the motion of a joint: sparse, with the elements 1 and -1 as integers."""
+    """The pose of a joint's frame in its parent body, or the motion of a joint.
+
+    Rows of the rotation, and the translation, list nonzero elements as (index, element); 1 and -1 are integers.
+    """
 
     rotation: tuple[Terms, ...]
     translation: Terms
@@ -73,9 +83,9 @@ def energies(
 
     Args:
         arm: the arm.
-        positions: of each coordinate.
+        positions: position of each coordinate.
         inertias: ten inertial parameters of each body.
-        number: converts the exact constants of the arm to elements of the ring.
+        number: conversion of the exact constants of the arm to elements of the ring.
 
     V is zero for a mass at the origin of the root link and increases against ``arm.gravity``.
     """
@@ -87,15 +97,16 @@ def energies(
     composites = [_Inertia(ten[0], tuple(ten[1:4]), tuple(ten[4:10])) for ten in inertias]
     total = _Inertia(0, (0, 0, 0), (0,) * 6)
     mass: dict[tuple[int, int], Element] = dict.fromkeys(triangle(len(arm.coordinates)), 0)
-    # Parents precede children: in reverse order a composite is complete before its column of M is computed.
+    # Parents precede children in `arm.bodies`. In reverse order, all children are added to the composite inertia of a
+    # body before its column of M is computed.
     for index, body in reversed(list(enumerate(arm.bodies))):
         for ancestor, entry in _column(arm, poses, motions, index, composites[index]):
             first, second = body.coordinate, ancestor.coordinate
-            # The rate of a mimic joint is a multiple of its leader's.
+            # The velocity of a mimic joint is `multiplier` times the velocity of its leader.
             multiplier = body.multiplier * ancestor.multiplier
             if multiplier != 1:
                 entry = number(multiplier) * entry
-            # Two bodies of one coordinate contribute twice to its diagonal entry, as (i, j) and as (j, i).
+            # Two different bodies i, j of one coordinate contribute twice to its diagonal entry: by (i, j) and (j, i).
             if first == second and body is not ancestor:
                 entry = entry + entry
             key = max(first, second), min(first, second)
@@ -115,7 +126,7 @@ def coefficients(
 ) -> list[Element]:
     """Return the coefficients of the inertial parameters in the entries of M, row after row, and then in V.
 
-    units: for each of the 10 B parameters of B bodies, a unit vector (10 B,) of the ring.
+    units: one unit vector (10 B,) for each of the 10 B parameters of B bodies, as an element of the ring.
     """
     inertias = [units[10 * body : 10 * body + 10] for body in range(len(arm.bodies))]
     result = energies(arm, positions, inertias, number)
@@ -123,7 +134,7 @@ def coefficients(
 
 
 def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
-    """Return the motion of the joint of each body, about or along z, at these positions of the coordinates."""
+    """Return the rotation about z, or translation along z, of the joint of each body at these positions."""
     bases = base_denominators(arm)
     motions = []
     for body in arm.bodies:
@@ -146,8 +157,8 @@ def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[
 
 
 def circle_point(angle: float) -> tuple[Fraction, Fraction]:
-    """Return the cosine and sine of an angle [rad] as a rational point of the unit circle, with an error of 1e-13."""
-    # tan(angle / 2) has a pole at pi; multiples of right angles are exact.
+    """Return rational cosine and sine of an angle [rad] with cos^2 + sin^2 = 1 exactly and an error of 1e-13."""
+    # Multiples of a right angle are rounded to -1, 0 and 1: tan(angle / 2) has a pole at pi.
     if abs(cos(angle)) < 1e-12 or abs(sin(angle)) < 1e-12:
         return Fraction(round(cos(angle))), Fraction(round(sin(angle)))
     t = Fraction(tan(angle / 2)).limit_denominator(10**7)
@@ -155,7 +166,11 @@ def circle_point(angle: float) -> tuple[Fraction, Fraction]:
 
 
 def base_denominators(arm: Chain) -> list[int]:
-    """Return for each coordinate q the integer d for which the angle of every body is an integer multiple of q / d."""
+    """Return an integer d per coordinate q.
+
+    The angle of each revolute joint with this coordinate, mimic joints included, is an integer multiple of q / d, up to
+    a constant.
+    """
     denominators = [1] * len(arm.coordinates)
     for body in arm.bodies:
         if body.joint_type == "revolute":
@@ -165,12 +180,12 @@ def base_denominators(arm: Chain) -> list[int]:
 
 
 def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Element]:
-    """Return cosine and sine of an integer multiple of an angle, by repeated doubling."""
+    """Return cosine and sine of ``factor`` times an angle with the cosine ``c`` and the sine ``s``."""
     result: tuple[Element, Element] = (1, 0)
-    # Exponentiation by squaring: multipliers of mimic joints reach twenty.
+    # Exponentiation by squaring needs few products; multipliers of mimic joints reach 20.
     for bit in bin(abs(factor))[2:]:
         x, y = result
-        # Square of the complex number x + i y, the point of twice the angle.
+        # The square of the complex number x + i y doubles its angle.
         result = (x * x - y * y, 2 * (x * y))
         if bit == "1":
             x, y = result
@@ -183,11 +198,15 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
 def _column(
     arm: Chain, poses: Sequence[_Pose], motions: Sequence[_Pose], index: int, inertia: _Inertia
 ) -> Iterator[tuple[Body, Element]]:
-    """Yield the entries of the mass matrix of the bodies' joints: of joint ``index`` with itself and its ancestors."""
+    """Yield (ancestor, entry) for the joint of a body and the joints of all its ancestors, itself first.
+
+    Each entry is the element of the mass matrix of the two joints, as if all joints were independent. inertia: the
+    composite inertia of the body and all its descendants.
+    """
     body = arm.bodies[index]
-    # The wrench that accelerates the composite body about (or along) its z axis at unit rate: force z x h and moment
-    # I z, or force m z and moment h x z. Its component along the axis of an ancestor is the entry of M (Featherstone,
-    # table 6.2).
+    # The wrench that gives the composite body a unit acceleration about (or along) its z axis: force z x h and moment
+    # I z (revolute), or force m z and moment h x z (prismatic). The component of this wrench along the axis of an
+    # ancestor is the entry of M (Featherstone, table 6.2).
     (hx, hy, _), tensor = inertia.moment, inertia.tensor
     wrench: _Wrench = (-hy, hx, 0), (tensor[2], tensor[4], tensor[5])
     if body.joint_type == "prismatic":
@@ -207,13 +226,16 @@ def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
 
 
 def _moved_inertia(motion: _Pose, inertia: _Inertia) -> _Inertia:
-    """Return the inertia in the joint's frame at q = 0 after the joint has moved about or along z."""
+    """Return an inertia in the joint's frame at q = 0, from the inertia in the joint's moved frame.
+
+    motion: rotation about z, or translation along z, of the joint.
+    """
     if motion.translation:
         return _translated(motion.translation, inertia)
     (_, s), (_, c) = motion.rotation[1]
     hx, hy, hz = inertia.moment
     xx, xy, xz, yy, yz, zz = inertia.tensor
-    # sin^2 = 1 - cos^2 is substituted here, so that polynomials need no reduction.
+    # sin^2 is replaced by 1 - cos^2 here: otherwise polynomials would contain both and need a reduction.
     cc, cs, difference = c * c, c * s, xx - yy
     # R I R^T for a rotation about z. Ixx + Iyy is invariant, so the second diagonal entry needs no products.
     turned_xx = yy + cc * difference - 2 * (cs * xy)
@@ -225,7 +247,7 @@ def _moved_inertia(motion: _Pose, inertia: _Inertia) -> _Inertia:
 def _posed_inertia(pose: _Pose, inertia: _Inertia) -> _Inertia:
     xx, xy, xz, yy, yz, zz = inertia.tensor
     columns = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-    # R I first, then (R I) R^T: rows of R are sparse, as most joints are at right angles.
+    # Rows of R are multiplied one at a time: they are sparse, because most axes of arms are at right angles.
     half = [[_dot(row, column) for column in columns] for row in pose.rotation]
     tensor = tuple(_dot(pose.rotation[j], half[i]) for i, j in TENSOR)
     return _translated(pose.translation, _Inertia(inertia.mass, _turned(pose, inertia.moment), tensor))
@@ -246,7 +268,7 @@ def _turned(pose: _Pose, vector: Vector) -> Vector:
 
 
 def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
-    """Return the inertia about an origin at ``-offset``: h + m p, and I by the parallel-axis theorem."""
+    """Return the inertia about an origin displaced by -p, p = ``offset``, by h + m p and the parallel-axis theorem."""
     if not offset:
         return inertia
     moment: list[Element] = list(inertia.moment)
@@ -267,7 +289,7 @@ def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
 
 
 def _terms(row: Sequence[Fraction], number: Number) -> Terms:
-    # Products with the integers 1 and -1 cost nothing, unlike those with elements of the ring.
+    # 1 and -1 remain integers, because `_dot` needs no multiplication for them.
     return tuple((i, int(x) if abs(x) == 1 else number(x)) for i, x in enumerate(row) if x)
 
 

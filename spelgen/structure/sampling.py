@@ -1,7 +1,8 @@
 """Samples of M and V at random positions, and the spans of M and of its changes that determine the structure.
 
-Samples are elements of the prime field, or floating-point numbers. They form 1 + n blocks: block 0 is the base, and in
-block k only coordinate k differs from the base. An entry that differs between the two depends on coordinate k.
+Samples are elements of the prime field, or floating-point numbers. They form 1 + n blocks of equal size. Block 0 has
+random positions; the positions of block 1 + k differ from these in coordinate k only (k from 0). An entry of M that
+differs between block 0 and block 1 + k depends on coordinate k.
 """
 
 from __future__ import annotations
@@ -28,23 +29,25 @@ Ten = Sequence[Element]
 def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return lower triangles of M, (1 + n, samples, n(n+1)/2), and V, (1 + n, samples), in the prime field.
 
-    ``kinematics``: every sample has its own random inertial parameters. ``inertials``: all have those from the URDF.
+    assume: ``kinematics``: each sample has other random inertial parameters. ``inertials``: all samples have the
+    inertial parameters of the URDF.
     """
     rng = np.random.default_rng(0)
     n = len(arm.coordinates)
     positions = []
     for index in range(n):
-        # Cosine and sine of an angle and a displacement are algebraically independent, so each is random by itself.
+        # Cosine and sine of an angle are algebraically independent of a displacement: the displacement is another
+        # random number.
         c, s = field.random_circle_points(rng, 2 * samples)
         value = random_residues(rng, (2 * samples,))
         moved = [Residues(_one_moved(x, index, 1 + n)) for x in (c, s, value)]
         positions.append(Position(*moved))
     if assume == "kinematics":
-        # A rank or zero for random inertial parameters holds for all values of the parameters.
+        # A rank or zero at random inertial parameters is valid for all values of the parameters.
         inertias: list[Ten] = [list(map(Residues, random_residues(rng, (10, samples)))) for _ in arm.bodies]
     else:
         inertias = [list(map(residue, body.inertia or (Fraction(0),) * 10)) for body in arm.bodies]
-    # One pass of the recursion computes all samples: its elements are arrays.
+    # The elements of the recursion are arrays, so that one pass computes all samples.
     result = energies(arm, positions, inertias, residue)
     shape = (1 + n, samples)
     entries = [_residue_values(entry, shape) for entry in result.mass.values()]
@@ -52,10 +55,11 @@ def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray,
 
 
 def regressor_rows(arm: Chain, points: int) -> np.ndarray:
-    """Return rows of the energy regressor in the prime field, (m points, 10 B), m = n(n+1)/2 + 1.
+    """Return m rows of the energy regressor at each of ``points`` random positions, in the prime field.
 
-    M(q) and V(q) - V(q0) are linear in the inertial parameters and determine the torque: the rank of the rows is the
-    number of base parameters (Gautier and Khalil 1990).
+    The result is (m points, 10 B) for B bodies, with m = n(n+1)/2 + 1 rows for the entries of M(q) and V(q) - V(q0).
+    The entries are linear in the inertial parameters and determine the torque: the rank of the rows is the number of
+    base parameters (Gautier and Khalil 1990).
     """
     rng = np.random.default_rng(1)
     parameters = 10 * len(arm.bodies)
@@ -68,7 +72,7 @@ def regressor_rows(arm: Chain, points: int) -> np.ndarray:
     units = list(map(Residues, np.eye(parameters, dtype=np.uint64)))
     elements = coefficients(arm, positions, units, residue)
     rows = np.stack([_residue_values(element, (points, parameters)) for element in elements], axis=1)
-    # V is determined up to a constant: it is relative to the first point.
+    # V is determined up to a constant: its value at the first point is subtracted.
     rows[:, -1] = difference(rows[:, -1], rows[0, -1])
     return rows.reshape(-1, parameters)
 
@@ -108,7 +112,10 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 
 
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
-    """Return blocks (blocks, S) of values (2 S,): the second half in block ``index`` + 1, the first in all others."""
+    """Return the values of one coordinate in all blocks of samples, (blocks, S).
+
+    values: (2 S,); block ``index`` + 1 gets the second half, all other blocks get the first half.
+    """
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
     result[index + 1] = moved
@@ -116,23 +123,24 @@ def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
 
 
 def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an element of the ring as an array of this shape, such as (1 + n, S); constants are broadcast."""
+    """Return a batch of field elements, or an integer, broadcast to an array of this shape, such as (1 + n, S)."""
     if isinstance(element, Residues):
         return np.broadcast_to(element.values, shape)
     return np.full(shape, element % PRIME, dtype=np.uint64)
 
 
 class Spans:
-    """Spans of M and of its changes, as rows over the n(n+1)/2 entries of the lower triangle, in the prime field.
+    """Spans of M and of its changes in the prime field.
 
-    The rows of ``mass`` (S, entries) span W, the space of M; the rows of ``changes[k]`` span T_k, the changes of M with
-    coordinate k. U is the sum of all T_k.
+    A row has the n(n+1)/2 entries of the lower triangle of M. The rows of ``mass`` (S, entries) span W, the space of
+    all M(q); the rows of ``changes[k]`` (S, entries) span T_k, the changes of M if only coordinate k moves. U is the
+    sum of all T_k.
     """
 
     def __init__(self, arm: Chain, assume: Assume):
         self.n = len(arm.coordinates)
         self.keys = triangle(self.n)
-        # d samples span a space of dimension d; four additional samples would reveal a larger dimension.
+        # A span has at most as many dimensions as M has entries; four more samples make a deficient rank less likely.
         count = len(self.keys) + 4
         mass, potential = field_samples(arm, assume, count)
         self._arm, self._assume, self._count = arm, assume, count
@@ -142,7 +150,7 @@ class Spans:
 
     @cached_property
     def entry_joints(self) -> list[frozenset[int]]:
-        """The joints that each entry of M depends on."""
+        """Set of the joints on which an entry of M depends, for each entry of the lower triangle."""
         depends = np.array([change.any(axis=0) for change in self.changes])  # (n, entries)
         return [frozenset(np.flatnonzero(column).tolist()) for column in depends.T]
 
@@ -158,27 +166,27 @@ class Spans:
 
     @cached_property
     def varying(self) -> np.ndarray:
-        """Basis of U, (dim U, entries): an echelon form for columns in ``order``."""
+        """Basis of U, (dim U, entries); with the columns in the order ``order`` it is an echelon form."""
         echelon = field.row_basis(np.concatenate(self.change_bases)[:, self.order])
         return echelon[:, np.argsort(self.order)]
 
     @cached_property
     def floats(self) -> np.ndarray:
-        """Samples of M in double precision, (1 + n, 2 S, entries), for the values of coefficients.
+        """Samples of M in double precision, (1 + n, 2 S, entries).
 
-        Their zeros and ranks are determined in the field.
+        They determine the values of nonzero coefficients; zeros and ranks are determined in the prime field.
         """
         return float_samples(self._arm, self._assume, 2 * self._count)
 
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
-        """Return rows (m, entries) that span the changes of M with ``joints``, in double precision."""
+        """Return rows (m, entries) that span the changes of M caused by ``joints``, in double precision."""
         base = self.floats[0]
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
 
     def outside(self, joints: frozenset[int]) -> np.ndarray:
-        """Return rows (m, dim U) that span the changes of M with joints outside ``joints``, in the basis of U."""
+        """Return rows (m, dim U) that span the changes of M caused by joints outside ``joints``, in the basis of U."""
         first, last = min(joints), max(joints)
-        # The joints outside are mostly a prefix and a suffix of the chain, whose echelon forms are cached.
+        # The joints before `first` and after `last` have cached echelon forms, which saves most of the time.
         between = [self._coordinates[k] for k in range(first, last) if k not in joints]
         return np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]])
 
@@ -203,17 +211,17 @@ class Spans:
 
     @cached_property
     def _nearer_root(self) -> list[np.ndarray]:
-        """For each joint, a basis (m, dim U) of the changes of M with earlier joints, in the basis of U."""
+        """Per joint, a basis (m, dim U) of the changes of M caused by joints nearer the root, in the basis of U."""
         return _sums(self._coordinates)
 
     @cached_property
     def _nearer_tip(self) -> list[np.ndarray]:
-        """For each joint, a basis (m, dim U) of the changes of M with later joints, in the basis of U."""
+        """Per joint, a basis (m, dim U) of the changes of M caused by joints nearer the tip, in the basis of U."""
         return _sums(self._coordinates[::-1])[::-1]
 
 
 def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return for each of these bases (m, dim U) an echelon basis of the sum of the spans before it."""
+    """Return one echelon basis (m, dim U) per basis: result k spans the sum of the spans of bases 0 to k - 1."""
 
     def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
         return field.row_basis(np.concatenate([rows, basis]))

@@ -1,8 +1,9 @@
 """Identifiability of servo and inertial parameters from logs of commanded positions, by a numerical rank.
 
-For each joint, kp (u - q) = kd qd + armature qdd + dry sgn(qd) + Y(q, qd, qdd) pi with known q and commands u. The
-equations are linear and homogeneous in kp, kd, armature, dry and pi: logs determine these parameters up to the null
-space of the system. The ratio of a parameter to kp is identifiable if both change by the same factor in the null space.
+For each joint, kp (u - q) = kd qd + armature qdd + dry sgn(qd) + Y(q, qd, qdd) pi, with logged q and u (the command),
+dry friction torque `dry`, torque regressor Y and inertial parameters pi. The equations are linear and homogeneous in
+kp, kd, armature, dry and pi: logs determine these parameters up to the null space of the system. The ratio of a
+parameter to kp is identifiable if both change by the same factor in the null space.
 """
 
 from typing import NamedTuple
@@ -19,9 +20,9 @@ PARAMETERS = ("kp", "kd", "armature", "dry")
 class ServoRank(NamedTuple):
     """Identifiable ratios of the parameters of servos.
 
-    groups: joints whose kp have identifiable ratios: one known kp, mass or load determines all parameters of a group.
-    open: (parameter, joint) without identifiable ratio to kp, which can be identified only together with the inertial
-    parameters of the bodies.
+    groups: sets of joints (0-based). Within a set, all ratios of two kp are identifiable, so that one known kp, mass or
+    load determines all parameters of the set. open: pairs (parameter, joint) whose ratio to the kp of the joint is not
+    identifiable; such a parameter can be identified only together with the inertial parameters of the bodies.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -29,29 +30,29 @@ class ServoRank(NamedTuple):
 
 
 def servo_rank(arm: Chain) -> ServoRank:
-    """Return the identifiable ratios for generic values: random states, inertial parameters and drive parameters."""
+    """Return the identifiable ratios of an arm, computed for random states, inertial and drive parameters."""
     random, n = np.random.default_rng(0), len(arm.coordinates)
     # Twice as many equations as unknowns, so that the rank is not limited by the samples.
     samples = 2 * (10 * len(arm.bodies) // n + len(PARAMETERS)) + 20
     q, qd, qdd = random.normal(size=(3, samples, n))
     columns = torque_rows(arm, q, qd, qdd).reshape(samples * n, -1)
     identifiable, _ = _row_and_null_space(columns)
-    # Scaled so that the true value of each unknown is 1.
+    # Each column is multiplied by a random true value of its unknown, so that all scaled unknowns are 1.
     bodies = columns @ (identifiable * random.uniform(0.5, 2.0, identifiable.shape[1]))
     drives = np.stack([qd, qdd, np.sign(qd)], axis=-1) * random.uniform(0.5, 2.0, (n, 3))
     torque = drives.sum(axis=-1) + bodies.sum(axis=-1).reshape(samples, n)
     rows = np.zeros((samples, n, n, len(PARAMETERS)))
     for joint in range(n):
-        # kp (u - q) is the torque, with a known command error: divided by it, the column of kp is minus the torque.
+        # The scaled kp is 1, so that the command error u - q, its column, is the torque of all other terms.
         rows[:, joint, joint, 0] = -torque[:, joint]
         rows[:, joint, joint, 1:] = drives[:, joint]
     system = np.concatenate([rows.reshape(samples * n, -1), bodies], axis=1)
-    # Columns of equal length, so that the threshold of singular values has no unit.
+    # Columns are scaled to unit length, so that the threshold of singular values has no unit.
     norms = np.linalg.norm(system, axis=0)
     _, null = _row_and_null_space(system / norms)
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
-    # smaller differences are rounding: the errors of null vectors are a thousand times the errors of the matrix
+    # [1] Smaller differences are rounding errors: null vectors have a thousand times the errors of the matrix.
     equal, kp = 1e-6, changes[:, :1]
     same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal  # (n, n)
     groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in same)
@@ -70,11 +71,11 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
         qdd: accelerations (S, n) [rad/s^2, m/s^2].
 
     Derivatives are complex-step derivatives (Squire and Trapp, SIAM Review 40:110, 1998), which have no cancellation.
-    The derivation does not import torch, and therefore does not use `dynamics.regressor`.
+    `dynamics.regressor` is not used, because it imports torch, and the derivation of the structure does not.
     """
     samples, n = q.shape
     step = 1e-30
-    # directions of the derivatives: each coordinate, and the velocity
+    # Directions of the derivatives with respect to q: each coordinate, and, for d/dt, the velocity qd.
     directions = np.concatenate([np.tile(np.eye(n), (samples, 1, 1)), qd[:, None]], axis=1)  # (S, n + 1, n)
     inertias = np.split(np.eye(10 * len(arm.bodies)), len(arm.bodies))
     shifted = q[:, None, None] + 1j * step * directions[:, :, None]
@@ -83,7 +84,7 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     for entry, (row, column) in enumerate(triangle(n)):
         mass[..., row, column] = mass[..., column, row] = triangles[..., entry]
     # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq
-    # The last direction of the derivatives is the velocity, along which qd changes by qdd.
+    # d/dt (M qd): the last direction is qd, and qd itself changes at the rate qdd.
     momentum = np.einsum("spij,sj->sip", mass[:, n], qd + 1j * step * qdd)
     kinetic = np.einsum("skpij,si,sj->skp", mass[:, :n], qd, qd) / 2
     return np.asarray((momentum - kinetic + potential[:, :n]).imag / step)
@@ -92,6 +93,6 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
 def _row_and_null_space(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return orthonormal bases of row space and null space, (k, rank) and (k, k - rank), of a matrix (m, k), m >= k."""
     _, singular_values, directions = np.linalg.svd(matrix, full_matrices=False)
-    # a smaller singular value is a rounding error
+    # [1] Smaller singular values, relative to the largest, are rounding errors.
     rank = int((singular_values > 1e-9 * singular_values[0]).sum())
     return directions[:rank].T, directions[rank:].T

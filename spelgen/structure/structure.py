@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class MassEntry(NamedTuple):
-    """An entry of the mass matrix, with indices from 0, and the coordinates that it depends on."""
+    """An entry of the mass matrix, with 0-based row and column, and the coordinates that it depends on."""
 
     row: int
     column: int
@@ -35,7 +35,11 @@ class MassEntry(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Structure:
-    """Structure for all values of the inertial parameters (``kinematics``), or for the URDF's (``inertials``)."""
+    """Structure of M and V of an arm.
+
+    It is valid for all values of the inertial parameters (``assume`` is ``kinematics``), or for the values in the URDF
+    (``inertials``). ``outputs`` and ``constants`` are the varying and the constant terms of M.
+    """
 
     assume: Assume
     joints: tuple[str, ...]
@@ -58,16 +62,19 @@ class Structure:
         return sum(not output.joints or min(output.joints) >= first for output in self.outputs)
 
 
-@lru_cache(maxsize=16)  # the same arm is often used with several settings or logs
+@lru_cache(maxsize=16)  # cached, since the same arm is often used with several settings or logs
 def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
-    """Return the structure of ``arm``. Raises ArmError for ``inertials`` if a body has no inertial values."""
+    """Return the structure of ``arm``; see ``Structure`` for ``assume``.
+
+    Raises ArmError if ``assume`` is ``inertials`` and a body has no inertial with mass.
+    """
     if assume == "inertials" and not arm.inertials_complete:
         raise ArmError(
             "links without inertial values",
             expected="an <inertial> on every moving body",
             do="use --assume kinematics, which needs none",
         )
-    # All results are ranks or zeros of these samples.
+    # The entries and terms follow from ranks and zeros of the samples in `spans`.
     spans = Spans(arm, assume)
     outputs, constants = smallest_form(spans)
     return Structure(

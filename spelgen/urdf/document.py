@@ -1,4 +1,4 @@
-"""Bytes -> XML tree of a URDF; unsafe content and other formats are refused."""
+"""Bytes of a URDF file -> XML tree; unsafe content and other formats are errors."""
 
 import re
 from pathlib import Path
@@ -25,10 +25,10 @@ _OTHER_FORMATS = {
 
 
 class UrdfDocument(NamedTuple):
-    """The bytes of a URDF, its ``<robot>`` element, and the lines of ``<xacro:property>`` elements in it.
+    """The bytes of a URDF file (``data``) and its ``<robot>`` element (``root``).
 
-    ``path`` is the name of the file in errors. For a xacro file, bytes and lines refer to the expanded document, and
-    ``warnings`` are the warnings of xacro.
+    ``path`` is the name of the file in errors. ``leftovers`` are the line numbers of ``<xacro:property>`` elements. For
+    a xacro file, bytes and lines refer to the expanded document, and ``warnings`` are the warnings of xacro.
     """
 
     path: Path
@@ -44,9 +44,9 @@ def urdf_bytes(path: Path) -> bytes:
 
 
 def read_document(path: Path) -> UrdfDocument:
-    """Return the parsed file; entities are never expanded and no other file is opened.
+    """Return the parsed file. XML entities are never expanded, and parsing opens no other file.
 
-    A ``*.xacro`` file is a program, which is executed first and may open other files (see ``xacro_input``).
+    A ``*.xacro`` file is a program. It is executed before parsing and may open other files (see ``xacro_input``).
 
     Raises UrdfError for a missing or oversized file, a document type declaration, malformed XML, a root element other
     than ``<robot>``, and xacro that is not expanded.
@@ -56,7 +56,7 @@ def read_document(path: Path) -> UrdfDocument:
     if is_xacro(path):
         path = path.with_name(f"{path.name} (expanded)")
         _refuse_damage(path, data)
-    # huge_tree=False: the limits of libxml2 on depth (256) and text length apply
+    # huge_tree=False keeps the limits of libxml2 on the depth of elements (256) and on the length of texts.
     parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=False, load_dtd=False)
     try:
         root = etree.fromstring(data, parser)
@@ -81,10 +81,10 @@ def _line_of(data: bytes, position: int) -> int:
 
 
 def _refuse_damage(path: Path, data: bytes) -> None:
-    """Raise UrdfError for damage with unclear errors of the XML parser, and for unsafe declarations."""
+    """Raise UrdfError for unsafe declarations, and for damage for which the XML parser has no clear message."""
     if not data.strip():
         raise UrdfError("an empty file", file=path, expected="a URDF document")
-    # Markers of git are the most common damage, and the parser's message would not name them.
+    # Conflict markers of git are the most common damage, and the message of the parser would not name them.
     conflict = _CONFLICT.search(data)
     if conflict:
         line, do = _line_of(data, conflict.start()), "resolve the merge conflict first"
@@ -94,7 +94,7 @@ def _refuse_damage(path: Path, data: bytes) -> None:
             "text or blank lines before the XML declaration", file=path, line=_line_of(data, data.index(b"<?xml")),
             expected="<?xml ...?> at the very start of the file", do="delete what stands before it",
         )  # fmt: skip
-    # Before parsing: an entity could expand to gigabytes, or read another file.
+    # These declarations are refused before parsing: an entity could expand to gigabytes, or read another file.
     for declaration in (b"<!DOCTYPE", b"<!ENTITY"):
         if declaration in data:
             raise _doctype_error(path, _line_of(data, data.index(declaration)))
@@ -136,7 +136,8 @@ def _check_root(path: Path, root: etree._Element) -> None:
 def _check_xacro(path: Path, root: etree._Element) -> tuple[int, ...]:
     """Return the lines of <xacro:property> elements. Raises UrdfError for other xacro elements.
 
-    Output of expanders may contain properties; a number that refers to one is refused when it is read.
+    Expanded documents may still contain properties, which have no effect. A number that refers to a property is an
+    error when the number is read.
     """
     errors, leftovers = [], []
     for element in root.iter(etree.Element):

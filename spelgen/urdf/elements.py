@@ -1,4 +1,4 @@
-"""A <link>, <joint> or <transmission> element -> its dataclass; defects are reported, not repaired."""
+"""Element <link>, <joint> or <transmission> of a URDF -> dataclass; defects are reported, not repaired."""
 
 from collections.abc import Sequence
 
@@ -9,23 +9,26 @@ from spelgen.urdf.robot import MOVING, Inertial, Mimic, Tensor, Transmission, Ur
 from spelgen.urdf.values import MAX_MAGNITUDE, Element, Notes
 
 Limits = tuple[float | None, float | None, float | None, float | None]
-"""Lower, upper, effort, velocity."""
+"""Limits of a joint: lower, upper [rad, m], effort [Nm, N], velocity [rad/s, m/s]; None for no limit."""
 
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
 
 
 def read_name(notes: Notes, xml: etree._Element) -> str | None:
-    """Return the name of an element; None, with an error, if it has none."""
+    """Return the name of an element; if it has none, add an error to ``notes`` and return None."""
     return Element(notes, xml, f"<{xml.tag}>").name()
 
 
 def read_link(notes: Notes, xml: etree._Element) -> UrdfLink | None:
-    """Return the link of a <link> element, with its first <inertial>; None, with an error, if it has no name."""
+    """Return the link of a <link> element; if it has no name, add an error to ``notes`` and return None.
+
+    Of several <inertial> elements the first is used, with a warning.
+    """
     name = read_name(notes, xml)
     if name is None:
         return None
     link = Element(notes, xml, f"link {name!r}")
-    # URDF allows one; parsers of ROS use the first
+    # URDF allows one <inertial> per link. Of several, the first is used, as the parsers of ROS do.
     inertials = xml.findall("inertial")
     if len(inertials) > 1:
         message = f"{len(inertials)} <inertial> elements: the first is taken, the others are ignored"
@@ -36,7 +39,7 @@ def read_link(notes: Notes, xml: etree._Element) -> UrdfLink | None:
 
 def _read_inertial(inertial: Element) -> Inertial | None:
     mass_element = inertial.child("mass")
-    # all parts are read before any is refused, so that all defects are reported
+    # Origin and tensor are read before an absent mass ends this function, so that all defects are reported.
     com, rpy = _read_origin(inertial)
     tensor = _read_tensor(inertial)
     if mass_element.xml is None:
@@ -52,16 +55,19 @@ def _read_inertial(inertial: Element) -> Inertial | None:
 
 
 def _read_tensor(inertial: Element) -> Tensor:
-    """Return (ixx, ixy, ixz, iyy, iyz, izz) [kg m2]; zeros if <inertia> is absent or, with an error, incomplete."""
+    """Return (ixx, ixy, ixz, iyy, iyz, izz) [kg m2] of an <inertial>.
+
+    All are zero if <inertia> is absent, which is a warning, or incomplete, which is an error.
+    """
     inertia = inertial.child("inertia")
     if inertial.xml is not None and inertia.xml is None:
-        # URDFs of vendors contain unexpanded macro calls in place of the tensor
+        # Some URDFs of vendors contain an unexpanded xacro macro in place of <inertia>: the warning names the macro.
         instead = next((e.tag for e in inertial.xml.iterchildren(etree.Element) if "inertia" in e.tag), None)
         hint = f" (<{instead}> is a xacro macro that was not expanded)" if instead else ""
         message = f"no <inertia>: read as a point mass{hint}"
         inertial.notes.warn(inertial.line, "inertial-without-inertia", inertial.where, message)
         return (0.0,) * 6
-    # absent products of inertia are 0, moments have no sensible default
+    # An absent product of inertia is 0. An absent moment of inertia is an error, because it has no sensible default.
     missing = [key for key in ("ixx", "iyy", "izz") if inertia.text(key) is None]
     if missing:
         inertia.error(f"no {', '.join(missing)}", "ixx, ixy, ixz, iyy, iyz, izz [kg m2]")
@@ -72,7 +78,10 @@ def _read_tensor(inertial: Element) -> Tensor:
 
 
 def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
-    """Return the joint; None, with errors, if its name, type, parent or child is unusable."""
+    """Return the joint of a <joint> element.
+
+    If its name, type, parent or child is unusable, add errors to ``notes`` and return None.
+    """
     name = read_name(notes, xml)
     if name is None:
         return None
@@ -84,7 +93,8 @@ def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
     parent = _read_end(joint, "parent")
     child = _read_end(joint, "child")
     xyz, rpy = _read_origin(joint)
-    # motion attributes of a fixed joint have no meaning: their errors are warnings
+    # Axis, limits and dynamics of a joint without motion, such as a fixed joint, have no effect: their errors become
+    # warnings.
     optional = Notes(notes.path)
     motion = joint if kind in MOVING else Element(optional, xml, joint.where)
     axis = _read_axis(motion, kind)
@@ -99,7 +109,7 @@ def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
 
 
 def _read_end(joint: Element, tag: str) -> str | None:
-    # with two parents, the links form no tree
+    # Two parents or two children are an error, because the links would not form a tree.
     ends = [] if joint.xml is None else joint.xml.findall(tag)
     link: str | None = ends[0].get("link") if len(ends) == 1 else None
     if not link:
@@ -116,7 +126,7 @@ def _read_origin(parent: Element) -> tuple[Vector, Vector]:
 def _read_axis(joint: Element, kind: str | None) -> Vector:
     axis, error_count = joint.child("axis"), len(joint.notes.errors)
     xyz = axis.triple("xyz", (1.0, 0.0, 0.0))  # the default of URDF
-    # an axis of length zero cannot be normalised
+    # An axis of length zero is an error, because it cannot be normalised.
     if kind in MOVING and len(joint.notes.errors) == error_count and max(map(abs, xyz)) < 1e-9:
         do = f'give the {kind} joint an axis such as "0 0 1"'
         joint.notes.error(axis.line, joint.where, f"the axis {axis.text('xyz')!r}", "a direction", do)
@@ -124,10 +134,10 @@ def _read_axis(joint: Element, kind: str | None) -> Vector:
 
 
 def _read_limits(limit: Element, kind: str | None) -> Limits:
-    # exporters write 0 for an unknown effort or velocity
+    # An effort or velocity limit of 0 counts as absent, because exporters write 0 for an unknown limit.
     effort, velocity = limit.limit("effort") or None, limit.limit("velocity") or None
     if kind == "continuous":
-        # lower and upper of a continuous joint have no meaning
+        # URDF defines that lower and upper of a continuous joint have no effect.
         return None, None, effort, velocity
     lower, upper = limit.limit("lower"), limit.limit("upper")
     return (None, None, effort, velocity) if lower == upper == 0 else (lower, upper, effort, velocity)
@@ -137,16 +147,16 @@ def _read_mimic(mimic: Element) -> Mimic | None:
     if mimic.xml is None:
         return None
     leader = mimic.text("joint")
-    # an error, because a follower without leader has no position
+    # An error and not a warning: the position of a mimic joint is undefined without a leader.
     if not leader:
         mimic.error("no joint", 'joint="..." naming the joint to follow')
         return None
-    # a multiplier of 0 locks the joint; an absent one means 1
+    # An absent multiplier is 1. A multiplier of 0 is kept: it locks the joint at its offset.
     multiplier = mimic.number("multiplier")
     if multiplier is None:
         multiplier = 1.0
     offset = mimic.number("offset") or 0.0
-    # the inverse of the multiplier is bounded as all numbers of a URDF
+    # The inverse of the multiplier has the same bound as all numbers of a URDF.
     if multiplier and abs(multiplier) < 1 / MAX_MAGNITUDE:
         expected = f"0, or {1 / MAX_MAGNITUDE:g} at least"
         mimic.error(repr(mimic.text("multiplier")), expected, key="multiplier")
@@ -154,14 +164,19 @@ def _read_mimic(mimic: Element) -> Mimic | None:
 
 
 def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) -> Transmission:
-    """Return the transmission, in the form of ROS (<type>, <joint>, <actuator>).
+    """Return the transmission of a <transmission> element in the form of ROS (<type>, <joint>, <actuator>).
 
-    Unknown joints and unusable numbers are warnings. The errors are attached to the transmission, for a later step that
-    needs it.
+    Unknown joints and unusable numbers are warnings. Errors of numbers are also stored in the transmission: a step that
+    needs the transmission raises them.
+
+    Args:
+        notes: the warnings are added to these notes.
+        xml: the element.
+        joints: names of all joints of the URDF.
     """
     name = xml.get("name") or ""
     where = f"transmission {name!r}"
-    # most logs contain joint torques, for which no transmission is needed
+    # Errors become warnings, because most logs contain joint torques, for which no transmission is needed.
     optional = Notes(notes.path)
     driven = []
     for element in xml.findall("joint"):
@@ -178,7 +193,7 @@ def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) 
         reduction = Element(optional, element, where).number_in_text("mechanicalReduction")
         actuators.append((element.get("name") or "", reduction))
     notes.add_as_warnings(optional)
-    # ROS 1 uses an element, some exporters an attribute
+    # The type is an element in ROS 1, and an attribute in the files of some exporters.
     kind = (xml.findtext("type") or xml.get("type") or "").strip()
     errors = tuple(optional.errors)
     return Transmission(name, kind, tuple(driven), tuple(actuators), xml.sourceline, errors)

@@ -1,4 +1,4 @@
-"""Visual and collision shapes of links: boxes, cylinders and spheres as numbers, meshes as triangles."""
+"""Visual and collision shapes of the links of a URDF: sizes of boxes, cylinders and spheres, triangles of meshes."""
 
 import copy
 import io
@@ -22,16 +22,17 @@ from spelgen.urdf.document import urdf_bytes
 
 Mesh = tuple[np.ndarray, np.ndarray]
 COUNTS = {"box": 3, "cylinder": 2, "sphere": 1, "mesh": 3}
-"""Numbers of the size of each shape."""
+"""Number of values in the size of each kind of shape."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinkShape:
     """A shape of a link.
 
-    kind and size [m]: "box" with three edges, "cylinder" with radius and length along z, "sphere" with its radius,
-    "mesh" with the scale along x, y and z. pose: (4, 4), in the frame of the link. file: of a mesh, as named in the
-    URDF. mesh: vertices (V, 3) [m], scaled, in the frame of the shape, and triangles (F, 3).
+    link: name of the link. kind and size: "box" with the lengths of three edges, "cylinder" with radius and length
+    along z, "sphere" with radius [m], "mesh" with the scale factors along x, y and z. pose: homogeneous transform
+    (4, 4) of the shape in the frame of the link. file: name of the file of a mesh in the URDF. mesh: scaled vertices
+    (V, 3) [m] in the frame of the shape, and vertex indices (F, 3) of triangles; None for other kinds.
     """
 
     link: str
@@ -43,14 +44,17 @@ class LinkShape:
 
 
 class LinkShapes(NamedTuple):
-    """The shapes that were read. unread: link -> the other shapes, each a mesh file or the kind of a shape."""
+    """The shapes that were read, and the shapes that could not be read.
+
+    unread: name of the link -> a text per shape: the name of a mesh file, or the reason.
+    """
 
     shapes: tuple[LinkShape, ...]
     unread: dict[str, tuple[str, ...]]
 
     @property
     def unread_text(self) -> str:
-        """The first two links and files of the shapes that were not read, and the number of others; empty if none."""
+        """Text of the links with unread shapes: two links with their files, and the number of other links."""
         named = [f"{link} ({', '.join(names)})" for link, names in self.unread.items()]
         if len(named) > 2:
             named[2:] = [counted(len(named) - 2, "more link")]
@@ -63,10 +67,10 @@ def link_shapes(
     """Return the visual or collision shapes of links of a valid URDF.
 
     Args:
-        urdf: Path of the file; its folder and the folders above are searched for meshes.
-        element: Name of the elements.
-        links: Names of the links.
-        faces: Largest number of triangles of all meshes together; finer meshes are simplified.
+        urdf: Path of the URDF; its folder and all parent folders are searched for meshes.
+        element: Name of the elements to read.
+        links: Names of the links whose shapes are returned.
+        faces: Largest number of triangles of all meshes together; meshes with more triangles are simplified.
     """
     root = etree.fromstring(urdf_bytes(urdf), etree.XMLParser(resolve_entities=False, no_network=True))
     shapes: list[LinkShape] = []
@@ -74,7 +78,7 @@ def link_shapes(
     for link in root.iterfind("link"):
         name = link.get("name", "")
         for each in link.iterfind(element) if name in links else ():
-            # one invalid shape must not hide the others, which are only drawn
+            # Shapes are needed for drawings only: an invalid shape is listed as unread, and the others are returned.
             try:
                 shapes.append(_shape(name, each))
             except ValueError as error:
@@ -91,9 +95,9 @@ def link_shapes(
 
 
 def mesh_file(urdf: Path, name: str) -> Path:
-    """Return the path of a mesh from its name in the URDF. Raises FileNotFoundError.
+    """Return the path of a mesh from its name in the URDF. Raises FileNotFoundError if no such file exists.
 
-    The folder of the URDF and all its parents are searched, since any of these may be the folder of a package.
+    The folder of the URDF and all its parent folders are searched, because any of them may be a package folder.
     """
     scheme, _, path_text = name.rpartition("://")
     path = Path(path_text)
@@ -105,10 +109,13 @@ def mesh_file(urdf: Path, name: str) -> Path:
 
 
 def _shape(link: str, element: etree._Element) -> LinkShape:
-    """Return a shape as read by yourdfpy, a mesh without its triangles. Raises ValueError for an invalid shape."""
+    """Return the shape of a <visual> or <collision> element, read by yourdfpy. Raises ValueError if it is invalid.
+
+    link: name of the link. A mesh has no triangles yet; see `_meshes`.
+    """
     import yourdfpy  # imports trimesh, which takes long
 
-    # a file of one shape: an invalid shape does not affect the others
+    # Each shape is parsed as a URDF of its own, so that an invalid shape does not affect the others.
     root = etree.Element("robot", name=link)
     collision = etree.SubElement(etree.SubElement(root, "link", name=link), "collision")
     collision.extend(copy.deepcopy(child) for child in element if child.tag in ("origin", "geometry"))
@@ -129,7 +136,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
             scale, file_name = geometry.mesh.scale, geometry.mesh.filename
             size = 1.0 if scale is None else scale
         numbers = np.broadcast_to(np.asarray(size, dtype=float), COUNTS[kind])
-    except Exception as error:  # of any type, from attributes that are absent or are not numbers
+    except Exception as error:  # absent or malformed attributes raise many types of errors
         raise ValueError("a shape that is not valid") from error
     if not (np.isfinite(pose).all() and np.isfinite(numbers).all()) or (kind != "mesh" and numbers.min() < 0):
         raise ValueError(f"a {kind} of negative or infinite size or place")
@@ -137,19 +144,22 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
 
 
 def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[str, tuple[float, ...]], Mesh]:
-    """Return meshes by file and scale, without unreadable ones."""
+    """Return the meshes of these shapes by (file, scale); a mesh that cannot be read is omitted.
+
+    faces: largest number of triangles of all meshes together.
+    """
     paths: dict[tuple[str, tuple[float, ...]], str] = {}
     for shape in shapes:
         with suppress(FileNotFoundError):
             paths[shape.file, shape.size] = str(mesh_file(urdf, shape.file))
-    if not paths:  # a process takes seconds to start
+    if not paths:  # no process is started without need: it takes seconds
         return {}
-    # ASCII JSON on stdin: arguments of a process are limited to the characters of the locale
+    # The task is ASCII JSON on stdin and not in the arguments, whose characters are limited by the locale.
     meshes = [(path, scale) for (_, scale), path in paths.items()]
     task = json.dumps({"faces": max(1, faces // len(shapes)), "meshes": meshes}).encode()
     command = [sys.executable, "-P", "-m", mesh_child.__name__]
     try:
-        # a process with limits: a mesh may declare any size, and may name a file without an end
+        # Meshes are read in a process with limits: a mesh file may declare any size, or name an endless file.
         run = subprocess.run(command, input=task, capture_output=True, timeout=60, check=True)
         arrays = np.load(io.BytesIO(run.stdout))
         numbered = [(key, f"v{index}", f"f{index}") for index, key in enumerate(paths)]

@@ -7,7 +7,8 @@ import numpy as np
 from spelgen.errors import Diagnostic
 from spelgen.urdf.robot import Inertial, Robot, Tensor, UrdfJoint
 
-# Tensors are printed with rounding: violations below this fraction are not reported.
+# [1] Smallest reported violation, relative to the largest principal moment: printed tensors are rounded, which causes
+# smaller violations.
 _ROUNDING = 1e-6
 
 Finding = tuple[str, str, int, str]
@@ -15,7 +16,7 @@ Finding = tuple[str, str, int, str]
 
 
 def lint(robot: Robot) -> list[Diagnostic]:
-    """Return the diagnostics of inertials, joints, rigid groups and limits, which the reader sorts by line."""
+    """Return the diagnostics of inertials, joints, rigid groups of links, and limits, in no particular order."""
     findings = [
         finding
         for link in robot.links
@@ -38,7 +39,7 @@ def _lint_inertial(link: str, inertial: Inertial) -> Iterator[Finding]:
         if inertial.mass > 0:
             yield "zero-inertia", where, line, "the inertia tensor is zero: a point mass"
         return
-    # the identity matrix is physically consistent, and is the default of templates
+    # The identity matrix passes the tests of consistency, but it is the default of templates and no real inertia.
     if tensor == (1.0, 0.0, 0.0, 1.0, 0.0, 1.0):
         yield "placeholder-inertial", where, line, "the tensor is the unit matrix: a placeholder"
     matrix = np.zeros((3, 3))
@@ -47,7 +48,8 @@ def _lint_inertial(link: str, inertial: Inertial) -> Iterator[Finding]:
     if smallest < -_ROUNDING * abs(largest):
         fault = "the inertia tensor is not positive semidefinite"
         yield "non-psd-inertia", where, line, f"{fault}: its least principal moment is {smallest:.3g}"
-    # a principal moment is the sum of two of three nonnegative second moments of mass
+    # Triangle inequality: each principal moment is the sum of two of three nonnegative second moments of mass, so that
+    # none exceeds the sum of the other two.
     elif smallest + middle < largest * (1 - _ROUNDING):
         inequality = f"{smallest:.3g} + {middle:.3g} < {largest:.3g}"
         message = f"no mass distribution has these principal moments: {inequality}"
@@ -55,14 +57,14 @@ def _lint_inertial(link: str, inertial: Inertial) -> Iterator[Finding]:
 
 
 def _lint_placeholders(inertials: Sequence[Inertial]) -> Iterator[Finding]:
-    """Warn of placeholders: one tensor repeated on most links was copied, not computed."""
+    """Yield a warning if most links have the same inertia tensor: it was probably copied, not computed."""
     lines: dict[Tensor, list[int]] = {}
     for inertial in inertials:
         if any(inertial.tensor):
             lines.setdefault(inertial.tensor, []).append(inertial.line)
     total = sum(map(len, lines.values()))
     repeated = max(lines.values(), key=len, default=[])
-    # two links may have equal shapes; three equal tensors are copies
+    # Two equal tensors are no evidence, because two links may have the same shape.
     if len(repeated) > total / 2 and len(repeated) >= 3:
         message = f"{len(repeated)} of {total} links have the same inertia tensor: perhaps placeholders"
         yield "placeholder-inertial", "robot", repeated[0], message
@@ -70,21 +72,21 @@ def _lint_placeholders(inertials: Sequence[Inertial]) -> Iterator[Finding]:
 
 def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
     where, line = f"joint {joint.name!r}", joint.line
-    # negative friction adds energy: simulations diverge
+    # Negative friction adds energy, so that simulations diverge.
     for name, value in (("damping", joint.damping), ("friction", joint.friction)):
         if value < 0:
             yield "negative-friction", f"{where} dynamics", line, f"{name} is {value:g}: it would add energy"
     length = float(np.linalg.norm(joint.axis))
     if abs(length - 1) > 1e-3:
         yield "non-unit-axis", f"{where} axis", line, f"its length is {length:.6g}: normalised"
-    # not corrected, because either number may be wrong
+    # Swapped limits are not corrected, because one of the numbers may be wrong instead.
     if joint.lower is not None and joint.upper is not None and joint.lower > joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
         yield "lower-above-upper", f"{where} limit", line, message
 
 
 def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
-    """Name all limits that moving joints do not have, once: every later step treats them as unlimited."""
+    """Yield one diagnostic that lists the limits that moving joints lack; these joints count as unlimited."""
     lacking = {
         "position": [x.name for x in joints if x.type != "continuous" and None in (x.lower, x.upper)],
         "velocity": [x.name for x in joints if x.velocity is None],
@@ -92,7 +94,7 @@ def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
     }
     texts = []
     for limit, names in lacking.items():
-        # most URDFs lack all limits of a kind or none
+        # Most URDFs specify a limit for all joints or for none: "all joints" is shorter than the names.
         which = "all joints" if len(names) == len(joints) else ", ".join(names)
         if names:
             texts.append(f"{limit} of {which}")
@@ -102,12 +104,16 @@ def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
 
 
 def _lint_groups(robot: Robot, moving: Sequence[UrdfJoint]) -> Iterator[Finding]:
-    """Warn about a moving joint whose rigid group, its child link and all links fixed to it, has no mass."""
+    """Yield a warning for each moving joint whose rigid group has no mass.
+
+    The rigid group is the child link of the joint and all links that fixed joints connect to it.
+    """
     if all(link.inertial is None for link in robot.links):
         yield "missing-inertial", "robot", 1, "no link has an <inertial>: masses and inertias are unknown"
         return
     for joint in moving:
-        # single links without mass are common; M is singular if a whole rigid group has no mass
+        # Groups are tested and not links: single links without mass are common, but M is singular if a whole rigid
+        # group has no mass.
         group = [joint.child]
         for name in group:
             group += [below.child for below in robot.joints_below[name] if below.type == "fixed"]

@@ -1,4 +1,4 @@
-"""URDF file -> Robot, with the values of the file: all elements are checked, and no defect is repaired silently."""
+"""URDF file -> Robot, with the values in the file: all elements are checked, and no defect is repaired silently."""
 
 import hashlib
 from collections.abc import Sequence
@@ -20,16 +20,16 @@ Part = TypeVar("Part", UrdfLink, UrdfJoint)
 
 
 def read_urdf(path: Path) -> Robot:
-    """Return the robot of a URDF file, with lint diagnostics in the order of lines; no other file is opened.
+    """Return the robot in a URDF file, with diagnostics in the order of lines. Meshes are not opened.
 
     A ``*.xacro`` file is a program, which is executed (see ``xacro_input``); lines then refer to the expanded document.
 
-    Raises UrdfError, or SpelgenErrors with all errors, if the file is missing or is no well-formed tree of links and
-    joints.
+    Raises UrdfError, or SpelgenErrors with all errors, if the file is missing or does not contain a well-formed tree of
+    links and joints.
     """
     document = read_document(path)
     notes = Notes(document.path)
-    # line numbers would be searched for in the wrong file
+    # Without this remark, users would look up the line numbers in the xacro file.
     if document.path != path:
         message = f"expanded by xacro: lines are those of the document that `xacro {path.name}` prints"
         notes.diagnostics.append(Diagnostic("info", "expanded-xacro", "robot", None, message))
@@ -43,7 +43,7 @@ def read_urdf(path: Path) -> Robot:
         message = f"{len(document.leftovers)} <xacro:property> elements were left behind by xacro: ignored"
         notes.warn(document.leftovers[0], "unexpanded-xacro", "robot", message)
     links = _read_links(notes, root)
-    # direct children only: Gazebo and transmissions have nested elements of the same names
+    # Only direct children of <robot> are read: elements for Gazebo, and transmissions, contain <joint> elements too.
     joints = _unique(notes, [read_joint(notes, element) for element in root.findall("joint")])
     _check_ends(notes, links, joints)
     _check_mimics(notes, joints)
@@ -59,7 +59,8 @@ def read_urdf(path: Path) -> Robot:
         root="",
         diagnostics=(),
     )
-    # only if all joints could be read, because the child links of unread joints would count as roots
+    # The root is searched only without errors: the child link of a joint that could not be read would look like a
+    # second root.
     if not notes.errors:
         robot = _rooted(notes, root, robot)
     collect(sorted(notes.errors, key=lambda error: error.line or 0))
@@ -67,7 +68,10 @@ def read_urdf(path: Path) -> Robot:
 
 
 def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
-    """Return the diagnostics of reading and lint in the order of lines, without duplicates for absent tensors."""
+    """Return the diagnostics of reading and of ``lint`` in the order of lines.
+
+    An absent <inertia> has a diagnostic of reading: the diagnostic of ``lint`` for a zero tensor is omitted.
+    """
     absent = {remark.line for remark in notes.diagnostics if remark.code == "inertial-without-inertia"}
     warnings = [x for x in lint(robot) if x.code != "zero-inertia" or x.line not in absent]
     return tuple(sorted([*notes.diagnostics, *warnings], key=lambda remark: remark.line or 0))
@@ -75,7 +79,8 @@ def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
 
 def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
     elements = root.findall("link")
-    # the cost of all later steps is at least linear in the links; arms have at most a tenth of this number
+    # The number of links is bounded, because the time of all later steps increases with it. Arms have at most a tenth
+    # of the bound.
     if len(elements) > MAX_LINKS:
         notes.error(root.sourceline, "<robot>", f"{len(elements)} links", f"at most {MAX_LINKS}")
         collect(notes.errors)
@@ -89,12 +94,12 @@ def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
 
 
 def _unique(notes: Notes, elements: Sequence[Part | None]) -> list[Part]:
-    """Return the elements that could be read; a name of two links, or of two joints, is an error."""
+    """Return the elements that are not None; two links, or two joints, of one name are reported as an error."""
     by_name: dict[str, Part] = {}
     for element in elements:
         if element is None:
             continue
-        # The first element of a name is kept, so that further checks report no consequences of the second.
+        # Only the first element of a name is kept, so that later checks do not report errors caused by the second.
         first = by_name.setdefault(element.name, element)
         if first is not element:
             kind = "link" if isinstance(element, UrdfLink) else "joint"
@@ -109,7 +114,7 @@ def _check_ends(notes: Notes, links: Sequence[UrdfLink], joints: Sequence[UrdfJo
     above: dict[str, UrdfJoint] = {}
     for joint in joints:
         where = f"joint {joint.name!r}"
-        # Both ends are checked before any error is raised: a renamed link breaks several joints.
+        # All ends of all joints are checked: a renamed link causes errors at several joints.
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in names:
                 got = f"no link is named {link!r}"
@@ -133,7 +138,7 @@ def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
         if leader is None:
             got = f"no joint is named {joint.mimic.joint!r}"
             notes.error(joint.line, where, got, do=suggestion(joint.mimic.joint, by_name))
-        # a follower of a fixed joint would be a fixed joint that looks as if it moves
+        # A mimic joint of a fixed joint is an error: it could not move, although its type states that it does.
         elif not leader.moves:
             got = f"the {leader.type} joint {leader.name!r}"
             notes.error(joint.line, where, got, "a revolute, continuous or prismatic joint to follow")
@@ -145,7 +150,7 @@ def _is_circle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
     """Whether ``joint`` is part of a cycle of mimic joints."""
     seen: set[str] = set()
     leader: UrdfJoint | None = joint
-    # The names that were seen end a cycle that does not contain the joint.
+    # `seen` ends the loop if the leaders form a cycle that does not contain the joint.
     while leader is not None and leader.mimic is not None and leader.name not in seen:
         seen.add(leader.name)
         leader = by_name.get(leader.mimic.joint)
@@ -153,7 +158,7 @@ def _is_circle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
 
 
 def _rooted(notes: Notes, root: etree._Element, robot: Robot) -> Robot:
-    """Return the robot with its root link, and report errors unless the links form one tree."""
+    """Return the robot with the name of its root link; errors are reported unless the links form one tree."""
     children = {joint.child for joint in robot.joints}
     tops = [link for link in robot.links if link.name not in children]
     if len(tops) != 1:
@@ -164,7 +169,8 @@ def _rooted(notes: Notes, root: etree._Element, robot: Robot) -> Robot:
         notes.error(root.sourceline, "<robot>", got, "one link that is no joint's child", do)
         return robot
     robot = replace(robot, root=tops[0].name)
-    # each link has one parent here, so that the walk from the root ends even if other links form a cycle
+    # `joints_from_root` ends even if some links form a cycle: each link has one parent here, so that the cycle is not
+    # connected to the root.
     connected = {robot.root, *(joint.child for joint in robot.joints_from_root)}
     for link in robot.links:
         if link.name not in connected:

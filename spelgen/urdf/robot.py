@@ -1,4 +1,4 @@
-"""A robot with the values of its URDF: links, joints and transmissions."""
+"""Data classes for the content of a URDF: robot, links, joints and transmissions."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,16 +13,18 @@ Tensor = tuple[float, float, float, float, float, float]
 JointType = Literal["revolute", "prismatic"]
 
 Assume = Literal["kinematics", "inertials"]
-"""Values of the URDF that determine the structure: the kinematics, or also zeros and symmetries of inertials."""
+"""Values of the URDF on which the structure depends: the kinematics only, or also the values of the inertials."""
 
 MOVING = ("revolute", "continuous", "prismatic")
 """Types of joints with one degree of freedom."""
 
 
 class Inertial(NamedTuple):
-    """Mass [kg], centre of mass and orientation of the inertial frame in the link frame [m, rad].
+    """Mass [kg] and inertia tensor of a link.
 
-    ``tensor`` is (ixx, ixy, ixz, iyy, iyz, izz) [kg m2] about the centre of mass, in the inertial frame.
+    ``com`` is the centre of mass [m] and ``rpy`` the orientation of the inertial frame [rad], both in the link frame.
+    ``tensor`` is (ixx, ixy, ixz, iyy, iyz, izz) [kg m2] about the centre of mass, in the inertial frame. ``line`` is
+    the line of the <inertial> element.
     """
 
     mass: float
@@ -33,7 +35,7 @@ class Inertial(NamedTuple):
 
 
 class UrdfLink(NamedTuple):
-    """A link; ``inertial`` is None if absent."""
+    """A link of a URDF; ``inertial`` is None if the link has no usable <inertial>."""
 
     name: str
     inertial: Inertial | None
@@ -41,7 +43,7 @@ class UrdfLink(NamedTuple):
 
 
 class Mimic(NamedTuple):
-    """A joint that follows another: q = multiplier * q_joint + offset [rad or m]."""
+    """The <mimic> of a joint: q = multiplier * q_joint + offset [rad, m]; ``joint`` is the name of the leader."""
 
     joint: str
     multiplier: float
@@ -49,9 +51,11 @@ class Mimic(NamedTuple):
 
 
 class UrdfJoint(NamedTuple):
-    """A joint at ``xyz`` [m] and ``rpy`` [rad] in the frame of the parent link; ``axis`` is in the frame of the joint.
+    """A joint of a URDF.
 
-    Limits are in rad or m, N m or N, and per second, None if absent. ``axis`` is not normalised; (1, 0, 0) if absent.
+    ``xyz`` [m] and ``rpy`` [rad] are the pose of the joint's frame in the frame of the parent link. ``axis`` is in the
+    frame of the joint, as in the file (not normalised); (1, 0, 0) if absent. Limits: ``lower``, ``upper`` [rad, m],
+    ``effort`` [Nm, N], ``velocity`` [rad/s, m/s]; None if absent. ``damping`` [Nm s/rad, N s/m], ``friction`` [Nm, N].
     """
 
     name: str
@@ -72,14 +76,14 @@ class UrdfJoint(NamedTuple):
 
     @property
     def moves(self) -> bool:
-        """Whether the joint has one degree of freedom, its own or its leader's."""
+        """Whether the joint is revolute, continuous or prismatic; mimic joints are included."""
         return self.type in MOVING
 
 
 class Transmission(NamedTuple):
-    """Actuators (name, reduction) that drive joints (name, reduction, offset); None for an absent number.
+    """Actuators (name, reduction) that drive joints (name, reduction, offset); an absent number is None.
 
-    ``errors`` are raised by a step that needs the transmission.
+    ``errors`` are the defects of the numbers; a step that needs the transmission raises them.
     """
 
     name: str
@@ -97,9 +101,10 @@ class Transmission(NamedTuple):
 
 @dataclass(frozen=True)
 class Robot:
-    """A tree of links and joints in the order of the file; ``digest`` is the SHA-256 of its bytes in hexadecimal.
+    """The content of a URDF: a tree of links and joints, in the order of the file.
 
-    ``source`` is the name of the file in errors; for a xacro file, lines and digest refer to the expanded document.
+    ``source`` is the name of the file in errors. ``digest`` is the SHA-256 of the bytes of the file in hexadecimal.
+    ``root`` is the name of the root link. For a xacro file, lines and digest refer to the expanded document.
     """
 
     name: str
@@ -124,13 +129,13 @@ class Robot:
 
     @cached_property
     def joint_above(self) -> dict[str, UrdfJoint]:
-        """The joint whose child is a link, by the name of the link; the root link has none."""
+        """For each link except the root, the joint of which the link is the child, by the name of the link."""
         return {joint.child: joint for joint in self.joints}
 
     @cached_property
     def joints_below(self) -> dict[str, tuple[UrdfJoint, ...]]:
-        """The joints whose parent is a link, by the name of the link, in the order of the file."""
-        # All links have an entry, so that the tips are the links with an empty one.
+        """For each link, the joints of which the link is the parent, by the name of the link."""
+        # Links without such joints have an empty entry, so that no caller needs a default.
         below: dict[str, tuple[UrdfJoint, ...]] = {link.name: () for link in self.links}
         for joint in self.joints:
             below[joint.parent] += (joint,)
@@ -140,7 +145,7 @@ class Robot:
     def joints_from_root(self) -> tuple[UrdfJoint, ...]:
         """All joints, parents before their children, depth first in the order of the file."""
         ordered: list[UrdfJoint] = []
-        # A stack replaces recursion: the nesting in a file is not bounded.
+        # A stack in place of recursion, because the depth of the tree may exceed the recursion limit of Python.
         pending = list(reversed(self.joints_below[self.root]))
         while pending:
             joint = pending.pop()
@@ -149,7 +154,7 @@ class Robot:
         return tuple(ordered)
 
     def path_to(self, link: str) -> tuple[UrdfJoint, ...]:
-        """Return the joints from the root to ``link``, in this order."""
+        """Return the joints on the path from the root to the link named ``link``, root first."""
         path: list[UrdfJoint] = []
         while link in self.joint_above:
             path.append(self.joint_above[link])

@@ -1,8 +1,8 @@
 """Checked reading of the elements of a URDF, and the list of defects of a file.
 
-The package yourdfpy is not used: each number is checked as text first (count, length, finiteness, line), and yourdfpy
-replaces absent inertias by 1.0, converts origins to matrices and drops mechanical reductions. Tests compare the two
-readings of all other values.
+The package yourdfpy is not used to read the numbers of an arm: it does not report lines, replaces absent inertias by
+1.0, converts origins to matrices and drops mechanical reductions. Here each number is checked as text first (count,
+length, finiteness). Tests compare all other values with the values that yourdfpy reads.
 """
 
 from __future__ import annotations
@@ -17,17 +17,19 @@ from lxml import etree
 from spelgen.errors import Diagnostic, UrdfError
 from spelgen.urdf.robot import Vector
 
-# Largest magnitude of a number of exact geometry: products of a few such numbers are in the range of a float.
+# [m, rad, kg, kg m2] Largest magnitude of a number in a URDF, limits excepted: products of a few such numbers do not
+# overflow a float.
 MAX_MAGNITUDE = 1e12
 MAX_NAME = 256
-# [rad, m; Nm, N; per second] From these on a limit states that there is none: exporters write 1e9, 1e16 or DBL_MAX.
+# [rad, m; Nm, N; rad/s, m/s] A limit of at least this magnitude means that the joint has no limit: exporters write 1e9,
+# 1e16 or DBL_MAX in this case.
 UNLIMITED = {"lower": 1e3, "upper": 1e3, "effort": 1e5, "velocity": 1e3}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
 
 @dataclass
 class Notes:
-    """Errors, which are reported together at the end of reading, and diagnostics of a file."""
+    """Errors and diagnostics of one file; the reader raises all errors together at its end."""
 
     path: Path
     errors: list[UrdfError] = field(default_factory=list)
@@ -36,16 +38,16 @@ class Notes:
     def error(
         self, line: int | None, element: str, got: str, expected: str | None = None, do: str | None = None
     ) -> None:
-        """Add an error."""
+        """Add an error about an element in a line of the file; arguments as for `UrdfError`."""
         error = UrdfError(got, file=self.path, line=line, element=element, expected=expected, do=do)
         self.errors.append(error)
 
     def warn(self, line: int | None, code: str, where: str, message: str) -> None:
-        """Add a warning."""
+        """Add a warning with this code about ``where``, the name of an element in messages."""
         self.diagnostics.append(Diagnostic("warning", code, where, line, message))
 
     def add_as_warnings(self, optional: Notes) -> None:
-        """Add the notes on an optional part of the file, its errors as warnings."""
+        """Add the notes on a part of the file that a robot does not need; errors are added as warnings."""
         self.diagnostics += optional.diagnostics
         for error in optional.errors:
             message = f"got {error.got}, expected {error.expected}: taken as absent"
@@ -54,7 +56,11 @@ class Notes:
 
 @dataclass(frozen=True)
 class Element:
-    """An element of a URDF, None if it is absent, its name in messages, and the notes that get its defects."""
+    """An element of a URDF with checked access to its attributes.
+
+    notes: errors and warnings about the element are added to these. xml: None if the element is absent; it then has no
+    attributes. where: name of the element in messages.
+    """
 
     notes: Notes
     xml: etree._Element | None
@@ -62,7 +68,7 @@ class Element:
 
     @property
     def line(self) -> int:
-        """Line of the element."""
+        """Line of the element in the file; 0 if the element is absent."""
         return 0 if self.xml is None else int(self.xml.sourceline)
 
     def error(self, got: str, expected: str | None = None, do: str | None = None, key: str = "") -> None:
@@ -70,7 +76,10 @@ class Element:
         self.notes.error(self.line, f"{self.where} {key}".rstrip(), got, expected, do)
 
     def child(self, tag: str) -> Element:
-        """Return the first child with this tag; repeated ones, which parsers treat differently, are reported."""
+        """Return the first child with this tag, which may be absent.
+
+        Several children with the tag cause a warning, because parsers of URDF differ in which of them they use.
+        """
         children = [] if self.xml is None else self.xml.findall(tag)
         if len(children) > 1:
             message = f"{len(children)} <{tag}> elements: the first is taken, the others are ignored"
@@ -78,17 +87,17 @@ class Element:
         return Element(self.notes, children[0] if children else None, f"{self.where} {tag}")
 
     def text(self, key: str) -> str | None:
-        """Return an attribute, None if it is absent."""
-        # an absent element reads as one without attributes, so that callers need no branch
+        """Return the text of an attribute; None if the attribute or the element is absent."""
+        # An absent element is no error here, so that callers need no branch for it.
         text: str | None = None if self.xml is None else self.xml.get(key)
         return text
 
     def name(self) -> str | None:
-        """Return the name of the element; None, with an error, if it has none."""
+        """Return the name of the element; add an error and return None if it has no usable name."""
         name = self.text("name")
         if not name or not name.strip():
             self.error("no name" if name is None else "an empty name", "a name", 'add name="..."')
-        # names occur in error messages, file names and the emitted module
+        # The length is bounded, because names occur in error messages, file names and the emitted module.
         elif len(name) > MAX_NAME:
             self.error(f"a name of {len(name)} characters", f"at most {MAX_NAME}")
         elif not self._is_unexpanded(name, "name"):
@@ -96,17 +105,23 @@ class Element:
         return None
 
     def triple(self, key: str, default: Vector = (0.0, 0.0, 0.0)) -> Vector:
-        """Return three numbers; the default if the attribute is absent or, with an error, unusable."""
+        """Return the three numbers in an attribute, or the default if it is absent.
+
+        For an unusable text, add an error and return the default.
+        """
         values = self._numbers(self.text(key), key, 3)
         return (values[0], values[1], values[2]) if values else default
 
     def number(self, key: str) -> float | None:
-        """Return a number; None if the attribute is absent or, with an error, unusable."""
+        """Return the number in an attribute, or None if it is absent; for an unusable text, add an error too."""
         values = self._numbers(self.text(key), key)
         return values[0] if values else None
 
     def limit(self, key: str) -> float | None:
-        """Return a limit; None without a limit: absent, inf, nan, or beyond the range of joints."""
+        """Return a limit of a joint; None if it is absent, inf, nan, or at least the magnitude in ``UNLIMITED``.
+
+        For an unusable text, add an error and return None.
+        """
         text = self.text(key)
         if text and text.strip().lower().lstrip("+-") in ("inf", "infinity", "nan"):
             return None
@@ -114,20 +129,26 @@ class Element:
         return values[0] if values and abs(values[0]) < UNLIMITED[key] else None
 
     def number_in_text(self, tag: str) -> float | None:
-        """Return the number in the text of a child element; None if it is absent or, with an error, unusable."""
+        """Return the number in the text of a child element, or None if it is absent.
+
+        For an unusable text, add an error and return None.
+        """
         child = None if self.xml is None else self.xml.find(tag)
         text = "" if child is None else child.text or ""
         values = Element(self.notes, child, self.where)._numbers(text if text.strip() else None, tag)
         return values[0] if values else None
 
     def _numbers(self, text: str | None, key: str, count: int = 1, bounded: bool = True) -> list[float]:
-        """Return ``count`` finite numbers; none for an absent text and, with an error, for any other text.
+        """Return the ``count`` finite numbers in a text.
 
-        bounded: whether magnitudes are at most MAX_MAGNITUDE; not for limits of joints, which may mean "unlimited".
+        The list is empty if the text is None. If the text does not consist of such numbers, add an error and return an
+        empty list. bounded: whether magnitudes above MAX_MAGNITUDE are errors; for limits of joints they are not,
+        because a huge limit means "unlimited".
         """
         if text is None or self._is_unexpanded(text, key):
             return []
-        # float() accepts nan, inf, 1_000 and Arabic digits, which other readers of URDF reject
+        # The text is checked before `float`, which accepts nan, inf, 1_000 and Arabic digits: other readers of URDF
+        # reject these.
         words, longest = text.split(), 64
         expected = "one number" if count == 1 else "three numbers"
         if len(words) != count:
@@ -135,7 +156,7 @@ class Element:
             self.error(f"{len(words)} numbers ({excerpt!r})", expected, key=key)
             return []
         for word in words:
-            # no exporter writes more digits: the file is damaged
+            # A longer word is a sign of a damaged file: no exporter writes such long numbers.
             if len(word) > longest:
                 self.error(f"a number of {len(word)} characters", f"at most {longest}", key=key)
                 return []
@@ -151,7 +172,7 @@ class Element:
         return values
 
     def _is_unexpanded(self, text: str, key: str) -> bool:
-        """Whether a value contains a xacro expression, which is then an error."""
+        """Whether a text contains a xacro expression; if it does, an error is added."""
         is_unexpanded = "${" in text or "$(" in text
         if is_unexpanded:
             do = "expand the file with the xacro command first"

@@ -1,1 +1,1 @@
-"""Fit arms under position servos to logs of commanded positions."""
+"""Fits of arms with position servos to logs of commanded and measured positions."""

@@ -1,9 +1,10 @@
 """Selection of the joints that have a dead zone, by the maximum posterior of each joint with and without one.
 
-The derivatives of the errors do not distinguish a dead zone from dry friction at a joint without gravity load: both
-hold the joint off its command. The motion at starts, stops and reversals does. So each joint is fitted twice, from
-initial parameters with and without a dead zone. Load, delay and likelihood are fixed at the last fit, so that joints
-are independent. A dead zone is kept if it lowers the joint's negative log posterior by more than significance^2 / 2.
+At a joint without gravity load, the derivatives of the position errors do not distinguish a dead zone from dry
+friction: both cause a static position error. The motion at starts, stops and reversals distinguishes them. Therefore
+each joint is fitted twice, from initial parameters with and without a dead zone. Load, delay and likelihood are fixed
+at their values in the preceding fit, so that the joints are independent. A dead zone is kept if it lowers the joint's
+negative log posterior by more than significance^2 / 2.
 """
 
 from dataclasses import replace
@@ -20,18 +21,18 @@ from spelgen.runtime.friction_laws import FrictionLaws
 
 
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return parameters whose dead zones are active at the selected joints; see the module."""
+    """Return parameters with dead zones at the selected joints only; the module's docstring describes the selection."""
     problem = problem.reweighted(x)
     without, costs_without = _joint_minima(problem, x)
     with_zones, costs_with = _joint_minima(problem, with_dead_zones(problem, x, TUNING.dead_zone_fraction))
-    better = costs_with + TUNING.significance**2 / 2 < costs_without  # false if a rollout diverged
+    better = costs_with + TUNING.significance**2 / 2 < costs_without  # false for NaN, if a rollout diverged
     joints, active = torch.where(better, with_zones.joints, without.joints), x.active.clone()
     active[problem.parameters.row(DEAD_ZONE)] = better
     return without_small_dead_zones(problem, replace(x, joints=joints, active=active))
 
 
 def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return the parameters without dead zones below the resolution of encoders."""
+    """Return the parameters without dead zones below `TUNING.min_dead_zone`, about the resolution of encoders."""
     row, joints, active = problem.parameters.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
     active[row] &= joints[row] > TUNING.min_dead_zone
     joints[row] *= active[row]
@@ -50,7 +51,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
     p, n = x.joints.shape
     for _ in range(TUNING.joint_steps):
         normal = problem.normal_equations(x, errors)
-        # the block (p, p) of each joint: (n, p, p) and (n, p)
+        # the Hessian and the negative gradient of each joint's own parameters: (n, p, p) and (n, p)
         blocks = normal.curvature[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)
         joints = NormalEquations(blocks.permute(2, 0, 1), normal.descent[: p * n].view(p, n).mT)
         steps = joints.step(damping).clamp(-TUNING.max_step, TUNING.max_step)
@@ -58,7 +59,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         candidate_errors = problem.residual(candidate)
         candidate_costs = problem.joint_costs(candidate, candidate_errors)
         better = active & (candidate_costs < costs)
-        # a joint ends after a small decrease, or if a step with a damping of at least one does not lower its cost
+        # the fit of a joint ends after a small decrease, or if a step with damping >= 1 does not lower the joint's cost
         active &= torch.where(better, costs - candidate_costs >= TUNING.min_decrease, damping < 1.0)
         x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
         errors = torch.where(better, candidate_errors, errors)
@@ -72,8 +73,8 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
 def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
     """Return parameters in which all joints have a dead zone, and all parameters are active.
 
-    The half dead zone is `fraction` of the static error, dry friction / kp, and Coulomb friction is reduced by this
-    fraction, so that the static error remains about the same (exactly, if there is only Coulomb friction).
+    Half the dead zone is set to ``fraction`` times the static error, dry friction / kp. Coulomb friction is reduced by
+    the same fraction, so that the static error remains about the same (exactly, if there is only Coulomb friction).
     """
     rollouts, row, joints = problem.rollouts, problem.parameters.row, x.joints.clone()
     model = rollouts.model
@@ -87,14 +88,14 @@ def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) 
 
 
 def sliding_friction(friction: FrictionLaws, qd: Tensor, gravity: Tensor) -> Tensor:
-    """Return the mean of the dry friction magnitude of each joint over its path, (n,) [Nm, N].
+    """Return the magnitude of each joint's dry friction, averaged over the distance traveled, (n,) [Nm, N].
 
     Args:
         friction: friction model.
         qd: velocities, (..., n) [rad/s, m/s].
         gravity: gravity torques, (..., n) [Nm, N].
     """
-    speed = qd.abs() + 1e-9  # so that the mean of joints at rest is defined
+    speed = qd.abs() + 1e-9  # without 1e-9, the mean of a joint at rest would be 0 / 0
     dry = friction.prepare().dry(qd, gravity) * speed
     mean: Tensor = dry.flatten(0, -2).sum(dim=0) / speed.flatten(0, -2).sum(dim=0)
     return mean

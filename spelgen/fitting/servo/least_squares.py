@@ -1,8 +1,8 @@
 """Least-squares fits to windows: the initial guess of a servo fit, and the baseline of linear second-order servos.
 
-The initial guess is linear least squares on the command error. At a joint that a servo holds,
-kp (u - q) = kd qd + M qdd + gravity + friction. Divided by kp, the command error is linear in the unknown parameters,
-and its coefficient for the gravity torque of the URDF's masses is 1 / kp.
+The initial guess is the linear least-squares solution for the command error u - q. At a joint with a position servo,
+kp (u - q) = kd qd + M qdd + gravity + friction. The command error is therefore linear in the ratios of the parameters
+to kp. The gravity torque is computed with the URDF's masses: its coefficient is 1 / kp.
 """
 
 from functools import lru_cache
@@ -35,7 +35,8 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
     with torch.no_grad():
         is_known = servo.trained == 0
         factor = 1 / (compliance * servo.nominal_kp).clamp(min=1e-12)
-        # gravity determines kp of the joints that it loads; the nominal kp of other joints gets the median factor
+        # Gravity determines kp only at joints that carry a gravity load. At other joints, the nominal kp is multiplied
+        # by the median of the factors at joints with a gravity load.
         determined = ~is_known & (significance[:, 3] > TUNING.kp_significance)
         determined &= factor.log().abs() < np.log(TUNING.kp_range)
         common = factor[determined].median() if determined.any() else 1.0
@@ -46,8 +47,8 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
         armature = torch.maximum(kp * inertia - load.inertia.mean(dim=(0, 1)), smallest**3 * kp)
         model.raw_armature.copy_((armature / model.nominal_armature).log())
         friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=smallest).log())
-        # such logs determine only the sum of viscous friction and kd: it is fitted as kd. Parameters are logarithms
-        # relative to nominal friction: -6 is negligible, -2 is small
+        # Logs of positions determine only the sum of viscous friction and kd, which is fitted as kd. The friction
+        # parameters are logarithms of ratios to nominal friction: -6 is negligible friction, -2 is small friction.
         friction.raw_viscous.fill_(-6.0)
         friction.raw_saturation.fill_(-6.0)
         friction.raw_stribeck.fill_(-2.0)
@@ -55,17 +56,17 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
 
 
 def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the least-squares coefficients of each joint, and their ratios to the standard deviations, (n, 5) each.
+    """Return the least-squares coefficients of each joint, and coefficients / standard deviations, (n, 5) each.
 
-    The K samples of a window count as one independent error.
+    Errors within a window are correlated: the standard deviations count its K samples as one independent error.
 
     Args:
-        columns: (W, K, n, 5), the regressors.
-        errors: (W, K, n) [rad, m].
+        columns: (W, K, n, 5), the regressors of each joint.
+        errors: (W, K, n), command errors [rad, m].
     """
     matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, M, 5)
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
-    # gelsd: the pivots of torch's default driver are not deterministic
+    # gelsd, since torch's default driver chooses its pivots differently in each run
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution
     residual = target - matrix @ solution
     unscaled = torch.linalg.pinv(matrix.mT @ matrix).diagonal(dim1=-2, dim2=-1)
@@ -75,11 +76,14 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def fit_linear_servos(windows: ServoWindows) -> LinearServos:
-    """Fit the delay of the commands to all samples of windows, and a linear servo per joint to those after burn-in."""
+    """Return linear servos fitted to the samples after the burn-in, and a command delay fitted to all samples.
+
+    The command delay is for the baseline `DelayedCommand`, which predicts the delayed command as the position.
+    """
     q, qd = windows.q.numpy(), windows.qd.numpy()
     measured, dt = q[:, 1:], float(windows.dt.mean())
 
-    # finite differences change one of four unknowns at a time, three of which are not the delay
+    # cached: of the four unknowns that finite differences change in turn, only the delay changes the commands
     @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
         """Return the mean command of each interval, (W, K-1, n)."""
@@ -88,9 +92,9 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     def delayed_error(delay: float) -> float:
         return float(np.square(commands(delay) - measured).mean())
 
-    # commands change little within the bounds, so the error has one minimum
+    # a bounded scalar search suffices: commands change little within the bounds, so the error has one minimum
     late = minimize_scalar(delayed_error, bounds=(0, TUNING.max_delay), method="bounded").x
-    # logarithms of natural frequency and damping ratio, delay, offset
+    # unknowns: log of the natural frequency [rad/s], log of the damping ratio, delay [s], offset [rad, m]
     initial = (np.log(TUNING.frequency), 0.0, TUNING.initial_delay, 0.0)
     bounds = ((-np.inf, -np.inf, 0.0, -np.inf), (np.inf, np.inf, TUNING.max_delay, np.inf))
     fits = []

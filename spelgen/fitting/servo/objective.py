@@ -1,8 +1,9 @@
-"""The objective servo: fit position servos, friction and gravity load of an arm to positions under its commands.
+"""The objective servo: fit the position servos, friction and gravity load of an arm to commands and measured positions.
 
-The initial guess is the least-squares solution of the command error (`least_squares`). Outer iterations then minimize
-the error of predicted windows (`problem`): each recomputes the load of the bodies along the predicted motion and the
-scale of the errors. Dead zones are selected after the first iteration (`laws`); the last one uses all windows.
+The initial guess is the least-squares solution for the command error (`least_squares`). Three outer iterations then
+minimize the error of predicted windows (`problem`). Each iteration first computes the scale of the errors and the load
+of the bodies, along the measured motion in the first iteration and along the predicted motion in the others. Dead zones
+are selected after the first iteration (`laws`). The last iteration uses all windows.
 """
 
 import copy
@@ -34,15 +35,16 @@ from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
-# On few windows with half the integration steps; on few windows with dead zones; on all windows.
+# The first iteration uses few windows with half the integration steps; the second, few windows with the selected dead
+# zones; the third, all windows.
 OUTER_ITERATIONS = 3
 
 
 class ServoObjective(Objective):
     """A fit to all logs, without validation logs; it can be resumed at the start of each outer iteration.
 
-    The load and the scale of the errors are functions of the parameters at the start of an iteration and of the
-    iterations before it: these parameters are all that a checkpoint contains.
+    The load and the scale of the errors in an outer iteration are functions of the parameters at the start of this and
+    of all earlier outer iterations. A checkpoint therefore contains only these parameters and the initial weights.
     """
 
     name: ClassVar[str] = "servo"
@@ -50,7 +52,7 @@ class ServoObjective(Objective):
 
     def __init__(self, request: FitRequest) -> None:
         super().__init__(request)
-        self._iterates: list[ServoParameters] = []  # at the start of each outer iteration
+        self._iterates: list[ServoParameters] = []  # parameters at the start of each outer iteration
         self._steps = 0
 
     def prepare(self) -> PreparedLogs:
@@ -71,7 +73,7 @@ class ServoObjective(Objective):
         )
 
     def begin(self) -> list[Diagnostic]:
-        """Set the initial guess."""
+        """Set the model to the initial guess, and begin the first outer iteration."""
         self._since = time.monotonic()
         set_initial_guess(self.model, self._windows)
         self._set_up(copy.deepcopy(self.model.state_dict()))
@@ -79,7 +81,7 @@ class ServoObjective(Objective):
         return []
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Resume at the start of the last outer iteration."""
+        """Resume at the start of the outer iteration that was interrupted."""
         self._since = time.monotonic() - checkpoint["seconds"]
         state = checkpoint["servo"]
         self.model.load_state_dict(state["start"])
@@ -92,7 +94,7 @@ class ServoObjective(Objective):
         """See `Objective`."""
         while len(self._iterates) < OUTER_ITERATIONS:
             x = self._minimized(progress)
-            # dead zones are selected with fitted gains: before, wrong gains dominate the errors
+            # Dead zones are selected after the first iteration: with the initial gains, gain errors would dominate.
             select = select_dead_zones if len(self._iterates) == 1 else without_small_dead_zones
             self._begin_iteration(select(self._problem, x))
             save()
@@ -101,10 +103,10 @@ class ServoObjective(Objective):
         return "finished"
 
     def _minimized(self, progress: TrainingProgress) -> ServoParameters:
-        """Return the minimum of this outer iteration's cost."""
+        """Return the parameters that minimize the cost of the current outer iteration."""
         problem, number = self._problem, len(self._iterates)
         show = partial(_show_progress, progress, number)
-        # later iterations start near the minimum
+        # smaller damping in the second and third outer iteration, which start near the minimum
         damping = DAMPING.initial_damping if number == 1 else TUNING.later_damping
         result = levenberg_marquardt(
             problem,
@@ -119,7 +121,7 @@ class ServoObjective(Objective):
         return result.state.x
 
     def _finish(self, x: ServoParameters) -> None:
-        """Take one step with half the integration step, which corrects the integration error, and record the result."""
+        """Correct the integration error by one solver step with half the integration step size; record the result."""
         problem = self._problem.refined(2 * self._windows.steps, TUNING.last_difference_step)
         end, solved = solution(problem, x)
         problem.parameters.write(end)
@@ -129,32 +131,34 @@ class ServoObjective(Objective):
         self._update_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
 
     def _set_up(self, weights: Content) -> None:
-        """Prepare the rollouts of a model that has these weights: the prior mean."""
+        """Prepare the rollouts; weights: current state_dict of the model, which is the mean of the prior."""
         self._initial_weights = weights
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
-        # the standard deviation of an encoder's rounding error, of steps of at least 1e-5 rad
+        # standard deviation of the rounding error of encoders: step / sqrt(12), with a step of at least 1e-5 rad
         self._noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
         self._rollouts = ServoRollouts.of(self.model, self._windows.subsampled(TUNING.sparse_windows))
 
     def _begin_iteration(self, x: ServoParameters) -> None:
-        """Recompute the load and the likelihood at x for the next outer iteration."""
+        """Begin an outer iteration at parameters x: recompute the load and the likelihood."""
         rollouts = self._rollouts
         if len(self._iterates) == OUTER_ITERATIONS - 1:
             rollouts = replace(rollouts, windows=self._windows)
             rollouts = rollouts.linearized(x, self._windows.motion())
-        elif self._iterates:  # only the first iteration tolerates the integration error of half the steps
+        elif self._iterates:  # half the integration steps are accurate enough for the first iteration only
             rollouts = replace(rollouts, windows=replace(rollouts.windows, steps=self._windows.steps))
         if self._iterates:
             rollouts = rollouts.linearized(x, rollouts.predicted_motion(x))
         errors = rollouts.residual(x)
         self._rollouts, self._problem = rollouts, ServoProblem.of(rollouts, self._noise, errors)
-        rollouts.parameters.write(x)  # for the checkpoint: the model of an interrupted fit is usable
+        rollouts.parameters.write(
+            x
+        )  # the checkpoint contains these weights: an interrupted fit has a usable model
         self._iterates.append(x)
         self._first_steps = self._steps
         self._update_checkpoint(float(errors.square().mean().sqrt()))
 
     def _update_checkpoint(self, rms: float) -> None:
-        """Set the content of checkpoint.pt; rms: of the position errors [rad, m]."""
+        """Set the content of checkpoint.pt; rms: RMS position error [rad, m]."""
         self._make_checkpoint(rms, time.monotonic() - self._since, self._windows.steps, self._steps)
         self._checkpoint["servo"] = {
             "start": self._initial_weights,

@@ -1,4 +1,4 @@
-"""The parameters of a servo fit: a point, the map between points and a model, and their Gaussian prior."""
+"""The parameters of a servo fit: their values, the map from values to a model, and their Gaussian prior."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ STRIBECK_VELOCITY = "friction.raw_stribeck_velocity"
 class ServoParameters:
     """Values of the fitted parameters, k = p n + r + 1 numbers.
 
-    joints: (p, n), p parameters of each joint. bodies: (r,), coordinates along directions of the body parameters, in
-    prior standard deviations. delay: of the commands [s]. active: mask (p, n) of the joint parameters that are fitted;
-    dead zones are fitted only at joints that have one.
+    joints: (p, n), p parameters of each joint. bodies: (r,), coordinates along `ParameterMap.directions`, in prior
+    standard deviations. delay: delay of the commands [s]. active: (p, n), mask of the joint parameters that are fitted;
+    dead zones are fitted only at joints with a dead zone.
     """
 
     joints: Tensor
@@ -35,7 +35,7 @@ class ServoParameters:
     active: Tensor
 
     def after(self, step: Tensor) -> ServoParameters:
-        """Return the parameters after a step (k,); the delay is clamped at zero."""
+        """Return the parameters after a step (k,); the delay remains at least zero."""
         joints, bodies, delay = step.split([self.joints.numel(), len(self.bodies), 1])
         return replace(
             self,
@@ -54,20 +54,20 @@ class ServoParameters:
 class ParameterMap:
     """The map between `ServoParameters` and the tensors of a model, and the prior.
 
-    names: (p,) of the rows of `ServoParameters.joints`; a parameter with K numbers per joint has K rows. tensors: of
-    the model, by name. directions: (10 B, r) of the log-Cholesky parameters of B bodies. prior_mean: the parameters
-    that the model has when the map is made.
+    names: names of the p rows of `ServoParameters.joints`; a parameter with K numbers per joint has K rows. tensors:
+    joint parameters of the model, by name. directions: (10 B, r), the directions in the space of the log-Cholesky
+    parameters of B bodies that are fitted. prior_mean: parameters of the model when the map is made.
 
     Args:
-        model: is updated by `write`.
-        q: (M, n) positions of the logs [rad, m], which determine the directions.
+        model: the model, which `write` changes.
+        q: (M, n), positions of the logs [rad, m], from which the directions are computed.
     """
 
     def __init__(self, model: ArmModel, q: Tensor) -> None:
         self._model, self._n = model, model.n
         tensors = dict(model.named_parameters()) | dict(model.named_buffers())
-        # without raw_viscous: logs of positions determine only the sum of viscous friction and kd, which is fitted as
-        # kd
+        # raw_viscous is not fitted: logs of positions determine only the sum of viscous friction and kd, which is
+        # fitted as kd
         rows = [
             *(parameters_of_kind(model, group) for group in ("stiffness", "damping", "armature", "offset")),
             (COULOMB, "friction.raw_stribeck", STRIBECK_VELOCITY),
@@ -101,7 +101,7 @@ class ParameterMap:
         return named
 
     def write(self, x: ServoParameters) -> None:
-        """Set the parameters of the model."""
+        """Set the parameters of the model to x."""
         with torch.no_grad():
             for name, rows in self.named(x.joints.unsqueeze(0)).items():
                 self.tensors[name].copy_(rows[0, 0])
@@ -109,7 +109,7 @@ class ParameterMap:
             self._model.servo.delay.fill_(x.delay)
 
     def precision(self, x: ServoParameters) -> Tensor:
-        """Return the precision of the prior, (k,): inverse variances of independent parameters."""
+        """Return the precision of the prior, (k,): the inverse variances of the parameters, which are independent."""
         joints = torch.where(x.active, self._deviations, TUNING.fixed)
         shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
         return torch.cat([joints.flatten(), shared]) ** -2
@@ -130,13 +130,13 @@ class ParameterMap:
         return parameters
 
     def _body_directions(self, q: Tensor) -> Tensor:
-        """Return the directions (10 B, r) with the largest effect on gravity at q (M, n).
+        """Return the r directions of log-Cholesky parameters with the largest effect on gravity at q (M, n), (10 B, r).
 
-        They are right singular vectors of d gravity / d log-Cholesky parameters. The length of each is its prior
-        standard deviation.
+        The directions are right singular vectors of d gravity / d log-Cholesky parameters. The length of a direction is
+        the prior standard deviation along the direction.
         """
         zero = torch.zeros_like(q)
-        # not torch.func: its Jacobians import a compiler, which takes more than a second
+        # torch.func is not used: its Jacobians import torch's compiler, which takes more than a second
         slopes = jacobian(self._inertial, self._mean_bodies)
         with torch.no_grad():
             gravity = regressor_of(self._model.chain, q, zero, zero) @ slopes.reshape(

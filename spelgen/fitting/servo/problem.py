@@ -5,8 +5,9 @@ The cost is the negative log posterior of x, except for a constant,
     sum over joints and samples of 2 log(1 + (error / scale)^2 / 4) / samples_per_error + (x - m)^T P (x - m) / 2,
 
 with the density of Student's t for three degrees of freedom, and a Gaussian prior of mean m and precision P. Student's
-t bounds the influence of windows in which the arm is held, by a table for example. The scale is one per joint, and
-errors of neighbouring samples are correlated: samples_per_error samples count as one independent error.
+t bounds the influence of windows in which the arm is blocked, for example by a table. Each joint has one scale. Errors
+of neighbouring samples are correlated: samples_per_error samples count as one independent error. Shapes: W windows,
+K' samples after the burn-in, n joints, k parameters.
 """
 
 from __future__ import annotations
@@ -25,25 +26,29 @@ from spelgen.fitting.servo.tuning import TUNING
 
 @dataclass(frozen=True, eq=False)
 class Likelihood:
-    """Student-t likelihood of position errors. scale: (n,) [rad, m]. samples_per_error: (n,)."""
+    """Student-t likelihood of position errors.
+
+    scale: (n,), scale of the errors [rad, m]. samples_per_error: (n,), number of samples per independent error.
+    """
 
     scale: Tensor
     samples_per_error: Tensor
 
     @classmethod
     def of(cls, errors: Tensor, noise: Tensor, max_samples: int) -> Likelihood:
-        """Return the likelihood with the scale and the correlation of given errors.
+        """Return the likelihood with the scale and the correlation estimated from errors.
 
         Args:
-            errors: (W, K', n) [rad, m].
-            noise: (n,) lower bound of the scale [rad, m].
+            errors: (W, K', n), position errors [rad, m].
+            noise: (n,), lower bound of the scale [rad, m].
             max_samples: largest number of samples per independent error.
         """
         # 1.4826 times the median of |error| is the standard deviation of a Gaussian; outliers do not change the median
         scale = torch.maximum(1.4826 * errors.abs().flatten(0, 1).median(dim=0).values, noise)
         robust = errors / (1 + (errors / scale).square() / 4)
-        # The variance of a sum over a block of m samples is m times the variance of a sample for independent errors, up
-        # to m^2 times for equal ones: the ratio is the number of samples per independent error.
+        # The variance of the sum of m errors is m times the variance of an error if the errors are independent, and m^2
+        # times this variance if they are equal. The ratio of the sum's variance to m variances is therefore the number
+        # of samples per independent error.
         size = min(max_samples, errors.shape[1])
         blocks = robust[:, : errors.shape[1] // size * size].unflatten(1, (-1, size))
         of_sums = blocks.sum(dim=2).square().mean(dim=(0, 1))
@@ -56,16 +61,16 @@ class Likelihood:
         return costs.sum(dim=(0, 1))
 
     def weights(self, errors: Tensor) -> Tensor:
-        """Return weights (W, K', n) of errors (W, K', n), with which weighted least squares has the same gradient."""
+        """Return the weights (W, K', n) with which weighted least squares has the gradient of `costs` at the errors."""
         robust = 1 / (1 + (errors / self.scale).square() / 4)
         return robust / self.scale**2 / self.samples_per_error
 
 
 @dataclass(frozen=True, eq=False)
 class ServoProblem:
-    """Negative log posterior of `ServoParameters` for a given load and likelihood: a `LeastSquaresProblem`.
+    """A `LeastSquaresProblem`: negative log posterior of `ServoParameters` for a given load and likelihood.
 
-    noise: (n,) lower bound of the scale of the position errors [rad, m].
+    noise: (n,), lower bound of the scale of the position errors [rad, m].
     """
 
     rollouts: ServoRollouts
@@ -74,12 +79,12 @@ class ServoProblem:
 
     @classmethod
     def of(cls, rollouts: ServoRollouts, noise: Tensor, errors: Tensor) -> ServoProblem:
-        """Return the problem with the likelihood of given errors, (W, K', n) [rad, m]."""
+        """Return the problem with the likelihood estimated from errors (W, K', n) [rad, m]."""
         max_samples = max(1, round(TUNING.correlation_time * rollouts.windows.rate))
         return cls(rollouts, noise, Likelihood.of(errors, noise, max_samples))
 
     def reweighted(self, x: ServoParameters) -> ServoProblem:
-        """Return the problem with the likelihood of the errors at x."""
+        """Return the problem with the likelihood estimated from the errors at parameters x."""
         return self.of(self.rollouts, self.noise, self.residual(x))
 
     def refined(self, steps: int, difference_step: float) -> ServoProblem:
@@ -99,7 +104,7 @@ class ServoProblem:
         return self.rollouts.residual(x)
 
     def joint_costs(self, x: ServoParameters, errors: Tensor) -> Tensor:
-        """Return the cost per joint (n,) for errors (W, K', n), without the prior of shared parameters."""
+        """Return the cost per joint (n,) for errors (W, K', n), without the prior of parameters that joints share."""
         prior = self._prior(x)[: x.joints.numel()].view_as(x.joints)
         return self.likelihood.costs(errors) + prior.sum(dim=0)
 
@@ -114,7 +119,7 @@ class ServoProblem:
         return self.parameters.precision(x) * (x.flat - self.parameters.prior_mean.flat).square() / 2
 
     def candidates(self, x: ServoParameters, step: Tensor) -> Iterable[ServoParameters]:
-        """Return the parameters after a step (k,), which is clamped; see `LeastSquaresProblem`."""
+        """Return the parameters after a step (k,), whose components are clamped to at most `TUNING.max_step`."""
         return [x.after(step.clamp(-TUNING.max_step, TUNING.max_step))]
 
     def normal_equations(self, x: ServoParameters, errors: Tensor) -> NormalEquations:
@@ -122,7 +127,7 @@ class ServoProblem:
         return self.with_prior(self.window_equations(x, errors), x)
 
     def with_prior(self, windows: NormalEquations, x: ServoParameters) -> NormalEquations:
-        """Return the sum of normal equations of windows (W, k, k), (W, k), plus normal equations of the prior at x."""
+        """Return the sum of the normal equations of W windows, (W, k, k) and (W, k), and of the prior at x."""
         precision = self.parameters.precision(x)
         descent = windows.descent.sum(dim=0) - precision * (x.flat - self.parameters.prior_mean.flat)
         return NormalEquations(windows.curvature.sum(dim=0) + torch.diag(precision), descent)
@@ -135,7 +140,7 @@ class ServoProblem:
         curvature = torch.zeros(count, p * n + r, p * n + r).double()
         descent = torch.zeros(count, p * n + r).double()
         for joint in range(n):
-            # the errors of a joint depend on its own and on shared parameters only
+            # the errors of a joint depend only on the parameters of this joint and on shared parameters
             jacobian = torch.cat([of_joints[..., joint], of_shared[..., joint]]).transpose(0, 1)
             rows = torch.cat([torch.arange(p) * n + joint, p * n + torch.arange(r)])
             weighted = jacobian * weights[:, None, :, joint]  # (W, p + r, K')

@@ -1,7 +1,8 @@
 """Result of a servo fit: ratios to kp with confidence intervals, and the ratios that the logs do not determine.
 
-Errors are correlated within a motion, and by the form of the model even over a whole log. So each log is one block of
-a jackknife (see `jackknife_covariance`). A parameter that the logs do not determine keeps the interval of its prior.
+Errors are correlated within a motion. Errors due to the form of the model are correlated even over a whole log, so each
+log is one block of a jackknife (see `jackknife_covariance`). The interval of a parameter that the logs do not determine
+is the interval of its prior.
 """
 
 import math
@@ -30,8 +31,8 @@ RATIOS = {
     "static_error": ("static error", "rad, m"),
     "dead_zone": ("half dead zone", "rad, m"),
 }
-"""Label and unit of each ratio to kp. lag: kd / kp plus the delay. dry: mean dry friction of a joint in motion.
-static_error: the sum of dry / kp and half the dead zone."""
+"""Label and unit of each ratio to kp. lag: kd / kp plus the delay. dry: ratio of mean dry friction in motion to kp.
+static_error: the sum of dry and half the dead zone."""
 ABOUT = (
     "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "
     "sum of kd and viscous friction, which such logs do not distinguish. lag: the sum of kd/kp and the delay, one "
@@ -42,9 +43,10 @@ ABOUT = (
 
 @dataclass(frozen=True)
 class FitSummary:
-    """The result of a fit for people.
+    """Summary of a fit for the user.
 
-    text: for a terminal. listing: parameters with intervals. headline: the first figure and its name.
+    text: summary for a terminal. listing: table of the parameters with intervals. headline: the most important figure,
+    and the name of this figure.
     """
 
     text: str
@@ -56,8 +58,8 @@ class FitSummary:
 class ServoSolution:
     """Normal equations and covariance at the end of a fit, with the dead zones of all joints as free parameters.
 
-    blocks: normal equations of the B blocks of the logs, (B, k, k) and (B, k). precision: of the prior, (k,).
-    covariance: of the parameters, (k, k).
+    blocks: normal equations of the B blocks of the logs, (B, k, k) and (B, k). precision: (k,), precision of the prior.
+    covariance: (k, k), covariance of the parameters.
     """
 
     blocks: NormalEquations
@@ -66,49 +68,52 @@ class ServoSolution:
 
     @property
     def quantile(self) -> float:
-        """Half the width of an interval, in standard deviations."""
-        # of Student's t, since there are few blocks: a two-sided 95 % interval
+        """Half the width of a 95 % interval, in standard deviations."""
+        # the 97.5 % quantile of Student's t instead of the Gaussian, since there are few blocks
         return float(stdtrit(max(1, len(self.blocks.curvature) - 1), 0.975))
 
 
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
-    """Return the parameters after one more step from x, and the solution there.
+    """Return the parameters after one more step from x, and the solution at these parameters.
 
-    x: of a fit with longer integration steps than in `problem`. The step, the effect of the integration error, is
-    added to the covariance. The parameters remain x if the step raises the cost.
+    x is the result of a fit with longer integration steps than the steps of ``problem``. The step from x shows the
+    effect of the integration error: its outer product is added to the covariance. If the step raises the cost, the
+    parameters remain x.
     """
-    # dead zones of all joints: fixed at zero, they would make dry friction seem better determined
+    # The dead zones of all joints are free parameters here. With dead zones fixed at zero, dry friction would seem
+    # better determined than it is.
     free, errors = replace(x, active=torch.ones_like(x.active)), problem.residual(x)
     numbers = problem.rollouts.windows.blocks(TUNING.min_logs, TUNING.min_blocks)
     blocks = NormalEquations(*(_sums(x, numbers) for x in problem.window_equations(free, errors)))
     precision = problem.parameters.precision(free)
     step = problem.with_prior(blocks, x).step()
-    # at the end of the fit the gradients of all windows and of the prior add up to zero
+    # gradients after the step: the gradients of all blocks and of the prior then add up to zero
     blocks = blocks._replace(descent=blocks.descent - blocks.curvature @ step)
     end = x.after(step)
-    # a joint at the break-away torque: the errors are far from linear in the parameters
+    # The step may raise the cost if a joint is at its break-away torque: errors are then not linear in the parameters.
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # the step is the effect of half the integration step
+    # the step, the effect of the integration error, is included as one standard deviation
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
 def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
-    """Return the sums of terms (W, ...) over the windows of each block, (B, ...); numbers: of the blocks, (W,)."""
+    """Return the sums of terms (W, ...) over the windows of each block, (B, ...); numbers: (W,), block of a window."""
     return terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:]).index_add(0, numbers, terms)
 
 
 def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
-    """Test by variance inflation factors if the logs distinguish parameters from all others; return (m,) booleans.
+    """Return booleans (m,): whether the logs distinguish each of m parameters from all other parameters.
 
-    Derivatives of the errors with respect to a dead zone and to dry friction are proportional at joints without gravity
-    load: a linear approximation cannot separate the two.
+    The test is an upper bound of the variance inflation factor. For example, the derivatives of the errors with respect
+    to a dead zone and to dry friction are proportional at joints without gravity load, so that a linear approximation
+    cannot distinguish the two.
 
     Args:
         blocks: normal equations of B blocks, (B, k, k) and (B, k).
-        precision: of the prior, (k,).
-        indices: of the parameters in question, (m,).
+        precision: (k,), precision of the prior.
+        indices: (m,), indices of the m parameters.
     """
     curvature = blocks.curvature.sum(dim=0)
     inverse = torch.linalg.inv(curvature + torch.diag(precision))
@@ -117,10 +122,10 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
 
 
 def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
-    """Return the ratios to kp by name, (n,) each.
+    """Return the ratios to kp, the keys of `RATIOS` -> (n,).
 
     Args:
-        model: with position servos.
+        model: model with position servos.
         qd: velocities, (..., n) [rad/s, m/s].
         gravity: gravity torques, (..., n) [Nm, N].
     """
@@ -139,18 +144,19 @@ def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
 def ratios_with_deviations(
     problem: ServoProblem, solution: ServoSolution
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return the ratios to kp by name, and the standard deviations of their logarithms, (n,) each."""
+    """Return the keys of `RATIOS` -> ratios to kp, and standard deviations of the ratios' logarithms, (n,) each."""
     rollouts, parameters = problem.rollouts, problem.parameters
     tensors = {name: x.detach().clone().requires_grad_() for name, x in parameters.tensors.items()}
     qd, gravity = rollouts.motion.qd, rollouts.load.gravity
     values = evaluate_with(rollouts.model, tensors, lambda model: ratios(model, qd, gravity))
     p, n = parameters.prior_mean.joints.shape
-    # the parameters of each joint, and the delay, which all joints share: (p + 1, p + 1, n)
+    # covariance of each joint's parameters and of the delay, which is the last parameter: (p + 1, p + 1, n)
     index = torch.cat([torch.arange(p * n).view(p, n), torch.full((1, n), len(solution.covariance) - 1)])
     blocks = solution.covariance[index.unsqueeze(1), index.unsqueeze(0)]
     result = {}
     for name, value in values.items():
-        # the ratio of a joint depends on the parameters of this joint only: the gradient of the sum has all derivatives
+        # The ratio of a joint depends only on this joint's parameters and the delay, so one gradient of the sum over
+        # joints contains the derivatives of all joints.
         derivatives = torch.autograd.grad(
             value.sum(), list(tensors.values()), retain_graph=True, materialize_grads=True
         )
@@ -164,7 +170,8 @@ def ratios_with_deviations(
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
     """Return the content for config.json: delay [s], RMS errors [rad, m], and per joint kp and the ratios to kp.
 
-    Intervals are of 95 %. determined: whether an interval is narrower than a factor of `ServoTuning`.
+    The intervals are 95 % intervals. The key "determined" states whether the logs determine a ratio: its interval is
+    within a factor of `ServoTuning.max_factor`, and a dead zone is distinguished from dry friction.
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},
@@ -184,11 +191,11 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
         record: Content = {"joint": name, "kp": {"value": kp[joint], "known": not trained[joint]}}
         for ratio, (of_joints, deviations) in values.items():
             value = float(of_joints[joint])
-            if ratio == "dead_zone" and not value:  # not selected
+            if ratio == "dead_zone" and not value:  # no dead zone was selected
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
             factor = math.exp(min(half, 50.0))  # bounded: exp must not overflow
-            # the sum of dry friction and dead zone, the static error, is determined even if its terms are not
+            # The static error, the sum of dry friction and dead zone, may be determined even if its two terms are not.
             determined = factor < TUNING.max_factor and (distinct[joint] or ratio not in ("dry", "dead_zone"))
             record[ratio] = {
                 "unit": RATIOS[ratio][1],
@@ -222,7 +229,7 @@ def servo_summary(record: Content | None) -> FitSummary | None:
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
     listing = Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
-    # a dead zone that is open makes dry friction open, too, which is named
+    # An undetermined dead zone is omitted: dry friction of the same joint is then undetermined, too, and is named.
     names = [f"{RATIOS[column][0]} of {joint}" for column, joint in open_ratios if column != "dead_zone"]
     end = f"Not determined by these logs: {', '.join(names)}" if names else "All ratios are determined"
     delay = f"{1000 * record['delay']['value']:.1f} ms, +- {1000 * record['delay']['half']:.1f} ms"

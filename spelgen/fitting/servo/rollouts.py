@@ -19,12 +19,13 @@ from spelgen.fitting.servo.windows import BodyLoad, MidpointMotion, ServoWindows
 class ServoRollouts:
     """Rollouts of windows; each joint is integrated independently, under the load of the bodies along a fixed motion.
 
-    The load is computed once, for parameters x0: a change of the body parameters adds regressor (phi(x) - phi(x0)),
-    with the inertial parameters phi. Since joints are independent, one rollout in which a parameter is changed at all
-    joints gives the derivatives of all joints; parameters that joints share (body parameters, delay) need
-    one rollout each. All of them are one batch.
+    The load is computed once, for parameters x0: a change of the body parameters to x adds regressor (phi(x) - phi(x0))
+    to the load, with the inertial parameters phi. Since joints are independent, one rollout in which a parameter is
+    changed at all joints gives the derivatives of all joints. Each parameter that joints share (body parameters, delay)
+    needs a separate rollout. All rollouts form one batch.
 
-    motion, load, inertial: the fixed motion, the load, and phi(x0) (10 B,). difference_step: of finite differences.
+    motion: the fixed motion. load: load along this motion for x0. inertial: phi(x0), (10 B,). difference_step: step of
+    the finite differences.
     """
 
     model: ArmModel
@@ -37,7 +38,7 @@ class ServoRollouts:
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
-        """Return the rollouts under the load of the model along the measured motion."""
+        """Return the rollouts under the load that the model has along the measured motion."""
         q = windows.q.flatten(0, 1)
         parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()
@@ -45,7 +46,7 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Return the rollouts under the load at x along a motion; the model has the parameters x afterwards."""
+        """Return the rollouts under the load for parameters x along a motion. The model's parameters are set to x."""
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
         return replace(self, motion=motion, load=load, inertial=inertial)
@@ -55,20 +56,20 @@ class ServoRollouts:
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
-        """Return the measured motion, with the derivatives of the prediction; see `ServoWindows.motion`."""
+        """Return measured positions with derivatives from the rollouts at x; see `ServoWindows.motion`."""
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])
 
     def jacobian(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return derivatives of the residual with respect to joint and to shared parameters.
+        """Return the derivatives of the residual with respect to joint parameters and to shared parameters.
 
         Returns:
-            (p, W, K', n), with respect to the parameters of the same joint, zero if no joint has the parameter;
-            (r + 1, W, K', n), with respect to the coordinates of the bodies and the delay.
+            (p, W, K', n), with respect to the p parameters of the same joint; zero for parameters that are not fitted.
+            (r + 1, W, K', n), with respect to the r coordinates of the bodies and to the delay.
         """
-        rows = x.active.any(dim=1).nonzero().squeeze(-1)  # parameters that any joint has
+        rows = x.active.any(dim=1).nonzero().squeeze(-1)  # parameters that are fitted at one joint or more
         p, r, step = len(rows), len(x.bodies), self.difference_step
-        # one batch: unchanged, each joint parameter, each coordinate of the bodies, the delay
+        # the batch: no parameter changed; then each joint parameter, each body coordinate, and the delay changed
         joints = x.joints.expand(p + r + 2, -1, -1).clone()
         joints[torch.arange(p) + 1, rows] += step
         bodies = x.bodies.expand(p + r + 2, -1).clone()
@@ -83,19 +84,23 @@ class ServoRollouts:
         return of_joints, derivatives[p:]
 
     def _errors(self, q: Tensor) -> Tensor:
-        """Return errors after the burn-in (P, W, K', n) for positions (P, W, K, n)."""
+        """Return the errors (P, W, K', n) after the burn-in of P sets of predicted positions (P, W, K, n)."""
         first = self.windows.burn_in + 1
         return q[:, :, first:] - self.windows.q[:, first:]
 
     def _rollout_at(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return q and qd, (1, W, K, n)."""
+        """Return q and qd of the rollouts with parameters x, (1, W, K, n)."""
         commands = self.windows.commands(x.delay)
         return self._rollout(x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
 
     def _rollout(self, joints: Tensor, bodies: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
-        """Return q and qd (P, W, K, n) for parameters (P, p, n), (P, r) under commands (P, W, K-1, S, n)."""
+        """Return q and qd (P, W, K, n) for P sets of parameters.
+
+        joints: (P, p, n), joint parameters. bodies: (P, r), body coordinates. commands: (P, W, K-1, S, n) [rad, m], at
+        the S integration steps of each sample interval.
+        """
         tensors = {name: tensor.detach() for name, tensor in self.parameters.named(joints).items()}
-        # inference mode saves a tenth of the time of these many small operations
+        # inference mode saves 10 % of the time, since there are many small operations
         with torch.inference_mode():
             drives, armature = evaluate_with(
                 self.model, tensors, lambda model: (servo_drives(model), model.armature)
@@ -107,7 +112,11 @@ class ServoRollouts:
     def _integrate(
         self, drives: ServoDrives, armature: Tensor, added: Tensor, commands: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return q and qd (P, W, K, n); armature: (P, 1, n), added: load (P, W, K-1, n), commands as in `_rollout`."""
+        """Return q and qd (P, W, K, n).
+
+        armature: (P, 1, n). added: (P, W, K-1, n), change of the load by changed body parameters [Nm, N]. commands: see
+        `_rollout`.
+        """
         windows, load = self.windows, self.load
         h = windows.dt.unsqueeze(-1) / commands.shape[3]
         inertia, bias = load.inertia + armature.unsqueeze(-2), load.bias + added
@@ -116,7 +125,9 @@ class ServoRollouts:
         positions, velocities, state = [q], [qd], None
         for k in range(windows.q.shape[1] - 1):
             current = Load(inertia[:, :, k], bias[:, :, k], load.gravity[:, k], coupled=False)
-            if state is None:  # the initial friction state is unknown; its effect decays during the burn-in
+            if (
+                state is None
+            ):  # assumed balanced, since friction is not measured; the error decays in the burn-in
                 state = balanced(drives, q, qd, commands[:, :, k, 0], current)
             for u in commands[:, :, k].unbind(2):
                 state = advanced(drives, state, u, current, h[:, k])

@@ -5,111 +5,119 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ServoTuning:
-    """Constants of fits of position servos, by the file that reads them."""
+    """Constants of fits of position servos, grouped by the file that uses them."""
 
     # Windows that a fit predicts (`servo.windows`).
 
-    # [s] Length of a window: gravity and friction need as long to become visible, and longer windows diverge with the
-    # delay.
+    # [s] Length of a window. Effects of gravity and friction are not visible in shorter windows; in longer windows, an
+    # error of the delay makes predictions diverge.
     length: float = 4.0
     # [1] Smallest number of samples of a window.
     min_samples: int = 8
-    # [s] Burn-in at the beginning of a window, during which the friction state forms; its errors do not count.
+    # [s] Burn-in at the beginning of a window, during which the friction state forms. Errors in the burn-in are
+    # ignored.
     burn_in: float = 1.0
-    # [1] Largest number of windows, evenly spread: ten minutes of motion.
+    # [1] Largest number of windows, evenly spread over the logs: ten minutes of motion.
     count: int = 200
-    # [1] Samples whose load is computed at once, which bounds the memory.
+    # [1] Number of samples whose load is computed at once; it limits the memory.
     batch: int = 2**13
 
     # Standard deviations of the Gaussian prior, about the initial parameters (`servo.parameters`).
 
-    # [1] Logarithms of a joint's gains, armature and friction: a factor of seven.
+    # [1] Logarithms of a joint's gains, armature and friction: one standard deviation is a factor of seven.
     logarithm: float = 2.0
-    # [1] Logarithm of the Stribeck velocity: with a wider prior friction that decreases at any speed absorbs offsets.
+    # [1] Logarithm of the Stribeck velocity. With a wider prior, friction could decrease over the whole range of speeds
+    # and would then absorb offsets.
     stribeck_velocity: float = 1.0
-    # [rad, m] Half of a dead zone: gears of hobby servos have a few mrad.
+    # [rad, m] Half of a dead zone: dead zones of the gears of hobby servos are a few mrad.
     dead_zone: float = 0.02
     # [s] Delay of the commands.
     delay: float = 0.1
-    # [1] Log-Cholesky parameters of the bodies: 30 % in mass.
+    # [1] Log-Cholesky parameters of the bodies: one standard deviation is 30 % in mass.
     bodies: float = 0.3
-    # [1] Directions of the body parameters that are fitted, those with the largest effect on gravity; further ones
-    # stay within their prior.
+    # [1] Largest number of directions of the body parameters that are fitted: the directions with the largest effect on
+    # gravity. Other directions remain at the prior mean.
     body_directions: int = 6
-    # [1] Smallest effect of such a direction on gravity, relative to the largest effect.
+    # [1] Smallest effect of a fitted direction on gravity, relative to the largest effect.
     min_effect: float = 1e-3
-    # [1] Prior standard deviation of a parameter that is not fitted.
+    # [1] Prior standard deviation of a parameter that is not fitted: practically zero.
     fixed: float = 1e-9
 
     # Cost and its derivatives (`servo.problem`, `servo.rollouts`).
 
-    # [s] Largest correlation time of the errors; most measured ones are above 0.2 s.
+    # [s] Largest correlation time of the position errors; most measured correlation times are above 0.2 s.
     correlation_time: float = 0.5
-    # [1] Finite-difference step of the parameters: rollouts in double precision lose half of their digits.
+    # [1] Finite-difference step of the parameters: far above the rounding of rollouts, which lose half of the digits of
+    # double precision.
     difference_step: float = 1e-4
     # [1] Largest step of any parameter; most are logarithms.
     max_step: float = 1.0
-    # [1] Samples for the directions of the body parameters.
+    # [1] Number of samples from which the directions of the body parameters are computed.
     gravity_samples: int = 2000
 
     # Convergence (`servo.objective`).
 
-    # [1] Largest number of windows in all outer iterations but the last.
+    # [1] Largest number of windows in an outer iteration, except for the last, which uses all windows.
     sparse_windows: int = 32
     # [1] Largest number of steps of an outer iteration.
     steps: int = 12
-    # [1] Steps of the last outer iteration, on all windows: it starts near the minimum of few windows.
+    # [1] Largest number of steps of the last outer iteration, on all windows: it starts near the minimum, which was
+    # found on few windows.
     last_steps: int = 2
-    # Decrease of the cost below which an outer iteration, or the fit of a joint with and without dead zone, ends.
+    # [1] Decrease of the cost below which an outer iteration ends, or the fit of a joint with or without a dead zone.
     min_decrease: float = 0.01
-    # [1] Decrease relative to the cost below which an outer iteration ends: costs are high if the form of the model is
-    # wrong.
+    # [1] Decrease divided by the cost below which an outer iteration ends. The absolute threshold is too small for the
+    # high costs of a model whose form is wrong.
     min_relative_decrease: float = 1e-4
-    # [1] Damping of the first step of all outer iterations but the first; with 1e-3 kd has an error of 0.3 %.
+    # [1] Damping of the first step of the second and third outer iteration; with 1e-3, kd would have an error of 0.3 %.
     later_damping: float = 1e-5
-    # [1] Finite-difference step of the last derivatives: with shorter steps a joint that is about to slip seems
-    # determined.
+    # [1] Finite-difference step of the derivatives from which the covariance is computed. With a shorter step, the
+    # parameters of a joint that is about to slip would seem to be determined.
     last_difference_step: float = 1e-3
 
     # Selection of the joints that have a dead zone (`servo.laws`).
 
-    # [1] Initial dead zone, as a fraction of the static error.
+    # [1] Half the initial dead zone, as a fraction of the static error.
     dead_zone_fraction: float = 0.25
     # [1] Largest number of steps of the fit of a single joint.
     joint_steps: int = 6
-    # [1] Standard deviations by which a dead zone must be more probable; other friction effects need 3.
+    # [1] Significance of a selected dead zone, in standard deviations; other friction effects need 3.
     significance: float = 4.0
-    # [rad, m] Smallest dead zone: the step of a 12-bit encoder is 1.5e-3 rad.
+    # [rad, m] Smallest value of half a dead zone; for comparison, the step of a 12-bit encoder is 1.5e-3 rad.
     min_dead_zone: float = 1e-3
 
     # Intervals and identifiability of the fitted parameters (`servo.report`).
 
-    # [1] Smallest number of logs of which each is one block of the covariance: halves of one motion are not
-    # independent.
+    # [1] Smallest number of logs for which each log is one block of the jackknife. Logs are not divided then, since
+    # halves of one motion are not independent.
     min_logs: int = 3
-    # [1] Smallest number of blocks into which fewer logs are divided.
+    # [1] Smallest total number of blocks if there are fewer logs, which are divided.
     min_blocks: int = 6
-    # [1] Variance inflation above which two effects are indistinguishable; on SO-101s it is below 30 or above 90.
+    # [1] Variance inflation factor above which a parameter is not distinguished from others; on SO-101 arms, the factor
+    # is below 30 or above 90.
     variance_inflation: float = 50.0
-    # [1] Standard deviation of ratios due to the form of the friction model: `benchmarks/servo_recovery.py`.
+    # [1] Standard deviation of the ratios' logarithms due to the form of the friction model, from
+    # `benchmarks/servo_recovery.py`.
     model_deviation: float = 0.015
-    # [1] A value whose interval reaches beyond this factor is not determined.
+    # [1] Largest ratio between the upper end of an interval and the value; with a wider interval, the value counts as
+    # not determined.
     max_factor: float = 1.25
 
     # Initial guess and baseline (`servo.least_squares`).
 
-    # [1] Number of standard deviations above which kp is computed from the coefficient of gravity; large, since
-    # neighbouring windows are correlated.
+    # [1] Smallest coefficient of gravity, in standard deviations, from which kp is computed. The threshold is large,
+    # since neighbouring windows are correlated.
     kp_significance: float = 8.0
     # [1] Largest factor between the initial and the nominal kp (of the settings, or 2 efforts per radian).
     kp_range: float = 20.0
-    # Smallest dry friction as a fraction of nominal friction [1]. Its square and its cube are the smallest kd/kp [s]
-    # and armature/kp [s^2]: positive, since logarithms are fitted.
+    # [1] Smallest initial dry friction, as a fraction of nominal friction. The square and the cube of this number are
+    # the smallest initial kd/kp [s] and armature/kp [s^2]. All three are positive, since their logarithms are fitted.
     min_friction: float = 0.05
-    # [s] Upper bound of the delays of linear servos, and their initial delay.
+    # [s] Largest delay of linear servos.
     max_delay: float = 0.4
+    # [s] Initial delay of linear servos.
     initial_delay: float = 0.02
-    # [rad/s] Initial natural frequency; the initial damping ratio is 1.
+    # [rad/s] Initial natural frequency of linear servos; the initial damping ratio is 1.
     frequency: float = 20.0
 
 

@@ -1,7 +1,7 @@
-"""Windows of logs of commanded positions, and the load of the drives by the arm's bodies along a motion.
+"""Windows of logs of commanded positions, and the load that the arm's bodies put on the drives along a motion.
 
-The load is evaluated along the measured motion, so that a fit integrates each joint by itself: measured and predicted
-positions differ by about 0.01 rad, which changes the load by about 1 %.
+The load is evaluated at measured instead of predicted positions, so that a fit can integrate each joint independently.
+Measured and predicted positions differ by about 0.01 rad, which changes the load by about 1 %.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split
 
 
 class MidpointMotion(NamedTuple):
-    """q, qd and qdd (W, K-1, n) of windows, as means over the intervals between samples."""
+    """q [rad, m], qd and qdd, (W, K-1, n) each, at the midpoints between the samples of windows."""
 
     q: Tensor
     qd: Tensor
@@ -35,9 +35,9 @@ class MidpointMotion(NamedTuple):
 class ServoWindows:
     """W windows of K samples.
 
-    rows: of the logs, one entry per window. q, qd: (W, K, n) [rad, m, per second]; qd is smoothed. dt: (W, K-1) [s].
-    burn_in: number of samples at the start of each window, during which the friction state forms; their errors do not
-    count. steps: integration steps per sample interval.
+    rows: log and slice of samples of each window. q, qd: (W, K, n) [rad, m, per second]; qd is smoothed. dt: (W, K-1),
+    sample intervals [s]. burn_in: number of samples at the start of each window, during which the friction state forms;
+    errors of these samples are ignored. steps: number of integration steps per sample interval.
     """
 
     rows: tuple[LogRows, ...]
@@ -53,16 +53,16 @@ class ServoWindows:
         return float(1 / self.dt.mean())
 
     def subsampled(self, count: int) -> ServoWindows:
-        """Return at most `count` of the windows, evenly spread, with half the integration steps."""
+        """Return at most ``count`` windows, evenly spread, with half as many integration steps."""
         selection = slice(None, None, -(-len(self.q) // count))
         q, qd, dt = self.q[selection], self.qd[selection], self.dt[selection]
         return ServoWindows(self.rows[selection], q, qd, dt, self.burn_in, -(-self.steps // 2))
 
     def blocks(self, min_logs: int, min_blocks: int) -> Tensor:
-        """Return the number of the block of each window, (W,): errors are assumed independent between blocks.
+        """Return the block number of each window, (W,). Errors in different blocks are assumed to be independent.
 
-        Each log is one block if there are at least `min_logs`; fewer logs are divided into equal segments, at least
-        `min_blocks` in all.
+        Each log is one block if there are at least ``min_logs`` logs. Fewer logs are divided into equal segments; each
+        segment is one block, and there are at least ``min_blocks`` blocks in total.
         """
         names, log_numbers = np.unique([log.name for log, _ in self.rows], return_inverse=True)
         segments = 1 if len(names) >= min_logs else -(-min_blocks // len(names))
@@ -70,14 +70,15 @@ class ServoWindows:
         for number in range(len(names)):
             windows = np.flatnonzero(log_numbers == number)
             blocks[windows] += np.arange(len(windows)) * segments // len(windows)
-        # consecutive numbers: some segments of a log with fewer windows than segments are empty
+        # renumbered without gaps, since a log with fewer windows than segments has empty segments
         return torch.from_numpy(np.unique(blocks, return_inverse=True)[1])
 
     def motion(self, q: Tensor | None = None, qd: Tensor | None = None) -> MidpointMotion:
-        """Return the measured motion between samples.
+        """Return measured positions, velocities and accelerations at the midpoints between samples.
 
-        The derivatives of a prediction q, qd (W, K, n), if there is one, are used, plus smoothed derivatives of
-        measured minus predicted positions: smoothing then does not attenuate fast motion that is predicted.
+        By default, velocities and accelerations are smoothed derivatives of the measured positions. With a prediction
+        q, qd (W, K, n), they are derivatives of the prediction plus smoothed derivatives of measured minus predicted
+        positions: smoothing then does not attenuate fast motion that the prediction contains.
         """
         if q is None or qd is None:
             q = qd = torch.zeros_like(self.q)
@@ -88,22 +89,23 @@ class ServoWindows:
         return MidpointMotion(_midpoints(self.q), velocity, _midpoints(slow_qdd) + acceleration)
 
     def commands(self, delay: float) -> Tensor:
-        """Return the commands of ``delay`` [s] earlier, at the steps between samples, (W, K-1, S, n) [rad, m]."""
+        """Return the commands delayed by ``delay`` [s] at the S steps of each interval, (W, K-1, S, n) [rad, m]."""
         commands = [delayed_commands(log, rows, delay, self.steps) for log, rows in self.rows]
         return torch.from_numpy(np.stack(commands))
 
 
 def _midpoints(x: Tensor) -> Tensor:
-    """Return means of neighbouring samples, (W, K-1, n)."""
+    """Return the means of successive samples of x (W, K, n), (W, K-1, n)."""
     return x[:, 1:] / 2 + x[:, :-1] / 2
 
 
 def servo_windows(
     logs: Sequence[Trajectory], preprocessing: Preprocessing, count: int = TUNING.count
 ) -> ServoWindows:
-    """Return at most `count` windows, evenly spread over the logs; they are shorter if all logs are.
+    """Return at most ``count`` windows, evenly spread over the logs.
 
-    Raises LogError if all logs are too short.
+    The windows are shorter than `TUNING.length` if all segments between gaps are shorter. Raises LogError if all
+    segments are too short.
     """
     segments: list[Trajectory] = []
     for log in logs:
@@ -117,7 +119,7 @@ def servo_windows(
     for segment in segments:
         starts = range(0, len(segment) - length + 1, max(1, length - burn_in))
         rows += [(segment, slice(start, start + length)) for start in starts]
-    rows = rows[:: -(-len(rows) // count)]  # evenly spread: the first motions may not move all joints
+    rows = rows[:: -(-len(rows) // count)]  # not the first ones: they may not move all joints
     smooth_velocities = {id(segment): velocities(segment) for segment in segments if len(segment) >= length}
     columns = (
         [log.q[samples] for log, samples in rows],
@@ -125,16 +127,17 @@ def servo_windows(
         [np.diff(log.t[samples]) for log, samples in rows],
     )
     q, qd, dt = (torch.from_numpy(np.stack(column)) for column in columns)
-    # enough for the log with the longest interval between samples
+    # the number of integration steps is sufficient for the log with the longest sample interval
     return ServoWindows(tuple(rows), q, qd, dt, burn_in, max(steps_between(log) for log, _ in rows))
 
 
 class BodyLoad(NamedTuple):
-    """The load of the drives by the bodies, along the midpoints of windows.
+    """The load that the bodies put on the drives, at the midpoints between the samples of windows.
 
-    inertia: (W, K-1, n) diagonal of M without armature [kg m^2, kg]. bias: (W, K-1, n) [Nm, N], Coriolis, centrifugal
-    and gravity torque, plus the torque of M's other entries. gravity: (W, K-1, n) [Nm, N]. regressor: (W, K-1, n, 10
-    B), derivatives of the torque with respect to the inertial parameters of B bodies.
+    inertia: (W, K-1, n), diagonal of M without armature [kg m^2, kg]. bias: (W, K-1, n) [Nm, N], Coriolis, centrifugal
+    and gravity torque, plus the inertial torque of the off-diagonal entries of M. gravity: (W, K-1, n), gravity torque
+    [Nm, N]. regressor: (W, K-1, n, 10 B), derivatives of the torque with respect to the inertial parameters of B
+    bodies.
     """
 
     inertia: Tensor

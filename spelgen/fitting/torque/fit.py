@@ -2,7 +2,8 @@
 
 initial fit -> choice of the friction state -> choice of friction effects -> residual terms -> final fit
 
-The first iterations use a subset of the samples; residual terms are selected on more of them; the final fit uses all.
+The stages before the residual terms use a subset of the samples, residual terms are selected on a larger subset, and
+the final fit uses all samples.
 """
 
 from collections.abc import Sequence
@@ -37,12 +38,14 @@ from spelgen.settings.fits import Adaptation, GaussianPrior
 
 @dataclass(frozen=True, eq=False)
 class TorqueSolution:
-    """Result of a fit.
+    """Result of a torque fit.
 
-    rms_residual: (n,) root mean square torque residual [Nm, N]. steps, cost: of the solver, at the end. prior: its
-    estimated standard deviations. covariance: (K, K) of x. compensated: (n,) joints whose drives compensate friction.
-    correlation_time: (n,) of the torque errors [s]. held_out_nmse: (n,) mean squared error of held-out
-    segments, divided by the variance of the torque; torque_std: (n,) its root [Nm, N]. selected_terms: residual terms.
+    rms_residual: root mean square torque residual, (n,) [Nm, N]. steps: number of steps of the solver. cost: final
+    cost. prior: prior with the estimated standard deviations. covariance: covariance of the parameters x, (K, K).
+    torque_std: root mean square torque error of held-out segments, (n,) [Nm, N]. compensated: joints whose drives
+    compensate friction, (n,). correlation_time: correlation time of the torque errors, (n,) [s]. held_out_nmse: mean
+    squared error of held-out segments divided by the variance of the torque, (n,). selected_terms: the selected
+    residual terms.
     """
 
     rms_residual: np.ndarray
@@ -66,18 +69,19 @@ def fit_torque(
     """Set the parameters of a model of rigid bodies to their MAP estimate.
 
     Args:
-        model: its current parameters are the prior mean, except for friction larger than the drives' torque.
-        samples: torques as logged, (T, n) [Nm, N].
-        prior: standard deviations before the fit; None: default.
-        adapt: group of parameters to estimate, about their current values (see `TorqueFit`); residual terms, and the
-            prior widths of a load, are then fixed. None: all.
+        model: model whose current parameters are the prior mean; friction that exceeds the drives' torque is reduced
+            first.
+        samples: samples with torques as logged, (T, n) [Nm, N].
+        prior: initial standard deviations of the prior; None: default.
+        adapt: group of parameters to estimate (see `TorqueFit`); the prior mean is then their current values. Residual
+            terms, and the prior widths of a load, are then fixed. None: estimate all parameters.
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.of(samples, TUNING.decimation)
     samples = samples.subsampled(_max_samples(model))
     subset = samples.subsampled(TUNING.initial_samples)
     if adapt is None:
-        # not of an adapted model: its friction was fitted before
+        # The friction of an adapted model is not nominal but fitted, so it is not limited.
         limit_friction(model, subset.columns)
     if prior is None:
         prior = TUNING.priors[adapt] if adapt else GaussianPrior()
@@ -109,21 +113,23 @@ def _run_stages(
         return refine(initial_fit(problem), samples), ()
     model = problem.jacobian.model
     if model.elements:
-        # friction without state first: bristles would delay reversals of bodies that are far off
+        # The initial fit has rate-only friction: bristles delay the reversal of friction, which would be fitted to
+        # the errors of bodies that are still far off.
         model.friction.memoryless.fill_(1.0)
     estimate = initial_fit(problem)
     if model.elements:
         estimate = choose_friction_state(estimate)
-    # the errors of a wrong friction model last longer than those of the chosen one
+    # Correlation times are estimated after the choice of the friction model, since a wrong friction model has
+    # errors that last longer.
     estimate = with_correlation_time(choose_friction_effects(estimate), samples)
     selected: Sequence[SelectedTerm] = ()
     if residual_terms(model) is not None:
         estimate, selected = fit_residual_terms(estimate, samples.subsampled(TUNING.residual_samples))
-    # residual terms were selected on fewer samples
+    # The preceding stages used subsets: the final fit uses all samples.
     return refine(estimate, samples), selected
 
 
 def _max_samples(model: ArmModel) -> int:
-    """Return the maximum number of samples: their two regressors are kept in memory."""
+    """Return the maximum number of samples of a fit, whose two regressors are kept in memory."""
     numbers = 2 * model.n * model.inertial_parameters.numel()
     return max(TUNING.initial_samples, int(TUNING.regressor_bytes / (8 * numbers)))

@@ -30,9 +30,9 @@ LOGARITHMIC_GROUPS = ("armature", "sizes", "effects", "load_dependence")
 class _RegressorBlock(NamedTuple):
     """T samples with all factors of the torque that do not depend on the parameters.
 
-    speed, acceleration: (T, n) of the drives. regressor: (T, n, 10 B) of the joint torque. load_regressor: (T, n, 10
-    B) of the gravity torque on the drives. residual_torque, friction_factor: (T, n), torque of the residual terms and
-    their factor on friction.
+    speed, acceleration: speeds and accelerations of the drives, (T, n). regressor: regressor of the joint torque,
+    (T, n, 10 B). load_regressor: regressor of the gravity torque on the drives, (T, n, 10 B). residual_torque: torque
+    of the residual terms, (T, n) [Nm, N]. friction_factor: factor of the residual terms on friction, (T, n).
     """
 
     samples: SampleBlock
@@ -58,11 +58,11 @@ class TorqueJacobian:
     """Torque residual of a model on samples, and its derivatives with respect to all rigid parameters x (K,).
 
     The modelled joint torque is Y(q, qd, qdd) theta + C^T (friction + armature a), plus the torque of the residual
-    terms, with the inertial parameters theta of B bodies, and the speeds C qd and accelerations a of the drives. The
-    residual is the measured torque, G (tau - offset) plus friction compensation, minus the modelled torque. The
-    residual terms of the model are constant: they are evaluated when this object is created. `terms` are linear terms
-    in addition, which are eliminated by variable projection. Jacobians with respect to "theta (K,)" have the other
-    parameters as further columns (see `joint_rows`).
+    terms. Here theta are the inertial parameters of B bodies, and C qd and a are the speeds and accelerations of the
+    drives. The torque residual is the measured torque, which is G (tau - offset) plus friction compensation, minus the
+    modelled torque. The residual terms of the model are evaluated once, when this object is created. `terms` are
+    additional linear terms, which are eliminated by variable projection. In Jacobians with respect to "theta (K,)",
+    theta includes all other parameters (see `joint_rows`).
     """
 
     def __init__(
@@ -77,7 +77,8 @@ class TorqueJacobian:
         self._affects = self._motors != 0  # (n, n): whether a drive affects a joint's torque
         self._affected = self._affected_joints()
         self._colours = _colour(self._affects.double().mT @ self._affects.double() > 0)
-        # regressors do not depend on x: computed once; blocks limit the memory of the copies in `_compressed_jacobian`
+        # Regressors do not depend on x, so they are computed once. Blocks of samples limit the memory of the copies in
+        # `_compressed_jacobian`.
         self._blocks = [self._with_regressors(block) for block in samples.blocks(TUNING.block)]
 
     @cached_property
@@ -88,14 +89,14 @@ class TorqueJacobian:
     def squared_residual(self, x: torch.Tensor) -> torch.Tensor:
         """Return the sum of the squared torque residual per joint, (n,) [Nm^2, N^2].
 
-        For a joint with eliminated terms it includes the penalty of their weights. If motor gains are trained, the
-        residual is the one of the logged torque: joint torques are proportional to the gains, so their residual would
-        be smallest for gains of zero.
+        For a joint with eliminated terms the sum includes the penalty of their weights. If motor gains are trained, the
+        residual of the logged torque is used: the measured joint torque is proportional to the gains, so that the
+        residual of the joint torque could be reduced by gains near zero.
         """
         parameters = self.rigid.unflatten(x)
         with torch.no_grad():
             blocks = [self._torque_residual(parameters, block)[0] for block in self._blocks]
-        # concatenated: eliminated terms are linear maps of all samples of a joint
+        # Eliminated terms depend on all samples of a joint, so the blocks are concatenated.
         residual = torch.cat(blocks) * self.logged_scale(x)
         squared_residual = residual.square().sum(dim=0)
         for joint, terms in self.terms.items():
@@ -103,13 +104,13 @@ class TorqueJacobian:
         return squared_residual
 
     def logged_scale(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the logged torque per joint torque (n,), relative to the initial gains: 1 unless gains are trained."""
+        """Return initial gain / gain (n,), which scales joint torques as logged torques; 1 for fixed gains."""
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 
     def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
-        """Return `logged_scale`, (..., n), differentiable; parameters: one set, or (...) sets."""
+        """Return `logged_scale`, (..., n), differentiable; parameters: one set, or a batch (...) of sets."""
         ones = torch.ones(self.model.n).double()
-        for name in self.rigid.names("gains"):  # logarithms of joint torque per logged torque
+        for name in self.rigid.names("gains"):  # logarithms of the gains, joint torque / logged torque
             change = parameters[name] - self.rigid.initial[name]
             return ones.expand(*change.shape[:-1], -1).index_copy(-1, self._gain_rows, (-change).exp())
         return ones
@@ -123,15 +124,16 @@ class TorqueJacobian:
         if self.terms:
             rows = self._projected(rows)
         curvature, descent = linearization.normal_equations(rows, noise, len(x))
-        # the products are formed in theta and transformed once, (K, K) instead of (T, K)
+        # The products are computed with respect to theta and then transformed: this transforms matrices (K, K)
+        # instead of Jacobians (T, K).
         change = self.theta_jacobian(x)
         return change.mT @ curvature @ change, change.mT @ descent
 
     def joint_rows(self, x: torch.Tensor) -> Iterator[JointRows]:
-        """Yield the Jacobian of each joint and block with respect to theta (K,), at x (K,).
+        """Yield the Jacobian of each joint and block of samples with respect to theta (K,), at x (K,).
 
-        theta is x with the inertial parameters in place of their log-Cholesky parameters: there the Jacobian is the
-        regressor, without a derivative to compute. `theta_jacobian` is d theta / d x.
+        theta is x with inertial parameters in place of log-Cholesky parameters. The Jacobian with respect to inertial
+        parameters is the regressor, so that no derivative need be computed. `theta_jacobian` is d theta / d x.
         """
         parameters, scale = self.rigid.unflatten(x), self.logged_scale(x)
         body_columns = self._of_bodies.nonzero()[:, 0]
@@ -139,7 +141,7 @@ class TorqueJacobian:
         for block in self._blocks:
             residual, parameter_columns, load_columns = self._compressed_jacobian(parameters, block)
             for joint, colour in enumerate(self._colours):
-                # decompression: the columns of this joint are the ones of the parameters that affect its torque
+                # decompression: keep only the columns of the parameters that affect the torque of this joint
                 affecting, drives = self._affected[:, joint], self._affects[:, joint]
                 loads = load_columns[colour][:, drives].unsqueeze(-1) * block.load_regressor[:, drives]
                 bodies = scale[joint] * block.regressor[:, joint] + loads.sum(dim=1)
@@ -148,7 +150,7 @@ class TorqueJacobian:
                 yield JointRows(joint, columns, jacobian, residual[:, joint])
 
     def _projected(self, rows: Iterable[JointRows]) -> Iterator[JointRows]:
-        """Yield the rows of each joint after variable projection of its terms, over all blocks."""
+        """Yield the rows of each joint, concatenated over all blocks, after variable projection of its terms."""
         for of_joint in concatenate_blocks(rows, self.model.n):
             terms = self.terms.get(of_joint.joint)
             if terms is None:
@@ -160,8 +162,8 @@ class TorqueJacobian:
     def theta_jacobian(self, x: torch.Tensor) -> torch.Tensor:
         """Return d theta / d x, (K, K): block diagonal over bodies, identity for all other parameters."""
         parameters = self.rigid.unflatten(x)
-        # ten copies of the bodies' parameters, so that one reverse pass has the gradients of all ten entries of theta:
-        # copy k receives the gradient of the k-th entry
+        # With ten copies of the bodies' parameters one reverse pass computes the gradients of all ten inertial
+        # parameters: copy k receives the gradient of the k-th one.
         copies = parameters[self.rigid.bodies].expand(10, -1, -1).detach().requires_grad_()
         with torch.enable_grad():
             theta = self._inertial_parameters({**parameters, self.rigid.bodies: copies})
@@ -172,7 +174,7 @@ class TorqueJacobian:
         return change
 
     def residual_samples(self, x: torch.Tensor) -> ResidualSamples:
-        """Return all samples with the torque residual and the friction torque at x (K,)."""
+        """Return all samples with the torque residual and the friction torque for parameters x (K,)."""
         parameters, blocks = self.rigid.unflatten(x), []
         with torch.no_grad():
             for block in self._blocks:
@@ -187,12 +189,13 @@ class TorqueJacobian:
 
         Args:
             x: (K,) parameters, at which the torque is linearized.
-            noise: (n,) standard deviations [Nm, N].
+            noise: (n,) standard deviations of the torque noise [Nm, N].
             covariance: (K, K) posterior covariance of x.
         """
         change = self.theta_jacobian(x)
         covariance = change @ covariance @ change.mT
-        # theta, not x: the torque is linear in inertial parameters, so that the projection also holds for large torques
+        # The projection uses theta, not x: the torque is linear in inertial parameters, so that the projection is also
+        # valid for large torques.
         rows = concatenate_blocks(self.joint_rows(x), len(noise))
         gains = []
         for joint, columns, _, _ in rows:
@@ -200,23 +203,23 @@ class TorqueJacobian:
         return RigidProjection(tuple(of_joint.jacobian for of_joint in rows), tuple(gains))
 
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Return parameters (K,) after a step (K,) that is straight where the torque is linear.
+        """Return parameters (K,) after a step (K,), straight in the quantities in which the torque is linear.
 
         Inertial parameters are updated along a straight line (see `step_in_inertial_parameters`). A coefficient c whose
-        logarithm is a parameter is updated to c (1 + step) if it increases, and to c exp(step) if it decreases, so that
-        c remains positive.
+        logarithm is a parameter is updated to c (1 + step) for a positive step, and to c exp(step) for a negative one,
+        so that c remains positive.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
         for name in self.rigid.names(*LOGARITHMIC_GROUPS):
-            # log(c + c step) = log c + log1p(step): the same to first order, and straight in c
+            # log(c + c step) = log c + log1p(step): equal to log c + step to first order, and a straight line in c
             parameters[name] = (
                 parameters[name]
                 - change[name]
                 + torch.minimum(change[name], change[name].clamp(min=0).log1p())
             )
         moved = step_in_inertial_parameters(self.rigid.unflatten(x)[bodies], change[bodies])
-        # a body without a step keeps its parameters to the last digit
+        # A body whose step is zero keeps its parameters exactly, without rounding errors.
         changed = change[bodies].any(dim=-1, keepdim=True)
         parameters[bodies] = torch.where(changed, moved, parameters[bodies])
         return self.rigid.flatten(parameters)
@@ -225,7 +228,7 @@ class TorqueJacobian:
         model, q, qd, qdd = self.model, block.q, block.qd, block.qdd
         zero = torch.zeros_like(q)
         with torch.no_grad():
-            # the friction model has the load of gravity only, not of acceleration
+            # Load-dependent friction depends on the gravity torque only, so accelerations are zero here.
             gravity_regressor = regressor_of(model.chain, q, zero, zero)
             return _RegressorBlock(
                 samples=block,
@@ -238,7 +241,7 @@ class TorqueJacobian:
             )
 
     def _affected_joints(self) -> torch.Tensor:
-        """Return a mask (K', n) of the joints whose torque depends on each of the K' parameters except the bodies'."""
+        """Return a mask (K', n): whether a joint's torque depends on each of the K' parameters except the bodies'."""
         masks = []
         for name, tensor in self.rigid.initial.items():
             if name == self.rigid.bodies:
@@ -259,7 +262,7 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return measured minus modelled joint torque, and the friction torque of the drives, both (T, n) [Nm, N].
 
-        load: (T, n) gravity torque on the drives; None: of these parameters.
+        load: gravity torque on the drives, (T, n); None: compute it from the parameters.
         """
         samples = block.samples
 
@@ -279,14 +282,15 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
         """Return the residual of the logged torque (T, n), and minus its Jacobian, compressed over joints.
 
-        Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive get
-        the same colour, so that each parameter affects at most one joint of a colour. The gradient of the sum of their
-        torques then has the rows of all of them, and there are as many reverse passes as colours, mostly one, instead
-        of n. Each sample has its own copy of the parameters: one pass has the gradients of all samples.
+        Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive may
+        have the same colour. Each parameter then affects at most one joint of a colour, so that the gradient of the sum
+        of the torques of one colour contains the Jacobian rows of all its joints. One reverse pass per colour (mostly
+        one) replaces n passes. Each sample has its own copy of the parameters, so that a pass computes the gradients of
+        all samples.
 
-        The second result has (T, K') per colour, with respect to the K' parameters except the bodies'; the third has
-        (T, n), with respect to the load on each drive. A gradient of several outputs at once (`is_grads_batched`)
-        would import torch's symbolic shapes, half a second.
+        The second result has a matrix (T, K') per colour, for the K' parameters that are not of bodies. The third has a
+        matrix (T, n) per colour, for the load on each drive. A gradient of several outputs at once (`is_grads_batched`)
+        would import torch's symbolic shapes, which takes half a second.
         """
         copies = {}
         for name, tensor in parameters.items():
@@ -307,7 +311,7 @@ class TorqueJacobian:
 
 
 def _colour(coupled: torch.Tensor) -> list[int]:
-    """Return a colour per joint, different for any two joints that are coupled (n, n): greedy, in order."""
+    """Return a colour per joint, different for coupled joints, by the greedy algorithm; coupled: mask (n, n)."""
     colours: list[int] = []
     for row in coupled.tolist():
         used = {colour for colour, shared in zip(colours, row, strict=False) if shared}

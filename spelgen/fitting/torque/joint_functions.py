@@ -1,8 +1,8 @@
 """Residual terms of single joints: torques and friction factors as linear models on samples, and their fit.
 
-Candidates are fitted after the rigid-body and friction model, which absorbs a part of a torque of position such as a
-spring. Such features are therefore compared after orthogonalization against the Jacobian of that model: a partial
-regression (Frisch and Waugh, Econometrica 1:387, 1933).
+Residual terms are fitted to the residual of the rigid-body and friction model. This model has already absorbed a part
+of a position-dependent torque such as a spring. The features of such torques are therefore orthogonalized against the
+Jacobian of the model: a partial regression (Frisch and Waugh, Econometrica 1:387, 1933).
 """
 
 from collections.abc import Collection, Iterator
@@ -29,25 +29,28 @@ TermKey = tuple[str, int | None]
 
 ALL = slice(None)
 TORQUE, FRICTION, RIPPLE = "raw_torque_splines", "raw_friction_splines", "raw_torque_ripple"
-LOG_FACTOR_LIMIT = 0.99 * LARGEST  # of friction's log factor: at LARGEST its parameter is infinite
+LOG_FACTOR_LIMIT = 0.99 * LARGEST  # limit of the log friction factor: LARGEST needs an infinite parameter
 
 
 @dataclass(frozen=True, eq=False)
 class JointFunction:
     """A residual term of one joint, as a linear model of P = L + W weights on T samples.
 
-    The model's parameter has W entries for the joint, in units of `scale`. Of the P weights the first L belong to
-    trends over these entries (a straight line over all splines), the columns of `trends`, the others to the entries.
+    The model's parameter has W entries for the joint, in units of `scale`. The first L of the P weights are
+    coefficients of trends over these entries, for example of a straight line over all splines. The other W weights are
+    the entries.
 
-    position: (T,) of the joint [rad, m].
+    position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
-    features: (T, P), the columns after orthogonalization; the columns themselves if the term is a friction factor.
+    features: (T, P) columns after orthogonalization; equal to the columns if the term is a friction factor.
     direction: (n,) joint torques per torque of the term.
-    groups: (P,) index of the weights' group, which has one prior precision.
-    friction: (T,) friction torque, with the current factor; the weights are then the ones of the factor's logarithm,
-        and columns @ weights is the torque linearized at the current factor. None: the term is a torque.
-    visit_length: mean number of samples per visit of a position: a new visit begins after a motion by the spacing of
-        the splines.
+    trends: (W, L) entries of each trend.
+    groups: (P,) index of the group of each weight; a group has one prior precision.
+    friction: (T,) friction torque with the current factor, if the term is a friction factor: the weights then give the
+        logarithm of the factor, and columns @ weights is the torque linearized at the current factor. None: the term
+        is a torque.
+    visit_length: mean number of samples per visit of a position. A new visit begins when the joint has moved by the
+        spacing of the splines.
     """
 
     parameter: str
@@ -63,7 +66,7 @@ class JointFunction:
     visit_length: float
 
     def read(self, terms: ResidualTerms) -> torch.Tensor:
-        """Return weights (P,) that represent the model's current parameter."""
+        """Return weights (P,) that represent the current parameter of the model."""
         if self.friction is not None:
             entries = terms.friction_logarithms()[self.joint]
         else:
@@ -71,50 +74,53 @@ class JointFunction:
         return F.pad(entries.detach(), (self.trends.shape[1], 0))
 
     def write(self, terms: ResidualTerms, weights: torch.Tensor) -> None:
-        """Set the model's parameter to weights (P,)."""
+        """Set the parameter of the model to the values that weights (P,) represent."""
         count = self.trends.shape[1]
-        # a trend has no parameter of its own in the model, only a prior of its own in the fit
+        # Trends have a separate prior in the fit but no separate parameter in the model: add them to the entries.
         entries = self.trends @ weights[:count] + weights[count:]
         if self.friction is not None:
-            # inverse of the model's tanh, which bounds the factor
+            # The model bounds the log factor by a tanh: invert it.
             entries = LARGEST * (entries.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT) / LARGEST).atanh()
         with torch.no_grad():
             terms.get_parameter(self.parameter)[self.joint] = entries / self.scale
 
     def torque(self, weights: torch.Tensor, rows: slice | torch.Tensor = ALL) -> torch.Tensor:
-        """Return the torque (T,) [Nm, N] of weights (P,) on the samples of these rows; of a factor: its change."""
+        """Return the torque (T,) [Nm, N] for weights (P,) at the samples `rows`; for a friction factor, its change."""
         features = self.features[rows]
         if self.friction is None:
             return features @ weights
         friction = self.friction[rows]
-        # columns are splines times friction: at zero friction 0 / 0 is replaced by a log factor of zero
+        # The columns are splines times friction, so the log factor is 0 / 0 at zero friction: replace it by zero.
         log_factor = (features @ weights.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT)) / friction
         return friction * log_factor.nan_to_num().expm1()
 
     def target(self, torque_residual: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Return the torque (T,) of the term that explains a residual (T, n) best, weighted by 1 / noise^2, (n,)."""
-        # least squares over the joints: coupled drives put one friction into several torques
+        """Return the torque (T,) that this term should have to explain a torque residual (T, n) best; noise: (n,)."""
+        # Weighted least squares over the joints, since the friction of a coupled drive acts on several joints.
         weight = self.direction / noise.square()
         return (torque_residual @ weight) / (self.direction @ weight)
 
     def fit(
         self, target: torch.Tensor, correlation_length: float, rows: slice | torch.Tensor = ALL
     ) -> BayesianRidge:
-        """Return the fit to a target (T,) on the samples of these rows: samples of one visit count as one error."""
+        """Return the fit to a target (T,) at the samples `rows`; samples of one visit count as one error."""
         samples = append_target(self.features[rows], target[rows])
-        # a function of position has the same error during one visit of a position, however long the visit lasts
+        # The error of a function of position is constant during a visit of a position, however long the visit lasts.
         length = max(correlation_length, self.visit_length)
         return bayesian_ridge(samples.mT @ samples, len(samples), self.groups, length)
 
 
 class ProjectedTerms(NamedTuple):
-    """Position-dependent torques, eliminated in a fit: the linear terms per joint, and the candidates they join."""
+    """Position-dependent torques that are eliminated in a fit.
+
+    terms: linear terms per joint. candidates: the residual terms whose columns the linear terms concatenate.
+    """
 
     terms: dict[int, LinearTerms]
     candidates: tuple[JointFunction, ...]
 
     def write(self, model: ArmModel, torque_residual: torch.Tensor) -> None:
-        """Set the model's residual terms to the weights eliminated at a torque residual (T, n)."""
+        """Set the residual terms of the model to the eliminated weights for a torque residual (T, n)."""
         weights = {joint: terms.weights(torque_residual[:, joint]) for joint, terms in self.terms.items()}
         for candidate in self.candidates:
             joint, count = candidate.joint, candidate.columns.shape[1]
@@ -131,13 +137,13 @@ def refit_terms(
 ) -> ProjectedTerms:
     """Refit the selected terms to the current torque residual, one after the other.
 
-    Friction factors are written to the model. Torques of position are set to zero in the model and returned as linear
-    terms with the fitted penalty: their weights are eliminated in the next fit of the rigid-body parameters.
+    Friction factors are written to the model. Position-dependent torques are set to zero in the model and returned as
+    linear terms with the fitted penalty; the next fit of the rigid-body parameters eliminates their weights.
 
     Args:
         model: model with residual terms.
-        samples: torque residual of the model with its current terms.
-        projection: of the rigid-body and friction model.
+        samples: samples with the torque residual of the model and its current terms.
+        projection: projection onto the rigid-body and friction model.
         selected: terms to refit.
         correlation_length: (n,) number of samples per independent error.
     """
@@ -146,7 +152,7 @@ def refit_terms(
     torques = []
     for candidate in joint_functions(model, samples, projection, selected):
         current = (candidate.features @ candidate.read(model.residuals)).unsqueeze(-1) * candidate.direction
-        # one after the other, each with the latest values of the others (backfitting)
+        # backfitting: each term is fitted to the residual of all other terms with their latest values
         target = candidate.target(residual + current, noise)
         fit = candidate.fit(target, float(correlation_length[candidate.joint]))
         weights = fit.coef
@@ -159,7 +165,8 @@ def refit_terms(
                 columns = torch.cat([terms[joint].features, columns], dim=1)
                 penalty = torch.cat([terms[joint].penalty, penalty])
             terms[joint] = LinearTerms(columns, penalty)
-            # its weights are eliminated: a copy in the model would count twice
+            # The weights of this torque will be eliminated, so the torque in the model must be zero, or it would
+            # count twice.
             weights = torch.zeros_like(weights)
         candidate.write(model.residuals, weights)
     return ProjectedTerms(terms, tuple(torques))
@@ -171,17 +178,17 @@ def joint_functions(
     projection: RigidProjection,
     selected: Collection[TermKey] | None = None,
 ) -> Iterator[JointFunction]:
-    """Yield the candidates per joint: smooth torque, friction factor, ripple; None: all, else the selected ones.
+    """Yield the candidate terms of each joint (smooth torque, friction factor, ripple), or only the selected ones.
 
-    The weights of smooth torques and friction factors have one prior precision, the ones of ripple one per frequency.
-    The straight line of smooth torques has a precision of its own: it extrapolates to positions without samples, as
-    springs do.
+    The weights of a smooth torque or a friction factor have one common prior precision; the weights of ripple have one
+    per frequency. The straight line of smooth torques has a separate precision, since it extrapolates to positions
+    without samples, as the torque of a spring does. selected: terms to yield; None: all.
     """
     terms, motors = model.residuals, motors_of(model)
     with torch.no_grad():
         splines, ripple = terms.splines(samples.q), terms.revolute * terms.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), terms.unit.flatten()
-    # number of visits: path length divided by the spacing of the splines
+    # number of visits of positions = 1 + path length / spacing of the splines
     visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
     one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
     line = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1)
@@ -217,6 +224,6 @@ def joint_functions(
 
 
 def rms_per_joint(torque_residual: torch.Tensor) -> torch.Tensor:
-    """Return the root mean square per joint (n,) of a torque residual (T, n), positive also without a residual."""
+    """Return the root mean square (n,) of a torque residual (T, n); it is positive even if the residual is zero."""
     rms = torque_residual.square().mean(dim=0).sqrt()
     return rms.clamp(min=1e-12 * float(rms.max()) + 1e-300)

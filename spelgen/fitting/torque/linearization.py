@@ -1,4 +1,4 @@
-"""Linearized torque per joint: rows of the Jacobian, normal equations, projections, and Bayesian ridge regression."""
+"""Linearized joint torques: Jacobian rows, normal equations, projections, and Bayesian ridge regression."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,8 @@ import torch.nn.functional as F
 class JointRows(NamedTuple):
     """Jacobian rows of one joint's torque: residual(theta + s) = residual - jacobian @ s[columns].
 
-    columns: (C,) parameters on which this torque depends. jacobian: (T, C). residual: (T,) [Nm, N].
+    columns: indices of the C parameters on which the torque of the joint depends. jacobian: derivatives of the torque
+    with respect to these parameters, (T, C). residual: torque residual, (T,) [Nm, N].
     """
 
     joint: int
@@ -23,14 +24,14 @@ class JointRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LinearTerms:
-    """Linear terms of one joint's torque, eliminated by variable projection.
+    """Linear terms of one joint's torque, whose weights are eliminated by variable projection.
 
-    With the features F (T, P) and the diagonal penalty D (P,), the weights are the ridge solution w(r) for the residual
-    r of all other parameters: w = (F^T F + D)^-1 F^T r. The cost |r - F w(r)|^2 + |D^1/2 w(r)|^2 depends on the other
-    parameters only. It is the square of a residual that is linear in r, whose Jacobian is this linear map of the
-    Jacobian of r, since F does not depend on these parameters (Golub and Pereyra, SIAM J. Numer. Anal. 10:413, 1973).
+    features: F, (T, P). penalty: diagonal D of the penalty on squared weights, (P,), in squares of the torque.
 
-    penalty: of squared weights, in squares of the torque.
+    Let r be the torque residual of all other parameters. The weights are the ridge solution w(r) = (F^T F + D)^-1 F^T
+    r. The cost |r - F w(r)|^2 + |D^1/2 w(r)|^2 then depends only on the other parameters. It is the square of a vector
+    that is linear in r. F does not depend on the other parameters, so the same linear map turns the Jacobian of r into
+    the Jacobian of this vector (Golub and Pereyra, SIAM J. Numer. Anal. 10:413, 1973).
     """
 
     features: torch.Tensor
@@ -38,8 +39,8 @@ class LinearTerms:
 
     @cached_property
     def ridge(self) -> torch.Tensor:
-        """Ridge estimator (P, T): weights per torque."""
-        # small (P, P): one factorization serves all columns of the Jacobian
+        """Matrix (P, T) that maps a torque (T,) to the ridge solution (P,)."""
+        # The matrix (P, P) is small; one factorization is used for all columns of the Jacobian.
         gram = self.features.mT @ self.features + self.penalty.diag()
         ridge: torch.Tensor = torch.linalg.solve(gram, self.features.mT)
         return ridge
@@ -49,7 +50,10 @@ class LinearTerms:
         return self.ridge @ torque
 
     def residual(self, torque: torch.Tensor) -> torch.Tensor:
-        """Return the ridge residual (T + P, ...) of a torque (T, ...): torque residual, then penalties' roots."""
+        """Return the vector (T + P, ...) whose square is the ridge cost of a torque (T, ...).
+
+        The first T entries are the torque residual, the others the weights times the roots of their penalties.
+        """
         weights = self.weights(torque)
         return torch.cat([torque - self.features @ weights, self.penalty.sqrt().diag() @ weights])
 
@@ -60,9 +64,10 @@ NO_TERMS: Mapping[int, LinearTerms] = {}
 class RigidProjection(NamedTuple):
     """Projection of joint torques onto the rigid-body and friction model, per joint.
 
-    jacobian: (T, C) with respect to theta (see `TorqueJacobian.joint_rows`). posterior_gain: (C, C), the posterior
-    covariance of theta divided by the noise variance: posterior_gain @ jacobian^T @ torque is the change of theta by
-    which a fit would absorb a torque (T,) on this joint.
+    jacobian: for each joint, derivatives (T, C) of its torque with respect to the C entries of theta that affect it
+    (see `TorqueJacobian.joint_rows`). posterior_gain: for each joint, the posterior covariance (C, C) of these entries
+    divided by the noise variance: posterior_gain @ jacobian^T @ torque is the change of theta by which a fit would
+    absorb an additional torque (T,) on this joint.
     """
 
     jacobian: tuple[torch.Tensor, ...]
@@ -74,17 +79,18 @@ class RigidProjection(NamedTuple):
         return torque - jacobian @ (self.posterior_gain[joint] @ (jacobian.mT @ torque))
 
     def errors(self, residual: torch.Tensor, size: int) -> torch.Tensor:
-        """Return the errors of the torque per segment, (S, size, n) [Nm, N], from the residual (S size, n) of a fit.
+        """Return the torque errors of S segments, (S, size, n) [Nm, N], from the residual (S size, n) of a fit.
 
-        The errors of a segment are (1 - H)^(-1/2) residual, with its block H of the hat matrix: the covariance of
-        independent errors is then that of the noise, however many parameters were fitted (Bell and McCaffrey, Survey
-        Methodology 28:169, 2002).
+        A fit reduces the residual below the errors. The correction is (1 - H)^(-1/2) residual, with the segment's block
+        H of the hat matrix: if errors are independent, the corrected residual has the covariance of the noise for any
+        number of parameters (Bell and McCaffrey, Survey Methodology 28:169, 2002).
         """
         errors: torch.Tensor = residual.unflatten(0, (-1, size)).clone()
         for joint, (jacobian, gain) in enumerate(zip(self.jacobian, self.posterior_gain, strict=True)):
             rows = jacobian.unflatten(0, (-1, size))
             values, vectors = torch.linalg.eigh(torch.eye(size).double() - rows @ gain @ rows.mT)
-            # at least one sample's error remains of a segment that determines many parameters
+            # Eigenvalues are near zero if the segment determines many parameters: the lower bound limits the
+            # correction.
             scale = values.clamp(min=1 / size).rsqrt().unsqueeze(-1)
             errors[..., joint] = (vectors @ (scale * (vectors.mT @ errors[..., joint : joint + 1])))[..., 0]
         return errors
@@ -110,9 +116,9 @@ def normal_equations(
     """Return J^T W J (K, K) and J^T W r (K,) with W = 1 / noise^2.
 
     Args:
-        rows: of all joints and blocks.
-        noise: (n,) standard deviations [Nm, N].
-        count: K, number of parameters.
+        rows: Jacobian rows of all joints and blocks.
+        noise: (n,) standard deviations of the torque noise [Nm, N].
+        count: number K of parameters.
     """
     curvature, descent = torch.zeros(count, count).double(), torch.zeros(count).double()
     for joint, columns, jacobian, residual in rows:
@@ -126,16 +132,17 @@ def least_squares_residual(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return squared residual (n,) and effective number of parameters per joint (n,) of unconstrained least squares.
 
-    The number is the trace of the joint's block of the hat matrix J (J^T W J)^+ J^T W.
+    The effective number of a joint is the trace of its block of the hat matrix J (J^T W J)^+ J^T W, W = 1 / noise^2.
 
     Args:
-        rows: of all joints and blocks.
-        noise: (n,) standard deviations [Nm, N], which weight the joints.
+        rows: Jacobian rows of all joints and blocks.
+        noise: (n,) standard deviations of the torque noise [Nm, N], which weight the joints.
         free: (K,) mask of the parameters.
     """
     curvature, descent = normal_equations(rows, noise, len(free))
     inverse = torch.zeros_like(curvature)
-    # pseudo-inverse: bodies have directions that no torque depends on, and there is no prior here
+    # There is no prior here, and some directions of the inertial parameters affect no torque: use the
+    # pseudo-inverse.
     inverse[free[:, None] & free] = _pseudo_inverse(curvature[free][:, free]).flatten()
     step = inverse @ descent
     squared_residual, gamma = torch.zeros(2, len(noise)).double()
@@ -146,11 +153,11 @@ def least_squares_residual(
 
 
 def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
-    """Return the pseudo-inverse (K, K) of a curvature (K, K), scaled to a unit diagonal for the rank decision."""
+    """Return the pseudo-inverse (K, K) of a curvature (K, K); the rank is decided after scaling to a unit diagonal."""
     length = curvature.diagonal().sqrt()
     scale = torch.where(length > 0, 1 / length, 0.0)
     scale = scale * scale[:, None]
-    # directions with less curvature than the rounding of products of sums are not determined by the samples
+    # Eigenvalues below the rounding errors of the sums of products are treated as zero.
     inverse: torch.Tensor = torch.linalg.pinv(curvature * scale, rtol=1e-10, hermitian=True)
     return inverse * scale
 
@@ -158,9 +165,10 @@ def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
 class BayesianRidge(NamedTuple):
     """Result of `bayesian_ridge` for P weights in G groups.
 
-    coef: (P,), the ridge solution for this penalty. penalty: (P,) of squared weights, lambda / alpha times the
-    correlation length, in squares of the target. alpha: precision of the noise. lambda_: (G,) precisions of the
-    weights. gamma: (G,) effective number of weights. n_iter, converged: of the fixed-point iteration.
+    coef: weights, which are the ridge solution for `penalty`, (P,). penalty: penalty on the squared weights, (P,),
+    equal to lambda / alpha times the correlation length, in squares of the target. alpha: precision of the noise.
+    lambda_: precision of the weights of each group, (G,). gamma: effective number of weights of each group, (G,).
+    n_iter, converged: number of fixed-point iterations, and whether they converged.
     """
 
     coef: torch.Tensor
@@ -177,8 +185,8 @@ def bayesian_ridge(
 ) -> BayesianRidge:
     """Fit a linear model, target = features @ coef + noise, with one prior precision per group of weights.
 
-    MacKay, Bayesian Interpolation, Neural Computation 4:415 (1992), in the words of scikit-learn's `BayesianRidge`: the
-    noise precision alpha and the weights' precisions lambda maximize the marginal likelihood.
+    MacKay, Bayesian Interpolation, Neural Computation 4:415 (1992), with the names of scikit-learn's `BayesianRidge`:
+    the noise precision alpha and the precisions lambda of the weights maximize the marginal likelihood.
 
     With the k weights w of a group and their posterior covariance S, one iteration is lambda = gamma / |w|^2,
     gamma = k - lambda tr S, and 1 / alpha = |target - features @ coef|^2 / count. MacKay divides by count - gamma: with
@@ -195,8 +203,7 @@ def bayesian_ridge(
     excited = gram.diagonal() > 0
     size, variance = member.sum(dim=0), square / count  # variance: 1 / alpha
     feature_square = (member.mT @ gram.diagonal() / count / size).clamp(min=1e-300)
-    # initially each group has 10 % of the variance of the target
-    # a start at zero weights would be a fixed point
+    # Zero weights would be a fixed point. Initially each group therefore explains 10 % of the variance of the target.
     lambda_ = 10 * feature_square * size / max(variance, 1e-300)
     n_iter, converged = 0, False
     while n_iter < 30 and not converged:
@@ -209,7 +216,7 @@ def bayesian_ridge(
         lambda_ = (gamma / (member.mT @ coef.square()).clamp(min=1e-300)).clamp(max=1e14)
         residual_square = square - float(2 * coef @ moment - coef @ gram @ coef)
         previous, variance = variance, max(residual_square, 1e-12 * square) / count
-        converged = abs(variance - previous) < 1e-3 * previous  # the noise needs three digits
+        converged = abs(variance - previous) < 1e-3 * previous  # three digits of the noise suffice
     return BayesianRidge(coef, penalty, 1 / max(variance, 1e-300), lambda_, gamma, n_iter, converged)
 
 

@@ -1,4 +1,4 @@
-"""Networks fitted to torques by L-BFGS: models of networks, and the networks of residual terms, which are selected."""
+"""Fit of networks to torques by L-BFGS: whole models of networks, and selected networks as residual terms."""
 
 import copy
 from collections.abc import Callable, Iterator
@@ -26,7 +26,7 @@ ADAPTED_PARTS: dict[Adaptation, tuple[str, ...]] = {
     "unit": ("",),
 }
 """Prefixes of the names of the weights that an adaptation fits."""
-BLOCK = 2**16  # samples in memory at a time, with the intermediate results that their gradient needs
+BLOCK = 2**16  # samples per block: gradients need all intermediate results of a block in memory
 
 
 def fit_networks(
@@ -39,22 +39,23 @@ def fit_networks(
     """Minimize the mean squared torque error of a model over its weights; return the number of evaluations.
 
     Args:
-        model: its weights that require a gradient are fitted.
-        samples: torques as logged, (T, n) [Nm, N]; errors are divided by the standard deviation of each joint's torque.
+        model: model whose weights that require a gradient are fitted.
+        samples: samples with torques as logged, (T, n) [Nm, N]; errors are divided by the standard deviation of each
+            joint's torque.
         weight_decay: see `LBFGS`.
-        penalty: is added to the loss, for example the distance from a URDF.
+        penalty: function that returns a term added to the loss, for example the distance from a URDF.
         evaluations: maximum number of evaluations of the loss.
     """
     count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
-    # joints of constant torque would have infinite weight
+    # joints of constant torque would have an infinite weight
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def summands() -> Iterator[torch.Tensor]:
         for number, (q, qd, qdd, tau, *_) in enumerate(samples.blocks(BLOCK)):
             error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
             cost = error.mean() if count <= BLOCK else error.sum() / (count * joints)
-            # once, not per block: the loss is a mean over all samples
+            # The loss is a sum over blocks: add the penalty once, not per block.
             if number == 0 and penalty is not None:
                 cost = cost + penalty()
             yield cost
@@ -73,10 +74,10 @@ def adapt_networks(
 
     Args:
         model: fitted model.
-        samples: torques as logged, (T, n) [Nm, N].
-        adapt: part of the model, see `ADAPTED_PARTS`.
-        weight_decay: factor of half the squared change of the weights, which is added to the loss: weights that these
-            samples do not determine are unchanged.
+        samples: samples with torques as logged, (T, n) [Nm, N].
+        adapt: name of the adapted part of the model, see `ADAPTED_PARTS`.
+        weight_decay: the loss includes this factor times half the squared change of the weights, so that weights that
+            the samples do not determine are unchanged.
         evaluations: maximum number of evaluations of the loss.
     """
     fitted = {name: x for name, x in model.named_parameters() if name.startswith(ADAPTED_PARTS[adapt])}
@@ -99,18 +100,18 @@ def select_networks(
     """Fit and select the network of the potential, then the network of the mass matrix.
 
     Args:
-        model: model with residual terms, whose networks are set.
-        samples: torque residual of the model with its current terms.
+        model: model with residual terms; weights of accepted networks are written to it.
+        samples: samples with the torque residual of the model and its current terms.
         correlation_length: number of samples per independent error.
     """
-    # the time of L-BFGS is proportional to the samples, which are correlated
+    # The time of L-BFGS is proportional to the number of samples. They are correlated, so a subset suffices.
     step = -(-len(samples.q) // SELECTION.network_samples)
     subset = ResidualSamples(*(column[::step] for column in samples))
-    # the target of all residual terms together, single-joint terms included
+    # The target is the torque of all residual terms together, single-joint terms included.
     with torch.no_grad():
         current = residual_torque(model, *subset[:3])
     subset = subset._replace(torque_residual=subset.torque_residual + current)
-    # the potential first: it needs no accelerations, which are the noisiest column
+    # The potential is first because it does not depend on accelerations, which are the noisiest signals.
     terms = model.residuals
     networks = {"residual_potential": list(terms.potential.parameters()) if terms.potential else []}
     networks["residual_mass"] = [terms.raw_constants, *(terms.mass.parameters() if terms.mass else ())]
@@ -128,7 +129,8 @@ def _fit_network(
 ) -> float | None:
     """Fit one network if, fitted to the first half, it lowers the error on the last half; return the error reduction.
 
-    Otherwise the network keeps its weights. samples: as torque residual the target of all residual terms together.
+    A rejected network keeps its initial weights. samples: samples whose torque residual is the target of all residual
+    terms together.
     """
     initial, residual = copy.deepcopy(network.state_dict()), _remaining_residual(model, samples)
     noise = rms_per_joint(residual)
@@ -144,7 +146,7 @@ def _fit_network(
         minimise(network, lambda: [cost()], evaluations, weight_decay=1.0)
 
     first, last = split_halves(len(samples.q), correlation_length)
-    # most networks explain nothing, which a few evaluations show
+    # A few evaluations of the loss show whether the network explains anything; most networks do not.
     for evaluations in (SELECTION.network_probe_evaluations, SELECTION.network_evaluations):
         fit(first, evaluations)
         error = _remaining_residual(model, samples)
@@ -153,7 +155,7 @@ def _fit_network(
         if after.sum() >= before.sum():
             break
     network.load_state_dict(initial)
-    # an accepted network is fitted again, to all samples
+    # The network is accepted: fit it to all samples.
     if reduction is not None:
         fit(ALL, SELECTION.network_evaluations)
     model.zero_grad(set_to_none=True)

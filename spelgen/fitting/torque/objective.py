@@ -32,7 +32,7 @@ from spelgen.logs.windows import thinned
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import TorqueFit
 
-SAMPLES = 5  # per validation window
+SAMPLES = 5  # number of samples per validation window
 FITTED = {
     "load": "only a load at the tip fitted",
     "friction": "only friction and torque offsets fitted",
@@ -41,13 +41,13 @@ FITTED = {
 
 
 class TorqueObjective(Objective):
-    """Fit to torques, which takes seconds to minutes: `begin` runs all of it, before there is a run folder."""
+    """Objective of a fit to torques: `begin` runs the whole fit, in seconds to minutes, before a run folder exists."""
 
     name: ClassVar[str] = "torque"
     config: TorqueFit
 
     def prepare(self) -> PreparedLogs:
-        """See `Objective`."""
+        """Return the prepared logs, after estimates of motor couplings and torque delay; see `Objective`."""
         preprocessing, self._delay = self.request.preprocessing, NO_DELAY
         self._coupling_notes: list[Diagnostic] = []
         if isinstance(self.model, RigidBodyDynamics):
@@ -59,7 +59,7 @@ class TorqueObjective(Objective):
                 self._delay = late
                 preprocessing = replace(preprocessing, torque_delay=late.delay)
                 self.request = replace(self.request, preprocessing=preprocessing)
-        # windows are for validation only: few suffice
+        # Windows are used for validation only, so a few suffice.
         stride = -(-sum(map(len, self.request.logs)) // TUNING.max_windows)
         self.data = prepare_data(self.request, SAMPLES, stride)
         return self.data
@@ -77,13 +77,13 @@ class TorqueObjective(Objective):
                 do="fit windows: the objective rollout",
             )
         regularizer = None
-        # rigid bodies have a prior of their own at the URDF
+        # The fit of rigid-body models has a prior at the URDF, so they need no regularizer.
         if self.config.urdf_weight and not isinstance(model, RigidBodyDynamics):
             regularizer = urdf_regularizer(self.request.urdf, model, self.data.training, notes)
         fit_notes, solution = fit_torques(model, samples, self.config, regularizer)
         self.results = {"notes": [note.message for note in fit_notes]}
         notes += fit_notes
-        # residual terms that were not selected are zero, and take time
+        # Residual terms that were not selected are zero: remove them to save time.
         subset = replace(self.data, validation=thinned(self.data.validation, TUNING.validation_windows))
         validation = Validation(without_idle_residuals(model), subset, self.request.options.device)
         substeps = validation.substeps()
@@ -94,7 +94,7 @@ class TorqueObjective(Objective):
             self._checkpoint["posterior"] = {
                 "covariance": solution.covariance,
                 "torque_std": solution.torque_std,
-                # the interval of a delay is of 99 %
+                # half width of a 99 % interval -> standard deviation
                 "delay_std": self._delay.interval / 2.576,
             }
         return notes
@@ -114,7 +114,7 @@ def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
 
 
 def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:
-    """Return the delay of the torques relative to the positions in these logs, from the bodies of a model."""
+    """Return the delay of the torques relative to the positions in the logs, from the regressor of a model."""
     with torch.no_grad():
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
     drives = Drives(inputs, motors_of(model).numpy())
@@ -122,15 +122,15 @@ def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Pre
 
 
 def couple_motors(model: ArmModel, coupling: Coupling, remaining: float) -> Diagnostic:
-    """Add a coupling to the motors of a model and its specification, and return the warning about it.
+    """Add a motor coupling to a model and its specification, and return the warning about the coupling.
 
-    Without it the friction of a coupled wrist would be attributed to the bodies (TX40: torque nMSE 1.1 instead of
-    0.02).
+    Without the coupling, the friction of a coupled wrist would be attributed to the bodies (TX40: torque nMSE 1.1
+    instead of 0.02).
 
     Args:
-        model: its motor of `coupling.joint` drives this joint only.
-        coupling: that logs of joint torques show.
-        remaining: squared torque residual of both joints with the coupling, relative to the one without it.
+        model: model in which the motor of `coupling.joint` drives this joint only.
+        coupling: coupling that was detected in logs of joint torques.
+        remaining: squared torque residual of both joints with the coupling, divided by the residual without it.
     """
     speeds = motors_of(model).clone()
     speeds[coupling.joint, coupling.moved_by] = coupling.ratio
@@ -146,7 +146,7 @@ def couple_motors(model: ArmModel, coupling: Coupling, remaining: float) -> Diag
 
 
 def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
-    """Return the samples of all logs, validation included; None if no log has moving samples at a sufficient rate."""
+    """Return the samples of all logs, validation included; None if no log has motion at a sufficient sample rate."""
     decimation, reach = 1, bristle_reach(model)
     if isinstance(model, RigidBodyDynamics):
         decimation = TUNING.decimation
@@ -164,7 +164,7 @@ def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
 def fit_torques(
     model: ArmModel, samples: TorqueSamples, config: TorqueFit, regularizer: UrdfRegularizer | None = None
 ) -> tuple[list[Diagnostic], TorqueSolution | None]:
-    """Fit the model to samples; return the notes of the fit, and its solution for a model of rigid bodies."""
+    """Fit a model to samples; return the notes of the fit, and the solution if the model is of rigid bodies."""
     notes: list[Diagnostic] = []
     solution = None
     if isinstance(model, RigidBodyDynamics):

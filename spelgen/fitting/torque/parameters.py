@@ -1,9 +1,9 @@
 """Parameters of rigid bodies, drives and friction, which a fit to torques estimates, as one vector x (K,).
 
-Their prior is Gaussian, with x before the fit as mean. Inertial parameters of different links are independent. Friction
-and armatures are derived from the effort limits of the drives, and their errors have a common factor (torques before or
-after the gear, one make of gears): the standard deviation common to all joints is therefore larger than the one of a
-single joint.
+The prior of x is Gaussian; the mean is x before the fit. Inertial parameters of different links are independent.
+Nominal friction and armatures are derived from the effort limits of the drives, and their errors have a common factor
+(torques before or after the gear, gears of one manufacturer). The standard deviation of this common factor is therefore
+larger than the standard deviation of the deviations of single joints.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ RIGID_GROUPS = (
 """Groups of parameters (see `ParameterInfo`) of bodies, drives and friction; all others are of residual terms."""
 DAY_GROUPS = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
 """Groups that differ from day to day."""
-NEGLIGIBLE = -30.0  # logarithm of a friction coefficient that is practically zero
+NEGLIGIBLE = -30.0  # logarithm of a negligible friction coefficient
 
 
 class ParameterVector:
     """Maps the parameters of bodies, drives and friction of a model to one vector x (K,), and back.
 
-    groups: parameter group per name. initial: values when this object was created.
+    groups: parameter group of each name. initial: parameters by name when this object was created.
     """
 
     def __init__(self, model: ArmModel) -> None:
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         self.groups: dict[str, str] = {}
-        self._tensors: dict[str, torch.Tensor] = {}  # parameters, and buffers that a fit may set
+        self._tensors: dict[str, torch.Tensor] = {}  # parameters, and buffers that a fit may change
         self.initial: dict[str, torch.Tensor] = {}
         for name, info in parameter_table(model).items():
             if info.kind in RIGID_GROUPS:
@@ -54,7 +54,7 @@ class ParameterVector:
         self._lengths = [tensor.numel() for tensor in self.initial.values()]
 
     def names(self, *groups: str) -> list[str]:
-        """Return the names of the parameters of these groups."""
+        """Return the names of the parameters of the given groups."""
         return [name for name, group in self.groups.items() if group in groups]
 
     def unflatten(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -73,7 +73,7 @@ class ParameterVector:
                 self._tensors[name].copy_(values)
 
     def mask(self, *groups: str) -> torch.Tensor:
-        """Return a mask (K,) of the parameters of these groups."""
+        """Return a mask (K,) of the parameters of the given groups."""
         tensors = self.initial.items()
         return (
             self.flatten({name: torch.full_like(x, self.groups[name] in groups) for name, x in tensors}) > 0
@@ -83,8 +83,8 @@ class ParameterVector:
         """Return a mask (K,) of the parameters that a fit estimates.
 
         Args:
-            adapt: "load": the last body; "friction": `DAY_GROUPS`; None or "unit": all.
-            compensated: (n,) joints with a friction compensation, which is fixed at all others.
+            adapt: "load": only the last body is free; "friction": only `DAY_GROUPS`; None or "unit": all groups.
+            compensated: (n,) joints whose friction compensation is free; it is fixed at all other joints.
         """
         if adapt == "load":
             free = self.mask()
@@ -105,14 +105,15 @@ def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
 def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
     """Limit the nominal friction of each drive to the standard deviation of its torque in the samples.
 
-    Nominal friction is derived from the effort limits of the URDF, which are placeholders in many files. Torque offsets
-    have its unit: they would be confounded with gravity if it were far too large.
+    Nominal friction is derived from the effort limits of the URDF, which are placeholders in many files. The prior
+    width of torque offsets is proportional to nominal friction: if it is far too large, offsets are confounded with
+    gravity.
     """
     rigid, motors = ParameterVector(model), motors_of(model)
     with torch.no_grad():
         drive_torque = joint_torque(model, samples) @ torch.linalg.inv(motors)
         limit = drive_torque.std(dim=0) / model.friction.nominal
-        # the torque of a drive at rest, or of a drive without torque, has no information on its friction
+        # Drives at rest and drives without torque have no information on their friction: do not limit it.
         informative = (limit > 0) & ((samples.qd @ motors.mT).abs().amax(dim=0) > MIN_SPEED)
         limit = torch.where(informative, limit, torch.inf)
         scale = limit.clamp(max=1.0)
@@ -126,12 +127,13 @@ def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
 
 
 def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-    """Return log-Cholesky parameters (B, 10) after a step that is straight in the inertial parameters.
+    """Return log-Cholesky parameters (B, 10) after a step along a straight line in the inertial parameters.
 
-    The torque is linear in the inertial parameters, not in their log-Cholesky parameters: a Gauss-Newton step that is
-    straight in the latter deviates from the line along which it was computed. With the pseudo-inertia C S C^T,
-    S = T T^T and T = T(raw), the step changes T by X = dT/draw step, and S to first order by
-    T (T^-1 X + (T^-1 X)^T) T^T. This change is added to S, reduced by a factor if S would lose positive definiteness.
+    The torque is linear in the inertial parameters, but not in the log-Cholesky parameters. The linear model of a
+    Gauss-Newton step is therefore exact along this line, but not along a straight line in the log-Cholesky parameters.
+    The pseudo-inertia is C S C^T with S = T T^T and T = T(raw). To first order the step changes T by X = dT/draw step,
+    and S by T (T^-1 X + (T^-1 X)^T) T^T. This change is added to S. It is reduced by a factor if S would not remain
+    positive definite.
 
     Args:
         raw: (B, 10) log-Cholesky parameters of B bodies.
@@ -140,7 +142,8 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
     row, column = torch.triu_indices(4, 4)
     parameters, change = torch.zeros(2, len(raw), 4, 4).double()
     parameters[:, row, column], change[:, row, column] = raw, step
-    # complex-step derivative: exact to the last digit; forward mode would import torch's compiler, which takes seconds
+    # A complex-step derivative has no truncation error. Forward mode would import torch's compiler, which takes
+    # seconds.
     epsilon = 1e-100
     perturbed = body_factor(torch.complex(parameters, epsilon * change))
     factor, factor_change = perturbed.real, perturbed.imag / epsilon
@@ -181,11 +184,12 @@ SHARED = {
 class ParameterPrior:
     """Prior of the parameters x: Gaussian, and Student's t for the parameters of each body.
 
-    The links of a URDF are not equally wrong. In a Gaussian prior one placeholder among careful values keeps its wrong
-    value, or widens the prior of all bodies. The t distribution is a Gaussian whose width differs between bodies.
+    The links of a URDF are not equally wrong. With a common Gaussian prior, a link with placeholder values would keep
+    wrong values, or would widen the prior of all links. The t distribution is a Gaussian whose width differs between
+    bodies.
 
-    rigid: names and groups of x. widths: standard deviations per group; the one of bodies is the scale of the t
-    distribution. hyperprior: their values before the fit. mean: (K,). body_widths: (B,) standard deviation per body.
+    rigid: names and groups of x. widths: standard deviation of each group; for bodies, the scale of the t distribution.
+    hyperprior: the initial `widths`. mean: prior mean of x, (K,). body_widths: standard deviation of each body, (B,).
     """
 
     rigid: ParameterVector
@@ -196,18 +200,18 @@ class ParameterPrior:
 
     @classmethod
     def of(cls, rigid: ParameterVector, widths: GaussianPrior) -> ParameterPrior:
-        """Return the prior whose mean is the current x of the model."""
+        """Return the prior whose mean is the vector of the model's current parameters."""
         body_widths = torch.full_like(rigid.initial[rigid.bodies][:, 0], widths.bodies)
         return cls(rigid, widths, widths, rigid.flatten(rigid.initial), body_widths)
 
     @property
     def plausible(self) -> bool:
-        """Whether the bodies' parameters are near the ones of the URDF, on average over the bodies."""
+        """Whether the root mean square of the bodies' widths is at most `TUNING.wrong_urdf`, as a factor of masses."""
         return float(self.body_widths.square().mean().sqrt().exp()) <= TUNING.wrong_urdf
 
     @cached_property
     def precision(self) -> torch.Tensor:
-        """Inverse covariance, (K, K)."""
+        """Inverse of the prior covariance, (K, K)."""
         covariance = prior_covariance(self.widths, self.rigid.initial, self.rigid.groups)
         bodies = self.rigid.mask("bodies")
         covariance[bodies, bodies] = self.body_widths.square().repeat_interleave(10)
@@ -218,7 +222,7 @@ class ParameterPrior:
 def prior_covariance(
     widths: GaussianPrior, parameters: Mapping[str, torch.Tensor], groups: Mapping[str, str]
 ) -> torch.Tensor:
-    """Return the prior covariance (K, K) of parameters of these names, shapes and groups, flattened in this order."""
+    """Return the prior covariance (K, K) of parameters, in their order; groups: parameter group of each name."""
     count = sum(x.numel() for x in parameters.values())
     matrix, friction, first = torch.zeros(count, count).double(), torch.zeros(count).double(), 0
     deviations: dict[str, float] = dict(widths)
@@ -227,7 +231,7 @@ def prior_covariance(
         option = width_option(groups[name])
         matrix[rows, rows] = torch.full((len(rows),), deviations[option]).double().square()
         if option in SHARED:
-            # bristle fractions are (n, elements): each element has a common factor of its own
+            # Bristle fractions are (n, elements): each element has a separate factor common to all joints.
             for of_joints in rows.view(len(x), -1).mT:
                 matrix[of_joints[:, None], of_joints] += deviations[SHARED[option]] ** 2
         if groups[name] in ("sizes", "effects"):
@@ -239,14 +243,16 @@ def prior_covariance(
 def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tensor) -> ParameterPrior:
     """Return the prior after one fixed-point step of evidence maximization for the widths of three groups.
 
-    MacKay, Bayesian Interpolation, Neural Computation 4:415 (1992): the fixed point s^2 = |x - mean|^2 / gamma, with
-    the effective number of parameters gamma = k - tr(covariance) / s^2 of the group's k parameters, maximizes the
-    marginal likelihood in Laplace's approximation. Here s^2 has a scaled inverse chi-squared hyperprior about its
-    initial value s0^2, with c degrees of freedom: s^2 = (|x - mean|^2 + c s0^2) / (gamma + c). It is bounded.
+    The groups are bodies, armatures and torque offsets. MacKay, Bayesian Interpolation, Neural Computation 4:415
+    (1992): the width s of a group of k parameters that maximizes the marginal likelihood in Laplace's approximation is
+    the fixed point of s^2 = |x - mean|^2 / gamma, with the effective number of parameters gamma = k - tr(covariance) /
+    s^2. Here s^2 also has a scaled inverse chi-squared hyperprior about the initial value s0^2, with c degrees of
+    freedom. The fixed point is then s^2 = (|x - mean|^2 + c s0^2) / (gamma + c). The width has an upper bound.
 
-    The width of a body has this hyperprior about the common width s. Integrated over it, the prior of the body is a t
-    distribution of c degrees of freedom and scale s, and the squares of the body count s^2 / width^2 times in the fixed
-    point of s (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989).
+    The width of a single body has the same hyperprior, about the common width s of all bodies. Integrated over the
+    width, the prior of the body is a t distribution of c degrees of freedom and scale s. In the fixed point of s, the
+    squared parameters of the body have the weight s^2 / width^2 (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881,
+    1989).
 
     Args:
         prior: current prior.
@@ -257,7 +263,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
     freedom, offset = prior.widths.degrees_of_freedom, x - prior.mean
 
     def width(squares: torch.Tensor, gamma: torch.Tensor, group: str, center: float) -> torch.Tensor:
-        """Return the fixed point (...) for squares and effective numbers of parameters (...), near a center."""
+        """Return the width s (...) for |x - mean|^2 = squares (...) and gamma (...), with center as s0."""
         square = (squares + freedom * center**2) / (gamma.clamp(min=0.0) + freedom)
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 
@@ -272,8 +278,8 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         count = int(mask.sum())
         centring = torch.eye(count).double()
         if group in SHARED and count:
-            # the common factor has a width of its own: the width of single joints is estimated from the differences
-            # between joints
+            # The common factor has a separate width. The width of single joints is therefore estimated from the
+            # differences between joints.
             centring -= 1 / count
         spread = centring @ covariance[mask][:, mask] @ centring
         gamma = centring.trace() - spread.trace() / current[group] ** 2
@@ -283,5 +289,5 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
 
 
 def width_option(group: str) -> str:
-    """Return the option of `GaussianPrior` with the standard deviation of a group."""
+    """Return the name of the option of `GaussianPrior` that is the standard deviation of a parameter group."""
     return "sizes" if group in ("effects", "load_dependence") else group

@@ -5,9 +5,9 @@ smooth in the few constants of each joint. The cost is the negative log posterio
 
     1/2 sum over joints j of |r_j(x)|^2 / s_j^2 + 1/2 (x - m)^T P (x - m),
 
-with the torque residual r, its noise s, and a Gaussian prior of mean m and precision P (see `prior`). The residual is
-the one of the logged torque if motor gains are trained (see `TorqueJacobian.squared_residual`). Noise and prior widths
-are estimated from the data: outer iterations alternate Levenberg-Marquardt steps with their updates.
+with the torque residual r, its noise s, and a Gaussian prior of mean m and precision P (see `ParameterPrior`). If motor
+gains are trained, r is the residual of the logged torque (see `TorqueJacobian.squared_residual`). Noise and prior
+widths are estimated from the data: outer iterations alternate Levenberg-Marquardt steps with their updates.
 """
 
 from __future__ import annotations
@@ -43,12 +43,11 @@ State = SolverState[torch.Tensor]
 
 @dataclass(frozen=True, eq=False)
 class NoiseEstimator:
-    """Estimator of the torque noise s (n,) from the squared residual of `count` samples.
+    """Estimator of the torque noise s (n,) [Nm, N] from the squared residual of `count` samples.
 
-    Errors of filtered samples are correlated. `correlation_length` (n,) samples count as one independent error: s^2 is
-    the mean squared residual times this length, so that sums over all samples have the weight of independent errors.
-
-    torque_std: (n,) standard deviation of the torque [Nm, N].
+    Errors of filtered samples are correlated, so `correlation_length` (n,) samples count as one independent error. s^2
+    is the mean squared residual times this length: the sum of squared residuals over all samples, divided by s^2, then
+    has the weight of the independent errors only. torque_std: standard deviation of the torque, (n,) [Nm, N].
     """
 
     count: int
@@ -59,13 +58,13 @@ class NoiseEstimator:
     def of(cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor) -> NoiseEstimator:
         """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
-        # a joint of constant torque has a standard deviation of zero, by which nothing can be divided
+        # A joint of constant torque has a standard deviation of zero: avoid divisions by zero.
         torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
         return cls(jacobian.samples.count, correlation_length, torque_std)
 
     @property
     def errors(self) -> torch.Tensor:
-        """Number of independent errors, (n,)."""
+        """Number of independent errors per joint, (n,)."""
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
@@ -78,19 +77,20 @@ class NoiseEstimator:
         """Return the noise (n,) [Nm, N], at least a fraction of the torque's standard deviation.
 
         Args:
-            squared_residual: (n,) [Nm^2, N^2], of all samples.
-            effective_parameters: number of parameters that each joint's torque determines, (n,): each reduces the
-                degrees of freedom of the residual by one independent error.
+            squared_residual: (n,) sum over all samples [Nm^2, N^2].
+            effective_parameters: (n,) number of parameters that each joint's torque determines. Each parameter reduces
+                the degrees of freedom of the residual by one independent error.
         """
-        # at least one error remains: gamma is divided equally (`updated`), a joint can have fewer errors than its share
+        # At least one error remains: `updated` assigns equal shares of the parameters to the joints, and a joint may
+        # have fewer independent errors than its share.
         fraction = (self.errors - effective_parameters).clamp(min=1.0) / self.errors
         rms = (squared_residual / self.count / fraction).sqrt()
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] of an annealing iteration: a fraction of the rms of its residual.
+        """Return the noise (n,) [Nm, N] of an annealing iteration, which is a fraction of the rms torque residual.
 
-        squared_residual: (n,) [Nm^2, N^2], of all samples.
+        squared_residual: (n,) sum over all samples [Nm^2, N^2].
         """
         return TUNING.annealing_fraction * (self.correlation_length * squared_residual / self.count).sqrt()
 
@@ -99,9 +99,9 @@ class NoiseEstimator:
 class TorqueProblem:
     """Negative log posterior of x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
-    noise: (n,) standard deviations, scaled as if the errors of all samples were independent. adapt: see `TorqueFit`.
-    compensated: (n,) joints whose drives compensate friction (see `stages.find_compensation`). correlation_time: (n,)
-    of the errors [s].
+    noise: standard deviations, (n,) [Nm, N], scaled such that the errors of all samples can be treated as independent
+    (see `NoiseEstimator`). adapt: see `TorqueFit`. compensated: joints whose drives compensate friction, (n,) (see
+    `stages.find_compensation`). correlation_time: correlation time of the torque errors, (n,) [s].
     """
 
     jacobian: TorqueJacobian
@@ -115,7 +115,7 @@ class TorqueProblem:
     def of(
         cls, jacobian: TorqueJacobian, widths: GaussianPrior, adapt: Adaptation | None = None
     ) -> TorqueProblem:
-        """Return the problem whose prior mean is the current x of the model."""
+        """Return the problem whose prior mean is the vector of the model's current parameters."""
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
         noise = NoiseEstimator.of(jacobian, correlation_time).upper_bound()
@@ -130,7 +130,7 @@ class TorqueProblem:
 
     @cached_property
     def noise_estimator(self) -> NoiseEstimator:
-        """Estimator of the noise of these samples."""
+        """Estimator of the torque noise for the samples of the Jacobian."""
         return NoiseEstimator.of(self.jacobian, self.correlation_time)
 
     @property
@@ -139,15 +139,16 @@ class TorqueProblem:
         return self.noise_estimator.correlation_length
 
     def with_least_squares_noise(self, x: torch.Tensor) -> TorqueProblem:
-        """Return the problem under the noise of unconstrained least squares, linearized at x (K,).
+        """Return the problem with the noise of unconstrained least squares, linearized at x (K,).
 
         Unconstrained least squares fits the samples better than any physically consistent x, up to the linearization of
-        friction: its residual is a lower bound of the noise. A noise from the residual of a poor initial guess would be
-        too large, and the fit would stop early.
+        friction, so that the residual of least squares is a lower bound of the noise. Noise estimated from the residual
+        of a poor initial guess would be too large, and the fit would stop early.
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
-        # twice: joints have common parameters, so that the solution depends on their weights, and these on the noise
+        # Joints have common parameters, so the solution depends on the weights of the joints, which are computed from
+        # the noise: iterate twice.
         for _ in range(2):
             noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
         return replace(self, noise=noise)
@@ -157,31 +158,32 @@ class TorqueProblem:
         return self.jacobian.squared_residual(x)
 
     def cost(self, x: torch.Tensor, residual: torch.Tensor) -> float:
-        """Return the negative log posterior of x (K,), except for a constant; residual: squared, (n,) [Nm^2, N^2]."""
+        """Return the negative log posterior of x (K,) up to a constant; residual: squared one, (n,) [Nm^2, N^2]."""
         deviation = x - self.prior.mean
         penalty = deviation @ self.prior.precision @ deviation
         return float(((residual / self.noise.square()).sum() + penalty) / 2)
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
         """Return Gauss-Newton Hessian (k, k) and negative gradient (k,) with respect to the k free parameters."""
-        # for all parameters first: the prior of common factors couples free and fixed parameters
+        # The prior of common factors couples free and fixed parameters: compute all rows, then select the free ones.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
         return NormalEquations(curvature, (descent - penalty_gradient)[self.free])
 
     def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
-        """Yield x + step, (K,), then the step that is straight in the inertial parameters (`curved_step`).
+        """Yield the parameters (K,) after two variants of a step: x + step, then `TorqueJacobian.curved_step`.
 
-        step: (k,) of the free parameters.
+        step: (k,) step of the free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
-        # the first is cheaper, and as good near the optimum; far from it the second may have a lower cost
+        # x + step is cheaper, and as good near the optimum. Far from the optimum the curved step may have a lower
+        # cost.
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
     def minimize(self, state: State, max_steps: int) -> SolverResult[torch.Tensor]:
-        """Return the result of Levenberg-Marquardt steps from a state of x (K,), whose cost is recomputed."""
+        """Return the result of at most `max_steps` Levenberg-Marquardt steps from a state; its cost is recomputed."""
         state = replace(state, cost=self.cost(state.x, state.residual))
         return levenberg_marquardt(
             self, state, max_steps=max_steps, min_relative_decrease=TUNING.min_relative_decrease
@@ -192,7 +194,7 @@ class TorqueProblem:
         return self.of_all_parameters(torch.linalg.inv(curvature))
 
     def of_all_parameters(self, free_covariance: torch.Tensor) -> torch.Tensor:
-        """Return the covariance (K, K) of all parameters, zero for fixed ones, from the free ones' (k, k)."""
+        """Return the covariance (K, K) from the covariance of the free parameters (k, k); zero for fixed parameters."""
         covariance = torch.zeros_like(self.prior.precision)
         covariance[self.free[:, None] & self.free] = free_covariance.flatten()
         return covariance
@@ -200,24 +202,25 @@ class TorqueProblem:
     def updated(self, state: State, covariance: torch.Tensor) -> TorqueProblem:
         """Return the problem with noise and prior widths re-estimated at a state.
 
-        The effective number of parameters is gamma = tr(1 - covariance P) (MacKay, 1992), assigned to all joints in
-        equal shares.
+        The effective number of parameters is gamma = tr(1 - covariance P) (MacKay, 1992). Each joint is assigned an
+        equal share.
         """
         free, joints = self.free, len(state.residual)
-        # of all joints together: a parameter of a body is determined by the torques of several joints
+        # A parameter of a body is determined by the torques of several joints: gamma is computed for all joints
+        # together.
         gamma = float(free.sum() - (covariance * self.prior.precision)[free][:, free].sum())
         noise = self.noise_estimator.estimate(state.residual, gamma / joints)
-        # one body is too little data for the widths of a load
+        # The widths of a load cannot be estimated from one body.
         prior = self.prior if self.adapt == "load" else update_widths(self.prior, state.x, covariance)
         return replace(self, noise=noise, prior=prior)
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueEstimate:
-    """MAP estimate: the problem with its noise and prior, and the solver's last state.
+    """MAP estimate: the problem with its noise and prior, and the last state of the solver.
 
-    covariance: (K, K), posterior covariance of x. After `alternate` it is the one of the last linearization,
-    under the noise and prior before their last update; `with_current_covariance` recomputes it.
+    covariance: posterior covariance of x, (K, K). After `alternate` it belongs to the last linearization, and to noise
+    and prior before their last update; `with_current_covariance` recomputes it.
     """
 
     problem: TorqueProblem
@@ -225,31 +228,34 @@ class TorqueEstimate:
     covariance: torch.Tensor
 
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
-        """Return the same parameters on other samples, or with other residual terms or friction models."""
+        """Return the estimate with the same x and another Jacobian (of other samples, residual terms or friction)."""
         state = replace(self.state, residual=jacobian.squared_residual(self.state.x))
         return replace(self, problem=replace(self.problem, jacobian=jacobian), state=state)
 
     def with_current_covariance(self) -> TorqueEstimate:
-        """Return the estimate with the covariance under its current noise and prior."""
+        """Return the estimate with the covariance recomputed for the current noise and prior."""
         normal = self.problem.normal_equations(self.state.x, self.state.residual)
         return replace(self, covariance=self.problem.covariance(normal.curvature))
 
     def on_segments(self, samples: TorqueSamples) -> TorqueEstimate:
-        """Return the estimate on segments of samples, with the noise of their interval and the current covariance."""
+        """Return the estimate on segments of consecutive samples, with the current covariance.
+
+        The noise is converted to the sample interval of the segments.
+        """
         jacobian = TorqueJacobian(
             self.problem.jacobian.model, samples.segments(TUNING.segment, TUNING.initial_samples)
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
-        # the weight of an independent error, length / noise^2, is the same at the interval of the segments
+        # The weight of an independent error, length / noise^2, must not depend on the sample interval.
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
     def linearize(self) -> tuple[ResidualSamples, RigidProjection]:
         """Return the torque residual, and the projection of joint torques onto the rigid-body and friction model.
 
-        The projection needs the covariance under the current noise (`with_current_covariance`): with the covariance of
-        a larger noise it would remove too much of a torque.
+        The covariance must be the one for the current noise (`with_current_covariance`). With the covariance for a
+        larger noise, the projection would remove too much of a torque.
         """
         jacobian, x = self.problem.jacobian, self.state.x
         projection = jacobian.rigid_projection(x, self.problem.noise, self.covariance)
@@ -260,14 +266,14 @@ def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
     """Alternate Levenberg-Marquardt steps with updates of noise and prior until the noise has converged.
 
     Args:
-        problem: with initial noise and prior.
-        state: first iterate.
+        problem: problem with initial noise and prior.
+        state: initial state of the solver.
     """
     for number in range(TUNING.iterations):
         result = problem.minimize(state, TUNING.iteration_steps)
         state, covariance = result.state, problem.covariance(result.normal_equations.curvature)
         previous, problem = problem, problem.updated(state, covariance)
-        # the first update replaces a noise of other samples or of another model
+        # The first update is no test of convergence: the initial noise may be of other samples or another model.
         if number and (problem.noise > TUNING.noise_converged * previous.noise).all():
             break
     return TorqueEstimate(problem, state, covariance)
@@ -276,31 +282,32 @@ def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
 def refine(
     estimate: TorqueEstimate, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
 ) -> TorqueEstimate:
-    """Return the estimate refitted to other samples or residual terms, with the given one as warm start."""
+    """Return the estimate refitted to other samples or with other linear terms; the given estimate is a warm start."""
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
-    # the former noise belongs to other samples, or to a fit without these terms
+    # The noise of the given estimate belongs to other samples or other terms: estimate it again.
     noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
     return alternate(replace(estimate.problem, noise=noise), estimate.state)
 
 
 def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> TorqueEstimate:
-    """Return the estimate with the correlation times (n,) of its errors on segments of samples.
+    """Return the estimate with correlation times (n,) [s] that are estimated on segments of samples.
 
-    The error of a torque is white noise, correlated over 0.06 s after the filter, and the error of the model, which
-    lasts for tenths of a second to seconds. The integrated correlation time of their sum is estimated from the residual
-    corrected for the fit (`RigidProjection.errors`): the residual itself is less correlated the more parameters are
-    fitted to it. The estimate is averaged with its prior mean, weighted by the numbers of independent errors.
+    The torque error is the sum of filtered white noise, correlated over 0.06 s, and of the model's error, correlated
+    over tenths of a second to seconds. The integrated correlation time of the sum is estimated from the residual.
+    Fitted parameters reduce the correlation of the residual, which is therefore corrected first
+    (`RigidProjection.errors`). The result is the weighted mean of this estimate and its prior mean, with the numbers of
+    independent errors as weights.
 
-    It is estimated once, after the friction model was chosen, since the errors of a wrong friction model last longer.
-    Updates in the outer iterations would be unstable: a joint with a long correlation time has a small weight, so that
-    its residual grows, and with it the correlation time.
+    The correlation time is estimated once, after the choice of the friction model, since the errors of a wrong friction
+    model last longer. Updates in the outer iterations would be unstable: a joint with a long correlation time has a
+    small weight, so that its residual grows, and the correlation time with the residual.
     """
     segments, problem, prior_mean = estimate.on_segments(samples), estimate.problem, TUNING.correlation_time
     residual, projection = segments.linearize()
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # the mean of two estimates, each with the weight of its independent errors
+    # weighted mean of the estimate and the prior mean; weights: numbers of independent errors
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

@@ -1,4 +1,4 @@
-"""Notes of a torque fit: prior width, selected residual terms, undetermined inertias."""
+"""Notes about a torque fit for users: prior width, selected residual terms, undetermined inertias."""
 
 import math
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ TERM_NAMES = {
 
 
 def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSolution) -> Iterator[Diagnostic]:
-    """Yield the notes of a fit of rigid bodies to samples."""
+    """Yield the notes about a fit of a rigid-body model to samples."""
     names = np.array(model.joint_names)
     posterior = Posterior(model, solution.covariance, solution.torque_std.numpy())
     yield _urdf_prior(solution)
@@ -55,7 +55,7 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
         )
     if residual_terms(model) is not None:
         yield Diagnostic("info", "residuals", "model", None, _selected_terms(samples, solution, names))
-    # a few positions suffice for a mean
+    # a few positions suffice for the mean inertia
     subset = samples.subsampled(50).columns
     inertia, std = posterior.uncertain(lambda other: _mean_inertia(other, subset.q))
     undetermined = std > TUNING.undetermined * inertia
@@ -77,8 +77,8 @@ def _warning(code: str, message: str, element: str = "logs") -> Diagnostic:
 
 
 def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
-    """Return the common width of the bodies' prior, as a warning if the URDF is not of this arm."""
-    # the log-Cholesky parameters of a body are logarithms of its mass and radii
+    """Return a note with the common prior width of the bodies, or a warning if it shows that the URDF is wrong."""
+    # The log-Cholesky parameters are logarithms of mass and radii, so exp(width) is a factor of the mass.
     factor = float(np.exp(solution.prior.bodies))
     message = f"prior standard deviation of URDF masses: factor {factor:.2g}"
     if factor <= TUNING.wrong_urdf:
@@ -96,21 +96,21 @@ def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
 
 
 def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray:
-    """Return the nMSE of held-out segments (n,), median-unbiased: most means of few squares are too small.
+    """Return the median-unbiased nMSE of held-out segments (n,).
 
-    The sum of the squared errors of S segments is taken to be chi-squared with S degrees of freedom, whose median is
-    below S.
+    The mean of few squared errors is more often too small than too large. The sum of the squared errors of S segments
+    is assumed to be chi-squared with S degrees of freedom; the median of this distribution is below S.
     """
     segments = samples.count * samples.interval / TUNING.segment
-    # at three seconds a factor of 1.27, at twelve of 1.06
+    # the correction is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve
     median = 2 * float(gammaincinv(segments / 2, 0.5))
     return np.asarray(solution.held_out_nmse * segments / median)
 
 
 def _few_data(samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray) -> Diagnostic:
-    """Return the warning that the samples do not support the parameters of some joints; nmse: (n,) of all joints."""
+    """Return the warning that the samples do not support a fit of some joints; nmse: see `_likely_nmse`, (n,)."""
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
-    # the error of the parameters is inversely proportional to the duration of the motion
+    # The nMSE due to parameter errors is inversely proportional to the duration of the motion.
     enough = math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported)
     return _warning(
         "few-data",
@@ -122,7 +122,7 @@ def _few_data(samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray) -> Di
 
 
 def _trained_gains(posterior: Posterior) -> Diagnostic:
-    """Return the trained motor gains with 95 % intervals, as a warning if the logs do not determine one of them."""
+    """Return a note with the motor gains and their 95 % intervals, or a warning if logs do not determine a gain."""
     gains = posterior.drives["gain"]
     parts = [f"{x.name} {x.value:.4g} ({x.low:.4g} to {x.high:.4g})" for x in gains]
     message = f"joint torque per logged torque, with 95 % intervals: {', '.join(parts)}"
@@ -155,7 +155,7 @@ def _selected_terms(samples: TorqueSamples, solution: TorqueSolution, names: np.
 
 
 def terms_in_use(model: ArmModel) -> list[str]:
-    """Return the residual terms of a model that are not zero, with their joints."""
+    """Return a text for each residual term of a model that is not zero, with the joints on which it acts."""
     names = model.joint_names
     residuals = residual_terms(model)
     if residuals is None:

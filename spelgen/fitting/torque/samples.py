@@ -1,4 +1,4 @@
-"""Samples of all logs that a model is fitted to, as tensors, split into blocks of bounded size."""
+"""Samples of all logs that a model is fitted to, as tensors; blocks of bounded size limit the memory of fits."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 class SampleBlock(NamedTuple):
     """T samples: q, qd, qdd [rad, m, s] and tau as logged [Nm, N], all (T, n).
 
-    z: (T, n, K) [rad, m], bristle states; direction: (T, n) of rate-only dry friction (see `DynamicsSamples`). Both are
-    None if unknown.
+    z: friction state, (T, n, K) [rad, m]. direction: direction in [-1, 1] of rate-only dry friction, (T, n) (see
+    `DynamicsSamples`). Both are None if unknown.
     """
 
     q: torch.Tensor
@@ -27,7 +27,7 @@ class SampleBlock(NamedTuple):
     direction: torch.Tensor | None = None
 
     def select(self, rows: slice) -> SampleBlock:
-        """Return the samples of these rows."""
+        """Return the samples of a slice of rows."""
         return SampleBlock._make(None if column is None else column[rows].contiguous() for column in self)
 
 
@@ -35,8 +35,8 @@ class SampleBlock(NamedTuple):
 class TorqueSamples:
     """Samples of all trajectories, concatenated.
 
-    original_count: number of samples before decimation and subsampling. interval: between successive samples [s].
-    recordings: (T,) index of the recording of each sample.
+    original_count: number of samples before decimation and subsampling. interval: time between successive samples [s].
+    recordings: index of the recording of each sample, (T,).
     """
 
     columns: SampleBlock
@@ -52,12 +52,12 @@ class TorqueSamples:
         recordings = []
         for x in trajectories:
             columns = (x.q, x.qd, x.qdd, x.tau, x.z, x.direction)
-            # copies: a view would keep all samples in memory
+            # A view would keep all samples in memory: copy the selected ones.
             decimated.append(
                 [None if column is None else np.ascontiguousarray(column[::decimation]) for column in columns]
             )
             count, interval = count + len(x.q), decimation / x.rate
-            # pieces of one recording have one index: errors of its motion are common to them
+            # All trajectories of one recording have the same index, since errors of its motion are common to them.
             recordings.append(torch.full((len(x.q[::decimation]),), names.setdefault(x.name, len(names))))
         table = SampleBlock._make(map(_concatenated, zip(*decimated, strict=True)))
         return cls(table, count, interval, torch.cat(recordings))
@@ -68,29 +68,29 @@ class TorqueSamples:
         return len(self.columns.q)
 
     def segment_length(self, seconds: float) -> int:
-        """Return the number of samples of a segment of this duration [s]; at most all."""
+        """Return the number of samples of a segment of `seconds` [s], at most the number of all samples."""
         return min(self.count, max(1, round(seconds / self.interval)))
 
     def segments(self, seconds: float, max_count: int) -> TorqueSamples:
-        """Return at most `max_count` samples: evenly spaced segments of this duration [s], concatenated."""
+        """Return at most `max_count` samples: evenly spaced segments of `seconds` [s] each, concatenated."""
         size = self.segment_length(seconds)
         number = max(1, min(self.count, max_count) // size)
-        # a segment may span two recordings: rare, and without effect on a mean
+        # A segment may span two recordings. This is rare, and negligible for means over segments.
         starts = torch.linspace(0, self.count - size, number).long()
         rows = (starts.unsqueeze(-1) + torch.arange(size)).flatten()
         columns = SampleBlock._make(None if column is None else column[rows] for column in self.columns)
         return replace(self, columns=columns, recordings=self.recordings[rows])
 
     def subsampled(self, max_count: int) -> TorqueSamples:
-        """Return at most `max_count` samples, evenly spaced; this object itself if it has no more."""
-        # evenly spaced, not random: deterministic, and covers every motion
+        """Return at most `max_count` evenly spaced samples; this object itself if it has no more samples."""
+        # Evenly spaced samples are deterministic and include every motion, in contrast to random ones.
         step = -(-self.count // max_count)
         if step <= 1:
             return self
         return replace(self.select(slice(None, None, step)), interval=step * self.interval)
 
     def select(self, rows: slice) -> TorqueSamples:
-        """Return the samples of these rows."""
+        """Return the samples of a slice of rows."""
         return replace(self, columns=self.columns.select(rows), recordings=self.recordings[rows])
 
     def blocks(self, size: int) -> Iterator[SampleBlock]:

@@ -1,12 +1,18 @@
 """Selection of single-joint residual terms by cross-validation of the torque residual.
 
-With several recordings one recording is held out at a time; with one, one of ten contiguous blocks, with a gap on both
-sides, since successive errors are correlated. A candidate is accepted if its mean relative error reduction over ten
-blocks is significant (one-sided t test, 1 %, or 0.1 % for one or two recordings), and if, fitted to the first half, it
-also lowers the error on the last half: often one motion repeats errors that another motion does not have. With one or
-two recordings its torque must be plausible, too (`max_torques`). If no candidate of a joint is accepted, both tests
-are repeated with the held-out samples at positions within the range of the fitted samples, since splines do not
-extrapolate. Of the accepted candidates of a joint the one with the largest error reduction is selected.
+If there are several recordings, whole recordings are held out. A single recording is divided into ten contiguous
+blocks, which are held out one at a time, with a gap on both sides, since successive errors are correlated. A candidate
+must pass three tests:
+
+- The mean relative error reduction over ten blocks is significant (one-sided t test, 1 %, or 0.1 % for one or two
+  recordings).
+- Fitted to the first half of the samples, the candidate also lowers the error on the last half: often one motion
+  repeats errors that another motion does not have.
+- With one or two recordings, the torque of the candidate is plausible (`max_torques`).
+
+If no candidate of a joint passes, the first two tests are repeated with only those held-out samples whose positions are
+within the range of the fitted samples, since splines do not extrapolate. Of the accepted candidates of a joint, the one
+with the largest error reduction is selected.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -34,8 +40,9 @@ from spelgen.fitting.torque.tuning import SELECTION
 class SelectedTerm:
     """A selected residual term.
 
-    name: of its parameter, or `residual_potential` or `residual_mass`. joint: None for networks. error_reduction:
-    relative reduction of the held-out squared torque residual at the joints that the term acts on.
+    name: name of the parameter of the term, or `residual_potential` or `residual_mass`. joint: index of the joint; None
+    for networks. error_reduction: relative reduction of the held-out squared torque residual at the joints on which the
+    term acts.
     """
 
     name: str
@@ -50,7 +57,7 @@ def can_split(count: int, correlation_length: float) -> bool:
 
 
 def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
-    """Return the first half of the samples, less the gap before the held-out samples, and the last half."""
+    """Return slices of `count` samples: the first half without the gap at its end, and the last half."""
     middle = count // 2
     return slice(0, max(0, middle - _gap(correlation_length))), slice(middle, count)
 
@@ -74,13 +81,13 @@ def select_functions(
     recordings: torch.Tensor,
     torque_std: torch.Tensor,
 ) -> list[SelectedTerm]:
-    """Return the term selected per joint, for joints with an accepted candidate.
+    """Return the selected term of each joint that has an accepted candidate.
 
     Args:
         model: model with residual terms.
-        samples: torque residual of the model with its current terms.
-        projection: of the rigid-body and friction model.
-        selected: terms that the model has already.
+        samples: samples with the torque residual of the model and its current terms.
+        projection: projection onto the rigid-body and friction model.
+        selected: terms that were selected before, which are no candidates.
         correlation_length: (n,) number of samples per independent error.
         recordings: (T,) index of the recording of each sample.
         torque_std: (n,) standard deviation of the torque [Nm, N].
@@ -90,7 +97,8 @@ def select_functions(
     for candidate in joint_functions(model, samples, projection):
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
-    # two recordings repeat a motion only once: their ten blocks are not independent
+    # With two recordings each fit is to one recording, whose errors are common to several of the ten blocks: the
+    # blocks are not independent, and the stricter test is used.
     limits = None if int(recordings.max()) > 1 else max_torques(model, samples.q, torque_std)
     best = (
         _best(of_joint, samples.torque_residual, noise, float(length), recordings, limits)
@@ -100,10 +108,10 @@ def select_functions(
 
 
 def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Return the largest plausible standard deviation (n,) [Nm, N] of a torque of position, by its parameter.
+    """Return the largest plausible standard deviation (n,) [Nm, N] of a term's torque, by the name of its parameter.
 
-    It bounds terms that one recording supports. A smooth torque balances a load, as springs and gas cylinders do, so a
-    joint that gravity does not load has none.
+    The bounds apply to terms that are selected on one or two recordings. Springs and gas cylinders balance a load, so
+    the bound of a smooth torque is zero for joints without gravity load.
 
     Args:
         model: fitted model.
@@ -126,10 +134,11 @@ def _best(
 ) -> SelectedTerm | None:
     """Return the accepted candidate of one joint with the largest error reduction, or None.
 
-    torque_residual: (T, n). noise: (n,). recordings: (T,). limits: `max_torques`; None: no bounds.
+    torque_residual: (T, n) [Nm, N]. noise: (n,) [Nm, N]. recordings: index of the recording of each sample, (T,).
+    limits: result of `max_torques`, for one or two recordings; None: no bounds.
     """
     significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
-    # halves are the farthest extrapolation in time that one recording allows
+    # The halves test the largest extrapolation in time that a single recording allows.
     first, last = split_halves(len(torque_residual), correlation_length)
     best = best_within = None
     for candidate in candidates:
@@ -142,7 +151,7 @@ def _best(
         if reduction is None and reduction_within is None:
             continue
         weights = candidate.fit(target, correlation_length, first).coef
-        # implausible torques of one motion are errors that this motion repeats
+        # An implausibly large torque is more likely an error that the motion repeats.
         if limits and candidate.torque(weights).std() > limits[candidate.parameter][candidate.joint]:
             continue
         before, after = target[last].square(), (target - candidate.torque(weights))[last].square()
@@ -152,14 +161,15 @@ def _best(
         if reduction_within is not None and after[within].sum() < before[within].sum():
             accepted = SelectedTerm(candidate.parameter, candidate.joint, reduction_within)
             best_within = _better(best_within, accepted)
-    # a candidate that extrapolates is preferred: outside the fitted range a spring has errors, and other functions of
-    # position have larger ones
+    # A candidate that passes outside the fitted range, too, is preferred. A spring has errors there, but other
+    # functions of position have larger ones.
     return best or best_within
 
 
 def _better(first: SelectedTerm | None, other: SelectedTerm) -> SelectedTerm:
-    """Return the other term if its error is clearly smaller, else the first."""
-    # splines of a linear spring reduce the error nearly as much as ripple does, and they extrapolate
+    """Return the other term if its held-out error is clearly smaller, else the first one."""
+    # Splines, which come first, are preferred to ripple at similar errors: for a linear spring both reduce the
+    # error by similar amounts, but only splines extrapolate.
     if first is None or 1 - other.error_reduction <= SELECTION.preference_ratio * (1 - first.error_reduction):
         return other
     return first
@@ -172,9 +182,13 @@ def _blocks(count: int) -> list[slice]:
 
 
 def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-    """Yield masks (T,) of the held-out and of the fitted samples: of recordings (T,), or of blocks of one recording."""
-    # Whole recordings are held out: they differ in day, load and motion, and so their errors differ more than the
-    # errors of blocks of one recording.
+    """Yield masks (T,) of the held-out and of the fitted samples, for each fold.
+
+    recordings: index of the recording of each sample, (T,). gap: number of unused samples at both ends of a held-out
+    block.
+    """
+    # Recordings differ in day, load and motion, so errors differ more between recordings than between blocks of one
+    # recording: hold out whole recordings if possible.
     number = int(recordings.max()) + 1
     if number == 1:
         rows = torch.arange(len(recordings))
@@ -191,8 +205,9 @@ def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, t
 def _cross_validate(
     candidate: JointFunction, target: torch.Tensor, correlation_length: float, recordings: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the held-out error (T,) of all folds, each after a fit to the others, and a mask (T,) of the held-out
-    positions within the range of the fitted ones.
+    """Return the error (T,) [Nm, N] at each sample by the fit from which it was held out, and a mask (T,).
+
+    The mask marks the samples whose positions are within the range of the fitted positions.
     """
     position = candidate.position
     error, within = torch.zeros_like(target), torch.zeros_like(target, dtype=torch.bool)
@@ -212,18 +227,19 @@ def block_squares(values: torch.Tensor) -> torch.Tensor:
 def significant_reduction(
     before: torch.Tensor, after: torch.Tensor, standard_errors: float = SELECTION.standard_errors
 ) -> float | None:
-    """Return the relative reduction of sums of squares per block (folds,), or None if it is not significant.
+    """Return the relative reduction of squared errors, or None if it is not significant.
 
-    The t test is on g = (before - after) / (before + after) per block, which is between -1 and 1: neither a block of
-    large torques nor a block of extrapolation dominates the variance. A negligible part of the mean square is added to
-    the denominator, so that blocks without torque count as zero.
+    before, after: sum of squared errors of each block without and with a term, (folds,). The t test is on g = (before -
+    after) / (before + after) of each block. g is between -1 and 1, so that neither a block of large torques nor a block
+    of extrapolation dominates the variance. A negligible part of the mean square is added to the denominator, so that g
+    is zero for blocks without torque.
     """
     negligible = 2 * SELECTION.min_reduction * before.mean()
-    # symmetric: halving and doubling an error have the same size
+    # g is antisymmetric: halving and doubling an error have opposite values
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:
         return None
     mean = float(g.mean())
-    reduction = 2 * mean / (1 + mean)  # g = (b - a) / (b + a) solved for (b - a) / b, at the mean g
+    reduction = 2 * mean / (1 + mean)  # (b - a) / b for the mean of g = (b - a) / (b + a)
     return reduction if reduction > SELECTION.min_reduction else None

@@ -28,8 +28,9 @@ EFFECT_GROUPS = ("effects", "load_dependence")
 def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
     """Fit all parameters from the prior mean.
 
-    The fit restarts with a friction compensation for all joints whose residual shows one, until no further joint does:
-    without it other parameters absorb the compensation, from which the fit would not recover.
+    If the residual of some joints shows a friction compensation, the fit restarts with trained compensation at these
+    joints, until no further joint shows one. Without restarts, other parameters would absorb the compensation, and the
+    fit would not recover.
     """
     problem, state = _annealed_fit(problem, 0)
     while problem.adapt is None and (further := find_compensation(problem, state.x)).any():
@@ -38,19 +39,19 @@ def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
     estimate = alternate(problem, state)
     if problem.adapt is not None or estimate.problem.prior.plausible or problem.compensated.all():
         return estimate
-    # masses that are wrong by such a factor are less plausible than drives that compensate friction, whose torque the
-    # masses absorb
+    # So large a correction of the masses is implausible: more likely the drives compensate friction, and the masses
+    # absorbed the compensation. Refit with compensation at all joints.
     problem = replace(problem, compensated=torch.ones_like(problem.compensated))
     compensated = alternate(*_annealed_fit(problem, estimate.state.steps))
     return compensated if compensated.problem.prior.plausible else estimate
 
 
 def _annealed_fit(problem: TorqueProblem, steps: int) -> tuple[TorqueProblem, State]:
-    """Return the fit from the prior mean by noise annealing; steps: taken before.
+    """Fit from the prior mean by noise annealing; steps: number of solver steps before this fit.
 
-    At the noise of least squares the cost is a narrow curved valley far from the optimum. Noise annealing follows it
-    with larger steps: start from a fraction of the current residual, and lower the noise with it to the least-squares
-    level.
+    Far from the optimum, the cost at the least-squares noise is a narrow curved valley, along which steps are small.
+    Larger noise widens the valley and allows larger steps. The noise starts at a fraction of the torque residual, and
+    falls with the residual to the least-squares noise.
     """
     estimator, mean = problem.noise_estimator, problem.prior.mean
     problem = problem.with_least_squares_noise(mean)
@@ -65,7 +66,7 @@ def _annealed_fit(problem: TorqueProblem, steps: int) -> tuple[TorqueProblem, St
 
 
 def _least_squares_noise_fit(problem: TorqueProblem, state: State) -> tuple[TorqueProblem, State]:
-    """Return the fit from a state under the noise of least squares, linearized there."""
+    """Fit from a state, with the noise of unconstrained least squares linearized at this state."""
     problem = problem.with_least_squares_noise(state.x)
     state = initial_state(problem, state.x, steps=state.steps)
     return problem, problem.minimize(state, TUNING.initial_steps).state
@@ -74,19 +75,20 @@ def _least_squares_noise_fit(problem: TorqueProblem, state: State) -> tuple[Torq
 def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     """Return the joints (n,) whose residual at x (K,) shows a friction compensation that is not modelled yet.
 
-    No friction model explains a torque that decreases with velocity. A drive that compensates friction after its torque
-    was measured adds such a torque. The slope of the residual over velocity must be negative, significant, explain a
-    part of the squared residual, and be visible in the torque: a delay of some milliseconds between torque and motion
-    causes a negative slope, too, but a smaller one. The drives of an arm are similar: if one compensates friction, a
-    slope of more than one standard deviation suffices for the others, whose parameters may absorb the compensation.
+    Friction cannot explain a torque that decreases with velocity. A drive that compensates friction after the torque
+    was measured adds such a torque. The residual is regressed on velocity; the slope must be negative and significant.
+    The torque of the regression line must also be a visible part of the measured torque, since a delay of some
+    milliseconds between torque and motion causes a smaller negative slope. The drives of an arm are similar: if one of
+    them compensates friction, a negative slope of more than one standard deviation suffices for the others, whose
+    parameters may have absorbed a part of the compensation.
     """
     samples = problem.jacobian.residual_samples(x)
     residual, estimator = samples.torque_residual, problem.noise_estimator
     products = (residual * samples.qd).sum(dim=0)
     slope = products / samples.qd.square().sum(dim=0).clamp(min=1e-300)
-    # share of the squared residual that the regression line explains (coefficient of determination)
+    # coefficient of determination: fraction of the squared residual that the regression line explains
     explained = slope * products / residual.square().sum(dim=0).clamp(min=1e-300)
-    # standard deviations by which the slope differs from zero
+    # t statistic of the slope
     deviations = (explained * estimator.errors / (1 - explained)).sqrt()
     decreasing = (slope < 0) & (deviations > 1) & ~problem.compensated
     if problem.compensated.any():
@@ -97,14 +99,15 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
 
 
 def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
-    """Choose per joint between rate-only friction, of the given estimate, and friction with bristle states.
+    """Choose per joint between rate-only friction, which the given estimate has, and friction with bristle states.
 
-    Bristles reverse their force over a displacement, and so after velocity reverses: at joints whose friction reverses
-    at once they would be confounded with inertia. The choice is by evidence (see `_rejected`).
+    The force of bristles reverses over a displacement, hence later than the velocity. At joints whose friction reverses
+    with the velocity, the delayed force would be confounded with inertia. The choice is by the evidence (see
+    `_rejected`).
     """
     friction = estimate.problem.jacobian.model.friction
     friction.memoryless.fill_(0.0)
-    # the noise of rate-only friction is too large for bristles, which explain more
+    # Bristles explain more than rate-only friction, so the noise is estimated again.
     problem, state = _least_squares_noise_fit(estimate.problem, estimate.state)
     hysteretic = alternate(problem, state)
     evidence = log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic)
@@ -113,7 +116,7 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     if rate_only.all():
         return estimate
     if rate_only.any():
-        # the friction state changed in the model: the residual is recomputed
+        # The friction model of some joints has changed, so the residual is recomputed.
         mixed = hysteretic.with_jacobian(hysteretic.problem.jacobian)
         return alternate(mixed.problem, mixed.state)
     return hysteretic
@@ -122,14 +125,14 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
 def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     """Choose the joints with Stribeck effect, saturation and load dependence of friction.
 
-    These coefficients are constrained to be positive, so noise biases all of them upwards: they are removed at joints
-    where they do not improve the likelihood by more than their number accounts for.
+    The coefficients of these effects are constrained to be positive, so noise biases all of them upwards. The effects
+    are removed at joints where they do not improve the likelihood enough for one additional parameter.
     """
     rigid = estimate.problem.jacobian.rigid
     index = rigid.unflatten(torch.arange(len(estimate.state.x)))
     effects = torch.stack([index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1)  # (n, effects)
     plain = _without(estimate, effects.flatten())
-    # Akaike's criterion, for one parameter (IEEE Trans. Autom. Control 19:716, 1974)
+    # penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974)
     rejected = _rejected(log_likelihood_ratio(estimate, plain) - 2)
     if rejected.all():
         return plain
@@ -137,9 +140,9 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
 
 
 def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
-    """Return the estimate with negligible coefficients, in x and in the prior mean, at these indices (k,)."""
+    """Refit with negligible friction coefficients at the given indices (k,) of x."""
     problem, x, mean = estimate.problem, estimate.state.x.clone(), estimate.problem.prior.mean.clone()
-    # in the prior mean, too: otherwise the prior would restore them
+    # The prior mean is changed, too: otherwise the prior would restore the coefficients.
     mean[indices] = x[indices] = NEGLIGIBLE
     problem = replace(problem, prior=replace(problem.prior, mean=mean))
     state = replace(estimate.state, x=x, residual=problem.residual(x))
@@ -147,18 +150,20 @@ def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
 
 
 def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> torch.Tensor:
-    """Return twice the log likelihood ratio of two estimates per joint (n,), with the noise maximized out."""
+    """Return twice the log likelihood ratio of `estimate` to `other` per joint, (n,), with maximized noise."""
     samples = estimate.problem.jacobian.samples
-    # the noise maximized out: log of the ratio of squares, per independent error
+    # At the maximum-likelihood noise of each estimate, the result is the number of independent errors times the log
+    # of the ratio of squared residuals.
     errors = samples.count * min(1.0, samples.interval / TUNING.reversal_correlation_time)
     return errors * (other.state.residual / estimate.state.residual).log()
 
 
 def fraction_occam_factor(estimate: TorqueEstimate) -> torch.Tensor:
-    """Return the Occam factor of the bristle fractions per joint (n,), twice its negative logarithm.
+    """Return -2 log(Occam factor) of the bristle fractions per joint, (n,).
 
-    It is log det of their prior covariance minus log det of their posterior covariance (MacKay, 1992). The evidence of
-    a model is its likelihood times this factor: free parameters explain noise, too.
+    The value is log det of their prior covariance minus log det of their posterior covariance (MacKay, 1992). The
+    evidence of a model is its likelihood times the Occam factor, which accounts for the noise that free parameters
+    explain.
     """
     rigid = estimate.problem.jacobian.rigid
     (name,) = rigid.names("fractions")
@@ -169,11 +174,11 @@ def fraction_occam_factor(estimate: TorqueEstimate) -> torch.Tensor:
 
 
 def _rejected(evidence: torch.Tensor) -> torch.Tensor:
-    """Return the joints (n,) at which a model is rejected, given twice the log evidence for it per joint (n,).
+    """Return the joints (n,) at which a model is rejected; evidence: twice the log evidence for the model, (n,).
 
-    The friction of an arm's gears is similar: weak evidence of a joint yields to the sum over all joints. Rejected are
-    joints with strong evidence against the model if the sum is in favour, and joints without strong evidence for it
-    otherwise.
+    The gears of an arm have similar friction, so joints with weak evidence use the sum over all joints. If the sum
+    favours the model, it is rejected only at joints with strong evidence against it. Otherwise it is rejected at all
+    joints without strong evidence for it.
     """
     return evidence < -TUNING.strong_evidence * evidence.sum().sign()
 
@@ -183,9 +188,9 @@ def fit_residual_terms(
 ) -> tuple[TorqueEstimate, list[SelectedTerm]]:
     """Select residual terms on samples, and fit them together with the rigid-body parameters.
 
-    Single-joint terms are selected first, in passes: each pass improves the rigid-body parameters, and with them the
-    residual on which further terms are selected. Networks of several joints are selected on the residual after these
-    terms.
+    Single-joint terms are selected first, in passes. Each pass is followed by a refit of the rigid-body parameters,
+    which improves the residual for the selection of further terms. Networks, which act on several joints, are selected
+    last, on the residual of the model with the selected single-joint terms.
     """
     model = estimate.problem.jacobian.model
     if samples is not estimate.problem.jacobian.samples:
@@ -202,7 +207,7 @@ def fit_residual_terms(
         estimate = _refit(estimate, samples, selected).with_current_covariance()
     residual_samples = estimate.problem.jacobian.residual_samples(estimate.state.x)
     selected += select_networks(model, residual_samples, float(correlation_length.max()))
-    # friction factors and networks are not eliminated, so that alternations are needed
+    # Friction factors and networks are not eliminated by variable projection: alternate with the rigid-body fit.
     for _ in range(TUNING.alternations if selected else 0):
         estimate = _refit(estimate.with_current_covariance(), samples, selected)
     return estimate, selected
@@ -211,7 +216,7 @@ def fit_residual_terms(
 def _refit(
     estimate: TorqueEstimate, samples: TorqueSamples, selected: Sequence[SelectedTerm]
 ) -> TorqueEstimate:
-    """Refit the selected single-joint terms and the rigid-body parameters, with torques of position eliminated."""
+    """Refit the selected single-joint terms, then rigid-body parameters and position-dependent torques together."""
     model, correlation_length = estimate.problem.jacobian.model, estimate.problem.correlation_length
     projected = refit_terms(model, *estimate.linearize(), _keys(selected), correlation_length)
     estimate = refine(estimate, samples, projected.terms)

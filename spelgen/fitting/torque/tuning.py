@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
-# [1] Standard deviations of the friction parameters (logarithms, fractions) of one arm from day to day.
+# [1] Standard deviations by which the friction parameters (logarithms, fractions) of an arm vary from day to day.
 DAY_TO_DAY = {
     "sizes": 0.1,
     "velocities": 0.1,
@@ -19,18 +19,20 @@ DAY_TO_DAY = {
 
 @dataclass(frozen=True)
 class TorqueTuning:
-    """Fits of rigid bodies to torques (`fitting.torque`)."""
+    """Constants of fits of rigid-body models to torques (`fitting.torque`)."""
 
-    # [1] Stride of the samples at 100 Hz: after the filter at 8 Hz every second one contains all information.
+    # [1] Only every n-th sample is used: after the filter at 8 Hz, 50 of 100 samples per second contain all
+    # information.
     decimation: int = 2
-    # [s] Prior mean of the correlation time of torque errors: errors of recorded arms. The samples within it count as
-    # one independent error.
+    # [s] Prior mean of the correlation time of torque errors, from recordings of arms. Samples within a correlation
+    # time count as one independent error.
     correlation_time: float = 0.2
-    # [s] Correlation time of torque errors for the comparison of friction models, which differ at reversals.
+    # [s] Correlation time of torque errors in comparisons of friction models. It is shorter because the models differ
+    # only near reversals of velocity.
     reversal_correlation_time: float = 0.1
-    # [1] Weight of the prior mean of the correlation time, as a number of independent errors.
+    # [1] Weight of `correlation_time` in the estimated correlation time, as a number of independent errors.
     correlation_weight: float = 30.0
-    # [s] Segments from which the correlation time is estimated.
+    # [s] Duration of the segments from which the correlation time is estimated, and which are held out for the nMSE.
     segment: float = 1.0
     # [1] Largest estimated prior width: masses and armatures are known to a factor of 20, torque offsets to three times
     # the typical friction. Logs that need a wider prior are not of the URDF's arm, or not in Nm.
@@ -42,56 +44,59 @@ class TorqueTuning:
     strong_evidence: float = 6.0
     # [1] Largest number of steps before noise and prior are estimated.
     initial_steps: int = 60
-    # [1] Largest number of iterations in which the noise is lowered to the least-squares level.
+    # [1] Largest number of iterations of noise annealing, which lowers the noise to the least-squares noise.
     annealing_iterations: int = 12
-    # [1] Noise of these iterations, as a fraction of the torque residual (a low_cost_robot with placeholder
-    # inertials: error of M(q) 0.44 -> 0.005).
+    # [1] Noise in the iterations of noise annealing, as a fraction of the rms torque residual. For a low_cost_robot
+    # with placeholder inertials, annealing reduces the error of M(q) from 0.44 to 0.005.
     annealing_fraction: float = 0.03
-    # [1] Noise divided by the noise of the previous iteration, above which the noise has converged.
+    # [1] The noise has converged if its ratio to the noise of the previous iteration exceeds this value.
     noise_converged: float = 0.98
     # [1] Largest number of steps in an outer iteration.
     iteration_steps: int = 5
-    # [1] Relative decrease of the cost below which an outer iteration ends.
+    # [1] An outer iteration ends if a step decreases the cost by less than this fraction.
     min_relative_decrease: float = 1e-4
-    # [1] Alternations of rigid bodies and residual terms.
+    # [1] Number of alternations between the fits of rigid bodies and of residual terms.
     alternations: int = 3
-    # [1] Evenly spread samples of the first outer iterations; the last ones use all samples.
+    # [1] Number of evenly spaced samples in the stages before the selection of residual terms; the final fit uses all.
     initial_samples: int = 2**10
     # [1] Largest number of windows of 5 samples from which the scales of the motion are computed.
     max_windows: int = 2**12
-    # [1] Largest number of validation windows on which the fitted model is measured.
+    # [1] Largest number of windows on which the fitted model is validated.
     validation_windows: int = 2**8
-    # [1] Samples for the selection of residual terms.
+    # [1] Largest number of samples for the selection of residual terms.
     residual_samples: int = 2**14
-    # [1] Smallest noise, as a fraction of a torque's standard deviation: noise-free samples are fitted to four digits.
+    # [1] Lower bound of the noise, as a fraction of the torque's standard deviation, for samples without noise.
     min_noise: float = 1e-4
-    # [1] Standard deviations by which the coefficient of friction compensation must differ from zero.
+    # [1] Number of standard deviations by which the slope of a friction compensation must differ from zero.
     min_significance: float = 4.0
-    # [1] Smallest standard deviation of friction compensation, as a fraction of the torque's: delays of
-    # milliseconds have a similar but smaller effect.
+    # [1] Smallest standard deviation of a friction compensation, as a fraction of the torque's standard deviation.
+    # Delays of milliseconds have a similar but smaller effect.
     min_compensation: float = 0.05
-    # [1] Samples of one block: some 100 MB for seven joints with their derivatives.
+    # [1] Number of samples per block: a block and its derivatives need some 100 MB of memory for seven joints.
     block: int = 2**13
-    # [B] Largest size of the regressors: 70,000 samples of six joints; of more samples a subset is used.
+    # [B] Memory of the regressors, which limits the number of samples to 70,000 for six joints. Larger logs are
+    # subsampled.
     regressor_bytes: float = 4e8
-    # [1] Largest step of a body, as a fraction of the distance to physically inconsistent parameters.
+    # [1] Largest step of a body's inertial parameters, as a fraction of the step to physically inconsistent parameters.
     body_step: float = 0.3
-    # [1] Relative standard deviation above which logs do not determine an inertia.
+    # [1] A warning names inertias whose relative standard deviation exceeds this value.
     undetermined: float = 0.5
-    # [1] Relative standard deviation above which logs do not determine a motor gain: its 95 % interval then reaches
-    # 20 % to either side, as the difference of two datasheets does.
+    # [1] A warning names motor gains whose relative standard deviation exceeds this value: the 95 % interval is then
+    # wider than +-20 %, which is the difference between two datasheets.
     undetermined_gain: float = 0.1
-    # [1] nMSE of held-out seconds above which logs do not support the fit at a joint.
+    # [1] A warning names joints whose nMSE of held-out segments exceeds this value.
     unsupported: float = 0.5
-    # [1] Factor of the prior standard deviation of URDF masses above which the URDF is wrong.
+    # [1] A warning states that the URDF is wrong if the prior standard deviation of its masses exceeds this factor.
     wrong_urdf: float = 5.0
-    # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
+    # [1] A warning names joints whose torque residual divided by the inertial torque exceeds this value: the predicted
+    # motion is then unreliable.
     weak_acceleration: float = 2.0
-    # [1] Prior standard deviations of an adapted fit, about the parameters of its source, by adapted part. load: mass
-    # known to a factor of twenty (with 10 in place of 3 half a second of motion has an error of 27 times the variance
-    # of the torque, UR10e). friction: warmth changes the friction of all joints by tens of per cent, of a single joint
-    # less (Bittencourt and Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: units of one make also
-    # differ by a few per cent in mass.
+    # [1] Prior standard deviations of an adapted fit, for each value of the option `adapt`; the prior mean is the
+    # source fit. load: the mass is known to a factor of twenty. With a width of 10 in place of 3, a fit to half a
+    # second of motion of a UR10e has an error of 27 times the variance of the torque. friction: temperature changes
+    # the common factor of all joints by tens of per cent, the deviations of single joints by less (Bittencourt and
+    # Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: units of one arm model also differ in mass, by a
+    # few per cent.
     priors: Mapping[Adaptation, GaussianPrior] = field(
         default_factory=lambda: {
             "load": GaussianPrior(bodies=3.0),
@@ -103,31 +108,33 @@ class TorqueTuning:
 
 @dataclass(frozen=True)
 class ResidualTuning:
-    """Selection of residual terms (`fitting.torque.selection`)."""
+    """Constants of the selection of residual terms (`fitting.torque.selection`)."""
 
-    # [1] Contiguous blocks of samples, each held out once.
+    # [1] Number of contiguous blocks of samples, each of which is held out once.
     folds: int = 10
-    # [1] Correlation times that are left out between fitted and held-out samples.
+    # [1] Gap between fitted and held-out samples, in correlation times.
     gap: float = 2.5
     # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
     # degrees of freedom.
     standard_errors: float = 2.82
-    # [1] Standard errors for samples of one recording, whose motion may repeat errors: p = 0.001.
+    # [1] The same number for one or two recordings, whose motion may repeat errors: p = 0.001.
     standard_errors_of_one: float = 4.30
-    # [1] Largest torque of position that one recording supports, as a fraction of the joint's torque.
+    # [1] Largest standard deviation of a position-dependent torque that is selected on one or two recordings, as a
+    # fraction of the standard deviation of the joint's torque.
     max_torque_fraction: float = 0.5
-    # [1] Gravity torque of a joint, as a fraction of its torque, below which it has no spring to balance it.
+    # [1] A joint has no spring that balances its load if the standard deviation of its gravity torque is below this
+    # fraction of the standard deviation of its torque.
     min_load_fraction: float = 0.1
     # [1] Smallest error reduction of a residual term.
     min_reduction: float = 1e-3
     # [1] A later term is preferred to the best one so far only if its residual is below this fraction of the residual
     # of the best one.
     preference_ratio: float = 0.9
-    # [1] Samples to which networks are fitted.
+    # [1] Largest number of samples to which networks are fitted.
     network_samples: int = 2**12
-    # [1] Evaluations of the loss after which a network without error reduction is discarded.
+    # [1] Number of evaluations of the loss after which a network is discarded if it does not reduce the error.
     network_probe_evaluations: int = 20
-    # [1] Evaluations of the loss of a network.
+    # [1] Number of evaluations of the loss in the fit of a network.
     network_evaluations: int = 100
 
 
