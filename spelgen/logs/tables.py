@@ -186,7 +186,7 @@ def _renaming(
     named = [
         joint for names in of_quantity.values() for x, joint in zip(names, joints, strict=True) if x == name
     ]
-    # columns of accelerations are not proposed for a missing torque: files of `excite` contain both
+    # columns of accelerations are not proposed in place of torques: files of `excite` contain both
     unused = [
         x
         for x in columns
