@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from spelgen.simulation.as_built import as_built as as_built
     from spelgen.simulation.simulate import simulate as simulate
 
-# Names of the API by the module that defines them; a module is imported at the first use of a name (PEP 562), so that
+# Module -> the names of the API that it defines. A module is imported at the first use of a name (PEP 562), so that
 # `import spelgen` is fast.
 _MODULES = {
     "arm.configured_arm": "load_arm Arm",

@@ -1,4 +1,4 @@
-"""Design: the form of each quantity of a model, as in the file of a preset; validated when it is created."""
+"""Design of a model: the form of each quantity of the equations of motion. Presets are designs in YAML files."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -17,10 +17,10 @@ BREAKAWAY = {
     "revolute": (1e-4, 4e-4, 1.6e-3, 6.4e-3, 2.5e-2, 1e-1),
     "prismatic": (1e-5, 4e-5, 1.6e-4, 6.4e-4, 2.5e-3, 1e-2),
 }
-"""Break-away displacements of the bristles per joint type [rad, m]: presliding of gears covers such decades."""
+"""Break-away displacements of the bristles per joint type [rad, m]. They span the decades of presliding of gears."""
 SERVO_STRIBECK_ROUNDING = 0.2
 """Rounding of the Stribeck curve at rest, as a fraction of the Stribeck velocity, for joints that servos hold at rest.
-Their friction decreases from rest on; otherwise they creep.
+The friction of such joints decreases from standstill on; with a rounded curve, simulated joints would creep.
 """
 
 
@@ -31,10 +31,12 @@ PRESETS = Path(__file__).parent / "presets"
 class Design:
     """The form of each quantity of the equations of motion.
 
-    derived: with the structure of the arm. dense: without knowledge of the arm (Wang et al., Sci Rep 15:33179, 2025,
-    and Duong et al., IEEE T-RO 40:3695, 2024); 3n: over all three axes of each joint. closed-form: rigid bodies with
-    trained inertial parameters, and networks for residual terms, if any. constants: friction model with trained
-    constants. Raises SettingsError for an inconsistent combination.
+    Values of the fields: ``derived`` is a quantity with the structure of the arm. ``dense`` is a quantity without
+    knowledge of the arm (Wang et al., Sci Rep 15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024); its suffix
+    ``3n`` means all three axes of each joint. ``closed-form`` means rigid bodies with trained inertial parameters, and
+    networks for residual terms, if any. ``constants`` is a friction model with trained constants.
+
+    Raises SettingsError for an inconsistent combination.
     """
 
     mass: Literal["derived", "dense-3n", "closed-form"]
@@ -42,12 +44,14 @@ class Design:
     dissipation: Literal["per-joint", "dense-n", "dense-3n", "constants"]
     input: Literal["derived", "dense-3n"]
     memory: Literal["bristles", "none"]
-    """Friction state: bristles, or none for friction that depends on the rate only."""
+    """State of the friction model: bristles (hysteresis), or none for friction that depends on the velocity only."""
     net: Literal["mlp", "kan", "none"]
-    """Networks of M and V: tanh or Kolmogorov-Arnold; residual networks in addition to rigid bodies: tanh."""
+    """Type of the networks of M and V: mlp (tanh) or kan (Kolmogorov-Arnold). Residual networks are always tanh."""
     encoding: Literal["joint", "lie-group", "none"]
-    """Inputs of a network: cos q and sin q, or scaled q, of the joints that it depends on; or the nine or three numbers
-    of R or r of every joint.
+    """Inputs of a network. joint: cos q and sin q, for a prismatic joint scaled q, of the joints it depends on.
+
+    lie-group: for every joint the nine entries of its rotation matrix R, or the three entries of its translation r.
+    none: the design has no such network.
     """
 
     def __post_init__(self) -> None:
@@ -62,7 +66,7 @@ def load_design(preset: str | Path | Design) -> Design:
     """Return the design of a preset of spelgen, or of a YAML file. Raises SettingsError."""
     if isinstance(preset, Design):
         return preset
-    # names first: a file without suffix cannot hide a preset
+    # The name of a preset takes precedence over a file of the same name without a suffix.
     if str(preset) in PRESET_NAMES:
         return _read(PRESETS / f"{preset}.yaml")
     if Path(preset).suffix in (".yaml", ".yml"):
@@ -77,7 +81,7 @@ def _read(path: Path) -> Design:
     content = document.value()
     if not isinstance(content, dict):
         raise SettingsError("no keys with values", file=path, expected=f"the keys {', '.join(CHOICES)}")
-    # the description is for readers of the file
+    # `about` is a description for people, not a field of `Design`.
     values = {key: value for key, value in content.items() if key != "about"}
     validate(values, document)
     return Design(**values)
@@ -103,7 +107,7 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
                 f"one of {', '.join(choices)}",
             )
             errors.append(SettingsError(got, file=file, line=lines[name], element=name, expected=expected))
-    # wrong values first: whether a wrong value conflicts with another one is unknown
+    # Invalid values are raised before conflicts are searched: a conflict is defined between valid values only.
     collect(errors)
     for first, second, do in _conflicts(values):
         got = f"{first}: {values[first]} with {second}: {values[second]}"
@@ -112,8 +116,8 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
 
 
 def _conflicts(values: Mapping[str, object]) -> Iterator[tuple[str, str, str]]:
-    """Yield pairs of keys with contradicting values, and advice."""
-    # rules in the order in which a reader of the file meets the keys
+    """Yield each pair of keys whose values contradict each other, with advice."""
+    # The rules have the order of the keys in a file, so that errors appear in the order of the file's lines.
     rigid = values["mass"] == "closed-form"
     if rigid != (values["potential"] == "closed-form"):
         yield "mass", "potential", "rigid bodies give both: name closed-form for both or for neither"

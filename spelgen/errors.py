@@ -13,9 +13,9 @@ MAX_TEXT = 2000  # number of printed characters of a part of a message
 
 @dataclass(eq=False, repr=False)
 class SpelgenError(Exception):
-    """An error printed as ``FILE:LINE: element: got X, expected Y; do Z``, without the absent parts.
+    """An error printed as ``FILE:LINE: element: got X, expected Y; do Z``; parts that are None are not printed.
 
-    Without ``expected``, ``got`` is a full statement, printed without the word "got".
+    If ``expected`` is None, ``got`` is a full statement, printed without the word "got".
     """
 
     got: str
@@ -27,16 +27,16 @@ class SpelgenError(Exception):
     do: str | None = None
 
     def __post_init__(self) -> None:
-        # `args` are the arguments of a copy, such as the one that Ray makes of an error of a worker
+        # Python constructs the copy of an exception from `args`; Ray copies an error of a worker in this way.
         super().__init__(self.got)
-        # errors are compared by their files, which callers name as text or as a path
+        # Callers give the file as text or as a path. `SpelgenErrors` compares the files of errors, so both become text.
         self.file = None if self.file is None else str(self.file)
 
     def __str__(self) -> str:
         statement = _in_short(self.got)
         if self.expected is not None:
             statement = f"got {statement}, expected {_in_short(self.expected)}"
-        # the form of compilers, from which editors jump to the line
+        # Compilers print FILE:LINE in this form, and editors open the file at that line.
         location = ":".join(str(x) for x in (self.file, self.line) if x is not None)
         message = ": ".join(x for x in (_in_short(location), _in_short(self.element or ""), statement) if x)
         if self.do is not None:
@@ -57,7 +57,7 @@ class SettingsError(SpelgenError):
 
 
 class OptionError(SettingsError):
-    """An option that does not apply; the text names the command or setting that it belongs to."""
+    """An option that does not apply; the text names the command or setting that the option belongs to."""
 
     def __init__(self, option: str, belongs: str) -> None:
         super().__init__(belongs, element=option)
@@ -85,7 +85,7 @@ class SpelgenErrors(SpelgenError):
         self.errors = tuple(errors)
 
     def __str__(self) -> str:
-        # a folder of logs from one logger has the same error in every file
+        # All logs of one logger often have the same error, which is printed once for all files.
         groups: dict[tuple[object, ...], list[SpelgenError]] = {}
         for error in self.errors:
             key = (error.line, error.element, error.got, error.expected, error.do)
@@ -127,7 +127,7 @@ def collect(errors: Sequence[SpelgenError]) -> None:
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a hint for an unknown ``name``: the closest of the known ``names``, or the first ten."""
     names = list(names)
-    # one name: a list of similar names would have to be read
+    # Only the closest name is suggested: it is most often the intended one, and a list takes time to read.
     nearest = get_close_matches(name, names, n=1)
     if nearest:
         return f"did you mean {nearest[0]!r}?"
@@ -138,7 +138,7 @@ def suggestion(name: str, names: Iterable[str]) -> str:
 def shortened(names: Sequence[str], limit: int) -> str:
     """Return the names, or the first ``limit`` of them and the number of the others."""
     omitted = len(names) - limit
-    # `and 1 more` is longer than most names
+    # A single omitted name is printed: most names are shorter than `and 1 more`.
     if omitted <= 1:
         return ", ".join(names)
     return ", ".join([*names[:limit], f"and {omitted} more"])
@@ -158,5 +158,5 @@ class Diagnostic:
         return f"{self.severity}: {self.where}: {self.message}"
 
     def to_dict(self) -> dict[str, object]:
-        """Return the five fields as a JSON object, in the order of the public contract."""
+        """Return the five fields as a JSON object; their order is part of the public interface."""
         return asdict(self)

@@ -1,7 +1,7 @@
 """Reading of regular files, atomic writing of files, and local copies of files at addresses.
 
-Addresses are URLs of fsspec, such as `s3://bucket/logs`. All other code works on local paths: a copy is in a temporary
-folder until the process ends, and files written to it are sent to the address.
+Addresses are URLs of fsspec, such as `s3://bucket/logs`. All other modules work on local paths: the local copy of an
+address is in a temporary folder until the process ends, and files written to the copy are sent to the address.
 """
 
 import atexit
@@ -44,10 +44,10 @@ def read_bytes(
         do: advice for a file that is too large.
     """
     try:
-        # The size is read first: a sparse file of many gigabytes takes no space.
+        # The size is checked before reading: a sparse file can state many gigabytes without occupying disk space.
         size = path.stat().st_size
         require_regular_file(path, error, kind)
-        # a parser of JSON cannot be interrupted, so its input is limited
+        # The parsers of JSON and Python cannot be interrupted, so the size of their input is limited.
         if size <= largest:
             return path.read_bytes()
     except FileNotFoundError:
@@ -59,12 +59,12 @@ def read_bytes(
 
 
 def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
-    """Return the object in a JSON file. Raises ``error`` if the file is absent, broken or contains another value."""
+    """Return the object in a JSON file. Raises ``error`` if the file is absent, malformed, or contains no object."""
     try:
         content = json.loads(read_bytes(path, error))
     except (ValueError, RecursionError) as problem:
         raise error(f"broken JSON ({problem})", file=path) from problem
-    # all files of spelgen are objects, which can get further keys
+    # All JSON files of spelgen are objects, because later versions can add keys to an object.
     if not isinstance(content, dict):
         raise error(f"{type(content).__name__} in JSON", file=path, expected="an object")
     return content
@@ -72,14 +72,15 @@ def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
 
 @contextmanager
 def limited_memory(size: int) -> Iterator[None]:
-    """Limit additional memory of the process to ``size`` bytes; more raises MemoryError.
+    """Limit the additional memory of the process to ``size`` bytes; a larger allocation raises MemoryError.
 
-    For readers of other packages, which allocate sizes stated in a file without a check. No effect except on Linux.
+    The limit protects from readers of other packages, which allocate the size that a file states without checking it.
+    It has an effect on Linux only.
     """
     try:
         import resource
 
-        # The limit of Linux is on the whole address space: the current size of the process is added.
+        # Linux limits the whole address space, so the current size of the process is added to `size`.
         pages = int(Path("/proc/self/statm").read_text().split()[0])
     except (ImportError, OSError):
         yield
@@ -97,20 +98,20 @@ def limited_memory(size: int) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path | str) -> Iterator[Path]:
-    """Yield a hidden file in the same folder, which finally replaces `path` atomically, even if power fails.
+    """Yield a hidden file in the folder of `path`; at the end it replaces `path` atomically, even if power fails.
 
-    Creates the folder, and sends the file to its address if it has one. An interrupted or failed write does not change
-    `path`. Raises OSError with the path if it cannot be written, for instance on a full disk.
+    An absent folder is created, and a file with an address is sent to the address. An interrupted or failed write does
+    not change `path`. Raises OSError with the path if the file cannot be written, for instance on a full disk.
     """
     path = Path(path)
     with naming(path):
-        # a new run folder is no reason for a command to fail after minutes of work
+        # An absent folder is created: otherwise a command would fail after minutes of work.
         path.parent.mkdir(parents=True, exist_ok=True)
-        # In the same folder: a file is renamed atomically only within a file system.
+        # The hidden file is in the same folder, because renaming is atomic only within one file system.
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
             yield unfinished
-            # without it, a power failure could occur after the renaming and before the content is on disk
+            # fsync puts the content on disk before the file is renamed: a power failure cannot result in an empty file.
             with unfinished.open("rb+") as file:
                 os.fsync(file.fileno())
             os.replace(unfinished, path)
@@ -120,7 +121,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, if it exists, also at its address."""
+    """Remove a file if it exists; for the copy of an address, also remove the file at the address."""
     path.unlink(missing_ok=True)
     sent(path)
 
@@ -153,19 +154,20 @@ def write_json(path: Path | str, content: Mapping[str, object]) -> Path:
     return write_text(path, json.dumps(content, indent=2) + "\n")
 
 
-# `Path` reduces two slashes to one; a Windows drive is one letter
+# One slash is accepted, because `Path` reduces two slashes to one. A scheme has at least two letters, because `C:/`
+# is a drive of Windows.
 ADDRESS = re.compile(r"^([a-z][a-z0-9+.-]+):/+(?=[^/])")
 
-_copies: dict[str, Path] = {}  # address -> its local copy
+_copies: dict[str, Path] = {}  # address -> local copy
 
 
 def local(path: Path | str) -> Path:
     """Return a local path unchanged, and for an address the local copy of its file or folder.
 
     Files written to the copy are sent to the address (see `sent`). Raises SpelgenError if the address cannot be
-    reached, or has keys outside itself.
+    reached, or if a key of the object store would be copied to a path outside the copy.
     """
-    # a local file whose name looks like an address takes precedence
+    # A local file whose name has the form of an address takes precedence over the address.
     match = ADDRESS.match(str(path))
     if match is None or Path(path).exists():
         return Path(path)
@@ -178,7 +180,7 @@ def local(path: Path | str) -> Path:
 
 
 def sent(path: Path) -> None:
-    """Send a written file to its address, or remove it there if it was removed here."""
+    """Copy a written local file to its address, or remove the file at the address if the local file was removed."""
     target = address_of(path)
     if target is None:
         return
@@ -227,9 +229,9 @@ def reached(address: str) -> Iterator[tuple[Any, str]]:
 def _fetch(address: str) -> Path:
     """Copy the file or folder at an address into a new temporary folder; return the path of the copy."""
     folder = Path(tempfile.mkdtemp(prefix="spelgen-"))
-    # Copies live as long as the process: results are sent when they are written.
+    # Copies are removed at the end of the process; written results were sent to the address before.
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    # The copy has the name of the original, whose suffix decides how it is read.
+    # The copy keeps the name of the original, because the suffix selects the reader.
     copy = _inside(folder, address.rpartition("/")[2], address)
     with reached(address) as (system, remote):
         if system.isdir(remote):
@@ -244,7 +246,7 @@ def _fetch(address: str) -> Path:
 
 
 def _inside(folder: Path, name: str, address: str) -> Path:
-    """Return the path of a name in a folder. Raises SpelgenError if it is outside the folder.
+    """Return the path of a name in a folder. Raises SpelgenError if the path is outside the folder.
 
     Archives and object stores accept any text as a key, such as `../../.bashrc`.
     """

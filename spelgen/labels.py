@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 
-# predictors in results, charts and tables
+# Names of predictors in results, charts and tables.
 MODEL = "model"  # the trained model
 CONSTANT_VELOCITY = "velocity stays constant"
 URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
@@ -28,14 +28,14 @@ UNITS = {"revolute": Units("rad", "rad/s", "Nm", "kg m²"), "prismatic": Units("
 
 
 INERTIAL_PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
-"""Ten per body: mass, first moment, tensor about the origin of the joint's frame."""
+"""Inertial parameters of a body: mass, first moment, and inertia tensor about the origin of the joint's frame."""
 # The first parameter of a group of regrouped parameters names the group. Iyy, hz and m come last, because those
 # parameters of a body with a revolute joint can always be regrouped into others.
 BASE_ORDER = ("Izz", "Ixx", "Ixy", "Ixz", "Iyz", "hx", "hy", "m", "Iyy", "hz")
 
 
 def parameter_name(index: int) -> str:
-    """Return the name of an inertial parameter: ``Izz2`` is the tensor component zz of the second body."""
+    """Return the name of an inertial parameter (index from 0), such as ``Izz2``: component zz of the second body."""
     return f"{INERTIAL_PARAMETERS[index % 10]}{index // 10 + 1}"
 
 
@@ -47,19 +47,19 @@ class NamedJoint:
     units: Units
 
     def axis(self, quantity: str, label: str = "") -> str:
-        """Return ``label [rad]`` with the unit of ``position``, ``velocity`` or ``torque``."""
+        """Return ``label [rad]``, with the joint's unit of the quantity ``position``, ``velocity`` or ``torque``."""
         return f"{label or quantity} [{asdict(self.units)[quantity]}]"
 
 
 def named_joints(names: Sequence[str], joint_types: Sequence[str]) -> list[NamedJoint]:
-    """Return the joints with the units of their types."""
+    """Return the named joints, each with the units of its joint type."""
     return [NamedJoint(name, UNITS[x]) for name, x in zip(names, joint_types, strict=True)]
 
 
 def joint_ranges(joints: tuple[int, ...]) -> str:
-    """Return the numbers of joints, from 1, with ranges of three or more: ``2-6`` or ``2,4``."""
+    """Return joint numbers (from 1) as text; three or more consecutive numbers form a range: ``2-6`` or ``2,4``."""
     texts = []
-    # consecutive joints have the same difference to their places
+    # Joint number minus position in the list is constant over consecutive joints.
     for _, indices in groupby(range(len(joints)), key=lambda index: joints[index] - index):
         run = [str(joints[index] + 1) for index in indices]
         texts += [f"{run[0]}-{run[-1]}"] if len(run) > 2 else run
@@ -72,8 +72,8 @@ def joints_in_ranges(joints: tuple[int, ...]) -> str:
 
 
 def entry_name(row: int, column: int) -> str:
-    """Return the name of an entry of M with indices from 0: M21, or M12,1 from the tenth joint."""
-    # M111 could be row 1 and column 11, or row 11 and column 1
+    """Return the name of an entry of M: ``M21`` for row 1 and column 0; with a comma from ten on, ``M12,1``."""
+    # Without a comma M111 could mean row 1 and column 11, or row 11 and column 1.
     comma = "," * (max(row, column) >= 9)
     return f"M{row + 1}{comma}{column + 1}"
 
@@ -102,26 +102,26 @@ def counted(count: int, noun: str) -> str:
 
 def share(fraction: float, reference: str = "") -> str:
     """Return ``5 % of the motion``, or ``13.6 times the motion`` for a fraction above 1."""
-    # 250 % of the motion is harder to imagine than 2.5 times the motion
+    # Above 1 a factor is easier to understand than a percentage: 2.5 times the motion, not 250 %.
     if fraction > 1:
         return f"{fraction:.3g} times {reference}".rstrip()
-    # four digits close to 100 %
+    # Four digits close to 100 %, so that 99.96 % is not rounded to 100 %.
     digits = 4 if 0.99 <= fraction < 1 else 3
     percent = f"{100 * fraction:.{digits}g} %"
     return f"{percent} of {reference}" if reference else percent
 
 
 def printable(text: str, allowed: str = "") -> str:
-    """Return text from a file with escaped control characters, except the characters ``allowed``."""
+    """Return text from a file with its control characters escaped, except for the characters in ``allowed``."""
     safe = (x if x.isprintable() or x in allowed else x.encode("unicode_escape").decode() for x in text)
     return "".join(safe)
 
 
 def short_name(name: str) -> str:
     """Return a name from a file for a line of a table: shortened, without control characters."""
-    # line ends and tabs of a name would break the table
+    # Line ends and tabs in a name would break the layout of the table.
     line = " ".join(printable(name).split())
-    # a table of 80 columns has room for a name of 36 characters
+    # A table of 80 characters has room for names of 36 characters.
     return f"{line[:33]}..." if len(line) > 36 else line or '""'
 
 
@@ -132,10 +132,10 @@ def thousandths(joint_types: Sequence[str]) -> str:
 
 
 def observed(predictor: str) -> str:
-    """Return the name of the predictor with the constant disturbance that a momentum observer estimates."""
+    """Return the name of a predictor that adds the constant disturbance estimated by a momentum observer."""
     return f"{predictor} + observer"
 
 
 def is_drawn(predictor: str) -> bool:
-    """True if charts show the predictor: with an observer only the model is shown."""
+    """Return True if charts show a predictor. Of the predictors with an observer, only the model's is shown."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

@@ -11,17 +11,17 @@ from typing import Literal
 
 WIDTH = 80
 MIN_NAME = 8
-"""Characters of the name of a row in one line, if a table is too wide; longer names are wrapped."""
-SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s\))")  # a name may be wrapped after it
+"""Smallest width of the first column [characters], to which names of rows are wrapped if a table is too wide."""
+SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s\))")  # places at which a name may be wrapped
 
 
 @dataclass(frozen=True)
 class Listing:
     """A table with a name in the first column; the columns in `left` are aligned to the left, others to the right.
 
-    text(): the title, the head and the rows, indented by two, then the note. In a table wider than 80 characters names
-    are wrapped, not numbers; if that is not sufficient, the table is split into several. html(): for notebooks, with
-    escaped text.
+    text() returns the title, the head and the rows, indented by two blanks, then the note. In a table wider than 80
+    characters, names are wrapped, not numbers; if the table is still too wide, it is split into several tables.
+    html() returns the table for notebooks, with escaped text.
     """
 
     title: str
@@ -34,7 +34,7 @@ class Listing:
         """Return the table for a terminal or a file, without a line end."""
         columns = list(map(list, zip(self.head, *self.rows, strict=True)))
         tables = "\n\n".join(self._layout(columns, group) for group in _groups(_fitted(columns)))
-        # indented as the rows, so that the next title is found at a glance
+        # The note is indented like the rows, so that titles, which are not indented, are easy to find.
         note = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
         return "\n".join([*textwrap.wrap(self.title, WIDTH), tables, *note])
 
@@ -56,7 +56,7 @@ class Listing:
         return "left" if column in self.left else "right"
 
     def _layout(self, columns: Sequence[Sequence[str]], group: Sequence[int]) -> str:
-        """Return the table of the names of rows and the columns of a group."""
+        """Return the table that consists of the first column (names of rows) and the columns with indices `group`."""
         names, *chosen = _fitted([columns[column] for column in (0, *group)])
         room = WIDTH - 2 * (1 + len(group)) - sum(map(_width, chosen))
         chosen.insert(0, [_folded(name, max(MIN_NAME, room)) for name in names])
@@ -75,18 +75,18 @@ def _fitted(columns: Sequence[Sequence[str]]) -> list[Sequence[str]]:
     """Return the columns, with wrapped heads if the table is too wide."""
     if sum(2 + _width(column) for column in columns) <= WIDTH:
         return list(columns)
-    # heads of fewer than 14 characters are not wrapped: most words would be cut
+    # Heads are wrapped to at least 14 characters: in narrower heads most words would be cut.
     return [columns[0], *([_folded(head, max(14, _width(cells))), *cells] for head, *cells in columns[1:])]
 
 
 def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
-    """Return the columns in groups, each of which fits into the width together with the names of rows."""
-    # Names of rows are wrapped first, since they can be; numbers cannot.
+    """Return groups of column indices; each group fits into the page width together with the names of rows."""
+    # Names of rows are wrapped before the table is split; numbers cannot be wrapped.
     words = [word for name in columns[0][1:] for word in SEPARATOR.split(name)]
     room = WIDTH - 2 - max(MIN_NAME, _width(words))
     groups: list[list[int]] = [[]]
     used = 0
-    # greedy: columns keep their order, and only the last table may be narrow
+    # Greedy filling keeps the order of the columns, and only the last table may be narrow.
     for column in range(1, len(columns)):
         width = 2 + _width(columns[column])
         if used and used + width > room:
@@ -115,13 +115,13 @@ def _folded(name: str, width: int) -> str:
 
 
 def number(value: float | None) -> str:
-    """Return a number with three significant digits, from 1000 an integer, and all digits of a count.
+    """Return a float with three significant digits, or as an integer from 1000 on; an int with all its digits.
 
-    None and numbers that are not finite are shown as a dash.
+    None and numbers that are not finite become a dash.
     """
     if value is None or not math.isfinite(value):
         return "-"
-    # a count is exact: rounding would hide a lost sample
+    # Integers are counts, of samples for example: rounding would hide a lost sample.
     if isinstance(value, int):
         return f"{value:,}"
     # Plain decimals in the range in which three digits need no exponent.

@@ -1,7 +1,7 @@
 """ModelSpec: everything that a model is made of, as frozen data with a canonical JSON form.
 
-It is the boundary between deriving and training: the derivation of structure produces it, and models are
-assembled and modules are written from it.
+The derivation of an arm's structure produces a ModelSpec; models are assembled and modules are written from it.
+It is thus the interface between the derivation of structure and the training of models.
 """
 
 import hashlib
@@ -18,19 +18,19 @@ from spelgen.urdf.robot import Assume, JointType
 Kind = Literal["zero", "constant", "varying"]
 Triple = tuple[float, float, float]
 Entries = tuple[tuple[int, int, float], ...]
-"""A sparse symmetric matrix by its lower triangle: (row, column, value), from 0."""
+"""Lower triangle of a sparse symmetric matrix: (row, column, value) of each entry, with indices from 0."""
 
-# Format of specifications. It changes when a specification, or weights, of an earlier version cannot be used any more.
+# Version of the format. It changes when specifications or weights of an earlier version of spelgen become unusable.
 SPEC_FORMAT = 9
 
 
 @dataclass(frozen=True)
 class Options:
-    """The options of `spelgen build`; with the URDF they determine the model."""
+    """The options of `spelgen build`; URDF and options determine the model."""
 
     preset: str = "hybrid"
     design: Design | None = None
-    """None: the preset of this name, which comes with spelgen."""
+    """Design from a YAML file; None for the design of spelgen that ``preset`` names."""
     assume: Assume = "kinematics"
     joints: tuple[str, ...] | None = None
     tip: str | None = None
@@ -40,7 +40,7 @@ class Options:
 
     def __post_init__(self) -> None:
         """Raise SettingsError for networks that are too large for memory."""
-        # weights in the hidden layers of one network: 134 MB in double precision
+        # Largest number of weights in the hidden layers of one network: 134 MB in double precision.
         max_weights = 2**24
         if not (self.width >= 1 and 1 <= self.depth <= 16 and self.width**2 * self.depth <= max_weights):
             expected = f"1 to 16 layers of at least 1, with at most {max_weights:,} weights"
@@ -49,7 +49,7 @@ class Options:
 
 @dataclass(frozen=True)
 class JointSpec:
-    """A joint by its name in the URDF; units are rad or m, and Nm or N."""
+    """A joint of the model. Units of a revolute joint are rad and Nm, of a prismatic joint m and N."""
 
     name: str
     joint_type: JointType
@@ -67,20 +67,20 @@ class JointSpec:
     gear: float
     """Revolutions of the motor per revolution of the joint."""
     mass_sensitivity: float
-    """Change of M with this joint, relative to the joint of the largest change."""
+    """Change of M with the position of this joint, divided by the largest such change of all joints."""
     potential_sensitivity: float
-    """The same of V."""
+    """Change of V with the position of this joint, divided by the largest such change of all joints."""
 
 
 @dataclass(frozen=True)
 class LinkSpec:
-    """A rigid body and its initial inertial parameters, in the frame of its joint, whose z is the axis."""
+    """A rigid body and its initial inertial parameters, in the frame of its joint; the z axis is the joint axis."""
 
     name: str
     parent: int
-    """Index of the link that carries it; -1: the base."""
+    """Index of the link that carries this link; -1: the base."""
     joint: int
-    """Index of the joint that moves it by ratio * q + offset."""
+    """Index of the joint whose position q moves this link by ratio * q + offset."""
     joint_type: JointType
     ratio: float
     offset: float
@@ -90,21 +90,21 @@ class LinkSpec:
     mass: float
     center_of_mass: Triple
     inertia: tuple[float, float, float, float, float, float]
-    """About the center of mass, (xx, xy, xz, yy, yz, zz) [kg m^2]."""
+    """Inertia tensor about the center of mass, (xx, xy, xz, yy, yz, zz) [kg m^2]."""
 
 
 @dataclass(frozen=True)
 class ServoSpec:
-    """The position servo of a joint; N and m instead of Nm and rad if it is prismatic."""
+    """The position servo of a joint. For a prismatic joint the units are N and m instead of Nm and rad."""
 
     kp: float
-    """Torque per distance from the command, the initial value [Nm/rad]."""
+    """Initial value of the proportional gain: torque per position error [Nm/rad]."""
     known: bool
     """Whether kp is known, and therefore not trained."""
     kd: float
-    """Torque per velocity, the initial value [Nm s/rad]."""
+    """Initial value of the damping gain: torque per velocity [Nm s/rad]."""
     limit: float | None
-    """Largest torque; None: unlimited."""
+    """Largest torque [Nm]; None: unlimited."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class ConstantSpec:
 
 @dataclass(frozen=True)
 class InputSpec:
-    """An entry of the input matrix G: the torque of a joint per input of a motor."""
+    """An entry of the input matrix G: torque of one joint divided by the input of one motor."""
 
     joint: int
     motor: int
@@ -138,7 +138,7 @@ class InputSpec:
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """A model; indices are from 0. Raises ModuleError if indices and names contradict each other."""
+    """Specification of a model; indices are from 0. Raises ModuleError if indices and names contradict each other."""
 
     robot: str
     urdf: str
@@ -148,35 +148,35 @@ class ModelSpec:
     design: Design
     joints: tuple[JointSpec, ...]
     entries: tuple[tuple[int, int, Kind, tuple[int, ...]], ...]
-    """(row, column, kind, joints) of the lower triangle of M, for people."""
+    """Description of the lower triangle of M: (row, column, zero/constant/varying, joints it depends on)."""
     outputs: tuple[OutputSpec, ...]
     constants: tuple[ConstantSpec, ...]
     potential: tuple[int, ...]
     """The joints that V depends on."""
     potential_scale: float
     margin: float
-    """Smallest eigenvalue of M relative to the nominal mean of M, below which M is corrected."""
+    """Lower bound of the eigenvalues of M, relative to the nominal mean of M; M is corrected below this bound."""
     started_from_urdf: bool
     """Whether the initial inertial parameters are from the URDF."""
     links: tuple[LinkSpec, ...] = ()
-    """Of a model of rigid bodies."""
+    """Bodies of a rigid-body model; empty for other models."""
     inputs: tuple[InputSpec, ...] = ()
-    """Empty: each input is the torque of its own joint."""
+    """Entries of G; empty if each input is the torque of one joint (G is the identity)."""
     motor_speeds: tuple[tuple[float, ...], ...] = ()
-    """Rows of C: the motors rotate at C qd; empty: each motor drives its own joint."""
+    """Rows of C, which gives the motor velocities C qd; empty if each motor drives one joint (C is the identity)."""
     servos: tuple[ServoSpec, ...] = ()
-    """Of joints whose inputs are commanded positions."""
+    """Position servos of the joints; empty for an arm whose inputs are torques."""
 
     def __post_init__(self) -> None:
-        # A specification from a file is untrusted: an index beyond its table would fail in the middle of the
-        # assembly.
+        # A specification from a file is untrusted: without this check an index out of range would fail later,
+        # during the assembly of a model, with an unclear error.
         n, links = len(self.joints), self.links
         joints = [*self.potential, *(x.joint for x in links), *(j for x in self.outputs for j in x.joints)]
         bases = [x.basis for x in self.outputs] + [x.basis for x in self.constants]
         joints += [index for basis in bases for row in basis for index in row[:2]]
         joints += [index for x in self.inputs for index in (x.joint, x.motor)]
         joints += [index for row, column, _, depends in self.entries for index in (row, column, *depends)]
-        # logs and exports find joints and links by name
+        # Names must be unique, because logs and exports find joints and links by name.
         names = [joint.name for joint in self.joints], [link.name for link in links]
         consistent = (
             n > 0
@@ -201,7 +201,7 @@ class ModelSpec:
 
     def to_json(self) -> str:
         """Return the canonical JSON, in one line of ASCII."""
-        # Sorted keys and no blanks: equal specifications have equal digests.
+        # Keys are sorted and blanks omitted, so that equal specifications have equal digests.
         plain = {"format": SPEC_FORMAT, **asdict(self)}
         return json.dumps(plain, sort_keys=True, ensure_ascii=True, separators=(",", ":"))
 
@@ -217,7 +217,7 @@ def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
 
     try:
         content = json.loads(text, parse_constant=_no_number)
-        # The format is compared before the keys, so that the error of an older file is clear.
+        # The format version is compared before the keys: the error of an older file then names its version.
         version = content.pop("format") if isinstance(content, dict) and "format" in content else None
         if version != SPEC_FORMAT:
             expected = f"{SPEC_FORMAT}, of this version"
@@ -226,10 +226,10 @@ def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
                 f"a specification of format {version!r}", file=file, expected=expected, do=again
             )
         spec = TypeAdapter(ModelSpec).validate_python(content)
-        # Compared with its own JSON form: pydantic converts values and ignores unknown keys.
+        # The result is converted back to JSON and compared, because pydantic converts values and ignores unknown keys.
         if json.loads(spec.to_json()) == {"format": version, **content}:
             return spec
-        # not ignored: a specification that was edited by hand would be another model than its text states
+        # A difference is an error: otherwise the model would differ from the text of a file edited by hand.
         reason = "keys or values of other types"
     except (ValidationError, ValueError, RecursionError, SettingsError) as problem:
         reason = " ".join(str(problem).split())[:200]

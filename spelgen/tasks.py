@@ -29,15 +29,15 @@ class RunTasks(Protocol):
 
 def default_jobs() -> int:
     """Return the number of cores that this process may use if Ray is installed, else 1."""
-    # a container or a job of a scheduler may own fewer cores than the machine has
+    # The CPU affinity is counted, because a container or a scheduled job may have fewer cores than the machine.
     return 1 if find_spec("ray") is None else len(os.sched_getaffinity(0))
 
 
 def run_here(
     work: Callable[[Task], Result], tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result | Exception]]:
-    """Run one task after the other in this process."""
-    # the exception is yielded, not raised: one failed run must not stop the others
+    """Run one task after the other in this process; yield each task with its result or its exception."""
+    # An exception is yielded, not raised, so that a failed task does not stop the others.
     for task in tasks:
         try:
             outcome: Result | Exception = work(task)
@@ -50,25 +50,25 @@ def run_here(
 def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
     """Yield a function that runs tasks: `jobs` at a time with Ray on this machine, or on a cluster.
 
-    A single job at a time does not need Ray. address: of a running Ray cluster, "auto" for the one of this machine.
-    Raises RunError if Ray is not installed, and if no cluster answers.
+    A single job at a time runs in this process, without Ray. address: address of a running Ray cluster; "auto" for the
+    cluster of this machine. Raises RunError if Ray is not installed, or if no cluster answers.
     """
-    # In this process: no second interpreter, and errors keep their traceback.
+    # One job runs in this process: it needs no second interpreter, and errors keep their traceback.
     if jobs == 1 and address is None:
         yield run_here
         return
     if find_spec("ray") is None:
         do = "pip install 'spelgen[parallel]', or --jobs 1"
         raise RunError("several runs at a time without Ray", expected="the extra parallel", do=do)
-    # no usage statistics are sent
+    # Ray must not send usage statistics.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # avoids a warning of Ray about a changed default
+    # This value avoids a warning of Ray about a changed default.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     import ray
 
     cluster: dict[str, Any] = {"address": address}
     if address is None:
-        # Without the dashboard, which opens a port. Tasks exchange only paths and a few numbers: 100 MB are plenty.
+        # The dashboard would open a port. Tasks exchange only paths and a few numbers, for which 100 MB suffice.
         cluster = {"num_cpus": jobs, "include_dashboard": False, "object_store_memory": 100_000_000}
     try:
         ray.init(**cluster, log_to_driver=False, logging_level=logging.ERROR)
@@ -78,7 +78,7 @@ def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
         do = "start one by `ray start --head`, or omit --address"
         raise RunError(f"no Ray cluster at {location} ({reason})", do=do) from error
     try:
-        # Ray reports dead workers on stdout, which is for results
+        # Ray prints messages about dead workers to stdout, which must contain results only.
         with redirect_stdout(sys.stderr):
             yield _run_on_ray
     finally:
@@ -94,7 +94,7 @@ def _run_on_ray(
     remote: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_work_or_die)
     waiting = {remote.remote(work, task): task for task in tasks}
     try:
-        # in the order in which tasks end: each result is stored at once, and survives a later failure
+        # Results are yielded as tasks end, so that the caller can store each one before a later task fails.
         while waiting:
             (reference,), _ = ray.wait(list(waiting), num_returns=1)
             yield waiting.pop(reference), _outcome(reference)
@@ -112,7 +112,7 @@ def _work_or_die(work: Callable[[Task], Result], task: Task) -> Result:
 
 
 def _outcome(reference: Any) -> Any:
-    """Return the result of a task, or its own exception."""
+    """Return the result of a Ray task, or the exception that the task raised, without Ray's wrapper."""
     import ray
     from ray.exceptions import RayError, RayTaskError
 
@@ -121,6 +121,6 @@ def _outcome(reference: Any) -> Any:
     except RayTaskError as error:
         return error.cause if isinstance(error.cause, Exception) else error
     except RayError as error:
-        # the workers of the task died each time, or processes of Ray itself did
+        # In all attempts the worker of the task or a process of Ray died.
         got = f"a worker that died {RETRIES + 1} times ({type(error).__name__})"
         return RunError(got, do="the same command runs the remaining tasks")

@@ -1,6 +1,6 @@
-"""Templates -> text. Templates contain layout only; their content is computed in Python.
+"""Rendering of templates as text. Templates contain the layout only; all content is computed in Python.
 
-Every page has the same frame: style sheet, scripts, and a policy that forbids all other scripts and all loading.
+Every HTML page has the same style sheet and scripts, and a policy that forbids all other scripts and all downloads.
 """
 
 import base64
@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from spelgen.version import __version__
 
-# an installed package has the templates inside itself, the repository next to it
+# An installed package contains the folder of templates; in the repository the folder is next to the package.
 _INSTALLED = Path(__file__).parent / "templates"
 _FOLDER = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1] / "templates"
 
@@ -23,7 +23,7 @@ _FOLDER = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1] / "te
 def _environment(autoescape: bool) -> Environment:
     return Environment(
         loader=FileSystemLoader(_FOLDER),
-        # a misspelt name would otherwise be an empty text in a page or in generated code
+        # A misspelt name raises an error; by default it would be an empty text in a page or in generated code.
         undefined=StrictUndefined,
         autoescape=autoescape,
         trim_blocks=True,
@@ -33,9 +33,9 @@ def _environment(autoescape: bool) -> Environment:
 
 
 def render(template: str, **context: object) -> str:
-    """Return the text of ``template`` with ``context``.
+    """Return the text of ``template``, in which the names of ``context`` are replaced by their values.
 
-    An undefined name is an error, and HTML templates escape text.
+    An undefined name raises an error. HTML templates escape the values.
     """
     return _environment(".html" in template).get_template(template).render(**context)
 
@@ -54,7 +54,7 @@ def render_page(template: str, **context: object) -> str:
     The Content-Security-Policy of the page admits its own style sheet and scripts by their digests and nothing else:
     the page loads no file or address, and text from a user's file cannot run as a script.
     """
-    # inline, not linked: a page is one file, which can be sent by mail
+    # Style sheet and scripts are inline, so that a page is a single file, which can be sent by mail.
     style, *scripts = _assets()
     return render(
         template,
@@ -68,8 +68,8 @@ def render_page(template: str, **context: object) -> str:
 
 
 def json_data(data: object) -> Markup:
-    """Return JSON for a <script> element: without the characters that could end the element."""
-    # NaN is not valid JSON: an error here, instead of a script that stops in the browser
+    """Return JSON for a <script> element; characters that could end the element are escaped."""
+    # NaN is not valid JSON. It raises an error here; otherwise the script would fail in the browser.
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 

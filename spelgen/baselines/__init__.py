@@ -1,1 +1,1 @@
-"""Predictors that a fitted model is compared with."""
+"""Baselines: simple predictors with which a fitted model is compared."""

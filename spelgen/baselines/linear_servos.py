@@ -11,13 +11,13 @@ from spelgen.logs.trajectory import LogRows, delayed_commands
 
 @dataclass(frozen=True)
 class DelayedCommand:
-    """Position = command ``delay`` [s] earlier."""
+    """Predictor whose position at time t is the command at t - delay; ``delay`` in [s]."""
 
     delay: float
     about = "the commands themselves, after the delay by which they are nearest to the positions of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the positions per part, (K, n): the delayed commands."""
+        """Return the predicted positions of each part, (K, n) [rad, m]: the delayed commands."""
         return [delayed_commands(log, rows, self.delay, 1)[:, 0] for log, rows in parts]
 
 
@@ -25,8 +25,8 @@ class DelayedCommand:
 class LinearServos:
     """Independent servos of the joints: qdd = w^2 (u(t - delay) + offset - q) - 2 damping w qd.
 
-    frequency: w [rad/s], damping: ratio [1], delay [s], offset [rad, m] of the n joints. late: the delay [s] of
-    `DelayedCommand`, one for all joints.
+    frequency: natural frequency w [rad/s]. damping: damping ratio [1]. delay: delay of the command [s]. offset: offset
+    of the position [rad, m]. All four have one value per joint. late: delay [s] of `DelayedCommand`, for all joints.
     """
 
     frequency: Sequence[float]
@@ -37,10 +37,10 @@ class LinearServos:
     about = "a linear second-order servo at each joint, fitted to windows of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the positions per part, (K, n), of second-order responses to the delayed commands."""
+        """Return the predicted positions of each part, (K, n) [rad, m]: second-order responses to the commands."""
         frequency, damping, result = np.array(self.frequency), np.array(self.damping), []
         for start, speed, (log, rows) in zip(q, qd, parts, strict=True):
-            # one step length: the exact response is precomputed for it
+            # The mean interval is used for all steps, so that the exact response is computed only once.
             dt = float(np.diff(log.t[rows]).mean())
             columns = [delayed_commands(log, rows, late, 1)[:, 0, k] for k, late in enumerate(self.delay)]
             u = np.stack(columns, axis=-1) + self.offset

@@ -14,24 +14,24 @@ from spelgen.logs.trajectory import LogRows
 from spelgen.logs.windows import Windows, thinned
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
-GAMMA = 1 - 0.5**0.5  # makes the method L-stable
+GAMMA = 1 - 0.5**0.5  # parameter of the Rosenbrock method that makes it L-stable
 
 
 State = tuple[Tensor, Tensor, Tensor]
-"""q and qd, (W, n), and the friction state z, (W, n, K)."""
+"""Positions q and velocities qd, (W, n) each [rad, m], and the friction state z, (W, n, K)."""
 
 
 def roll_out_stiff(
     dynamics: object, windows: Windows, substeps: int, disturbance: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return positions and velocities (W, K-1, n) at samples 1..K-1 of each window, from its sample 0.
+    """Return predicted positions and velocities (W, K-1, n) at samples 1..K-1, from sample 0 of each window.
 
-    Method: ROS2, a Rosenbrock method of order two for any matrix in place of the Jacobian; with the exact one it is
-    L-stable (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the matrix is the Jacobian
-    of friction only, so that damping and bristles of any stiffness (light links with dry friction) need no smaller
-    steps, and the error of an explicit method is not confused with an error of the dynamics.
+    Method: ROS2, a Rosenbrock method. It has order two for any approximation of the Jacobian, and is L-stable with the
+    exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the approximation is
+    the Jacobian of friction only. Damping and bristles of any stiffness (light links with dry friction) then need no
+    smaller steps, and the error of an explicit method is not confused with an error of the dynamics.
 
-    disturbance: (W, n) of `observe`. After a divergence the states of a window are NaN.
+    disturbance: constant disturbance (W, n) from `observe`. If a prediction diverges, its later states are NaN.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
     z = sliding_memory(dynamics, qd) if windows.z is None else windows.z
@@ -49,7 +49,7 @@ def roll_out_stiff(
         inside = ((qd.abs() <= TUNING.bounds * largest) & q.isfinite()).all(dim=-1, keepdim=True)
         if not inside.any():
             break
-        # NaN propagates to all later samples
+        # A diverged state becomes NaN, which propagates to all later samples.
         q, qd = torch.where(inside, q, torch.nan), torch.where(inside, qd, torch.nan)
         positions[:, k], velocities[:, k] = q, qd
     return positions, velocities
@@ -58,44 +58,46 @@ def roll_out_stiff(
 def _stepper(
     dynamics: object, width: Tensor, disturbance: Tensor
 ) -> Callable[[State, Tensor, Tensor], State]:
-    """Return the function that takes a step of M qdd = force from a state, under tau.
+    """Return the function that computes one integrator step of M qdd = force from a state, under torques tau.
 
-    width: (n,) finite-difference steps of velocity. disturbance: a force if the state has momenta, else acceleration.
+    width: (n,) finite-difference steps of velocity [rad/s, m/s]. disturbance: (W, n) a force [Nm, N] if the state of
+    the dynamics contains momenta, else an acceleration [rad/s^2, m/s^2].
     """
     pose_at = equations_of(dynamics)
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return the generalized forces M qdd, (W, n) [Nm, N]; pose: the equations of motion at q."""
+        """Return the generalised forces M qdd, (W, n) [Nm, N]. pose: equations of motion at q."""
         added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
         return pose.force(qd, tau, z) + added
 
     def step(state: State, tau: Tensor, step: Tensor) -> State:
-        """Take one step of (q, qd), with A = [[0, 1], [-M^-1 K, -M^-1 D]].
+        """Return the state after one step, with the approximate Jacobian A = [[0, 1], [-M^-1 K, -M^-1 D]] of (q, qd).
 
-        D = d friction / d qd and, if friction has a state z, K = d friction / d q through z.
+        D = d friction / d qd. If friction has a state z, K = d friction / d q through z, else K = 0.
         """
         q, qd, z = state
         pose = pose_at(q)
         damping, stiffness = _friction_slopes(dynamics, pose, qd, z, width)
         h = GAMMA * step
-        # With the position eliminated the matrix is M + h D + h^2 K: one factorisation of size n serves both stages.
+        # Without the eliminated position, the matrix of both stages is M + h D + h^2 K: one factorisation of size n.
         factors, pivots, _ = torch.linalg.lu_factor_ex(
             pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
         )
 
         def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-            """Return (1 - h A)^-1 of (velocity, force), with the mass in the second row."""
+            """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force)."""
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
-        # Result: u + step (3 k1 + k2) / 2 with (1 - h A) k1 = F(u), (1 - h A) k2 = F(u + step k1) - 2 k1.
+        # ROS2 for a state u: the next state is u + step (3 k1 + k2) / 2, where (1 - h A) k1 = F(u) and
+        # (1 - h A) k2 = F(u + step k1) - 2 k1.
         v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
         second = pose_at(q2)
         force = forces(second, qd2, tau, memory_after(dynamics, z, q2 - q))
-        # solve_ex: a singular matrix of one window must not stop the others
+        # solve_ex raises no error, so that a singular matrix in one window does not stop the other windows.
         a2 = torch.linalg.solve_ex(second.mass, force)[0] - 2 * a1
         v2, a2 = solve(qd2 - 2 * v1, (pose.mass @ a2.unsqueeze(-1)).squeeze(-1))
         end = q + step * (1.5 * v1 + 0.5 * v2)
@@ -108,14 +110,14 @@ def _stepper(
 def _friction_slopes(
     dynamics: object, pose: MotionEquations, qd: Tensor, z: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return D and K, (W, n): the friction of a joint depends on its own motion only."""
-    # central differences: dry friction jumps at standstill
+    """Return the diagonals of D and K, (W, n), see `_stepper`: friction depends on the motion of its own joint only."""
+    # Central differences, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
-    # friction that falls with velocity (negative damping) is integrated by the explicit part
+    # Negative damping (friction that decreases with velocity) is omitted from D, and so integrated explicitly.
     damping = slope.clamp(min=0)
     if not is_stateful(dynamics):
         return damping, torch.zeros_like(damping)
-    # bristles deflect in the direction of motion
+    # The finite-difference step has the direction of motion, in which bristles deflect.
     displacement = TUNING.displacement_step * torch.where(qd < 0, -1.0, 1.0).to(qd)
     bent = pose.friction(qd, memory_after(dynamics, z, displacement))
     return damping, ((bent - pose.friction(qd, z)) / displacement).clamp(min=0)
@@ -123,20 +125,20 @@ def _friction_slopes(
 
 @dataclass(frozen=True)
 class PredictorTuning:
-    """Integration of predictions by the Rosenbrock method."""
+    """Constants of the integration of predictions by the Rosenbrock method."""
 
-    # [1] Largest number of steps between samples; a power of two.
+    # [1] Largest number of integrator steps between two samples; a power of two.
     most_substeps: int = 16
-    # [s] Shortest step: only dynamics that diverge would need shorter ones.
+    # [s] Shortest integrator step: only diverging dynamics would need shorter steps.
     shortest_step: float = 1e-3
-    # [1] Allowed change of a result if the steps are doubled, relative to the error of the dynamics: reported figures
-    # change by a thousandth.
+    # [1] Allowed change of a prediction if the number of steps is doubled, divided by the error of the dynamics. With
+    # this value reported figures change by a thousandth.
     tolerance: float = 5e-2
-    # [1] Smallest expected error of dynamics, relative to the motion.
+    # [1] Lower bound of the error of the dynamics in this comparison, divided by the motion.
     least_error: float = 2e-5
-    # [1] Windows on which the number of steps is chosen.
+    # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16
-    # [1] Multiple of the largest measured velocity beyond which a prediction has diverged.
+    # [1] A predicted velocity above this multiple of the largest measured velocity counts as diverged.
     bounds: float = 100.0
     # [1] Finite-difference step of friction with respect to velocity, as a fraction of a joint's largest velocity.
     velocity_step: float = 1e-5
@@ -164,12 +166,12 @@ class Solver:
 
 
 def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
-    """Return the solver with the fewest steps per sample interval that suffice: twice as many change little."""
+    """Return the solver with the fewest steps per sample interval for which doubling the steps changes little."""
     windows = thinned(probe, TUNING.probed_windows)
     motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
     solver = Solver(dynamics, 1)
     coarse = solver(windows)[1]
-    # only dynamics that diverge would need shorter steps, and cannot be predicted with them either
+    # The step length has a lower bound: diverging dynamics cannot be predicted with shorter steps either.
     max_substeps = min(TUNING.most_substeps, windows.dt.mean().item() / TUNING.shortest_step)
     while 2 * solver.substeps <= max_substeps:
         finer = replace(solver, substeps=2 * solver.substeps)
@@ -184,9 +186,10 @@ def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
 
 @dataclass(frozen=True)
 class Predictor:
-    """A predictor of windows of K samples: q and qd, both (W, K-1, n), from the first sample and the torques.
+    """Predictor of motion: for windows of K samples, q and qd (W, K-1, n) from the first sample and the torques.
 
-    solver: a `Solver` if there are dynamics, else any function. dynamics: None if the prediction needs none.
+    solver: a `Solver` if the prediction integrates dynamics, else any function of the windows. dynamics: the integrated
+    dynamics, or None.
     """
 
     name: str
@@ -200,7 +203,7 @@ def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor
 
 
 class CommandFollower(Protocol):
-    """Predictor of positions under position commands. about: its name and the method of its fit."""
+    """Predictor of positions under position commands. about: name of the predictor and method of its fit."""
 
     @property
     def about(self) -> str: ...
@@ -214,5 +217,5 @@ class CommandFollower(Protocol):
             qd: (parts, n) initial velocities [rad/s, m/s].
 
         Returns:
-            (K, n) [rad, m] for each part.
+            Positions (K, n) [rad, m] of each part.
         """

@@ -1,4 +1,4 @@
-"""All baselines, in the order in which tables show them: `fit` fits them, `evaluate` compares a model with them."""
+"""List of all baselines, in the order of tables. `fit` fits the baselines, `evaluate` compares a model with them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from spelgen.logs.windows import Windows
 from spelgen.spec import Options
 
 FittedBaselines = dict[str, Any]
-"""The content of least_squares.json: fitted baselines, and the coverage of the training logs."""
+"""Content of least_squares.json: the fitted baselines, and the coverage of the training logs."""
 LinearServoRecord = Mapping[str, Any]
 """Parameters of `LinearServos` in the record of a fit, by name."""
 
@@ -39,9 +39,10 @@ LinearServoRecord = Mapping[str, Any]
 class EvaluatedArm:
     """The information about an arm under torques that baselines may use.
 
-    joints: names, in the order of q. urdf: None if unknown. fitted: the baselines fitted to the training logs.
-    fitted_arm: the arm for which these were fitted; None if there are none. probe: windows for which the integrator's
-    step is chosen. notes: a baseline appends, for example, why it is absent.
+    joints: names of the joints in the order of q. urdf: path of the URDF, None if unknown. fitted: baselines fitted to
+    the training logs. fitted_arm: arm for which these baselines were fitted; None without fitted baselines. probe:
+    windows from which the number of integrator steps is chosen. notes: list to which a baseline appends diagnostics,
+    for example the reason of its absence.
     """
 
     joints: Sequence[str]
@@ -53,17 +54,18 @@ class EvaluatedArm:
 
 
 class Baseline:
-    """Simple predictor of an arm under torques, under position commands, or under both.
+    """Base class of simple predictors of an arm under torques, under position commands, or under both.
 
-    Each baseline is listed in `registry.py`. It overrides `predictors` or `followers`, and `fit` if it has parameters.
+    Subclasses are listed in `registry.py`. A subclass overrides `predictors` or `followers`, and `fit` if it has
+    parameters.
     """
 
     def fit(self, arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> dict[str, object]:
-        """Return the parameters fitted to the training logs, as JSON; {} if there is nothing to fit."""
+        """Return the parameters fitted to the training logs, as a JSON object; {} if the baseline has no parameters."""
         return {}
 
     def predictors(self, arm: EvaluatedArm) -> list[Predictor]:
-        """Return the predictors under torques; [] if data or a package for them is absent."""
+        """Return the predictors under torques; [] if data or a package that they need is absent."""
         return []
 
     def followers(
@@ -71,7 +73,7 @@ class Baseline:
     ) -> dict[str, CommandFollower]:
         """Return the predictors under position commands, by name.
 
-        linear_servos: None for a model without a record.
+        linear_servos: parameters of linear servos in the record of the fit; None for a model without a record.
         """
         return {}
 
@@ -84,38 +86,38 @@ def arm_of_model(model: object, urdf: Path) -> Arm:
 
 
 class ConstantVelocity(Baseline):
-    """The initial velocity of a window, kept constant."""
+    """Prediction that the initial velocity of a window remains constant."""
 
     def predictors(self, arm: EvaluatedArm) -> list[Predictor]:
-        """Return the predictor."""
+        """Return the predictor of constant velocity."""
         return [Predictor(CONSTANT_VELOCITY, hold_velocity)]
 
 
 def hold_velocity(windows: Windows) -> States:
-    """Return q [rad, m] and qd [rad/s, m/s], (W, K-1, n), at samples 1..K-1 of the windows."""
+    """Return q [rad, m] and qd [rad/s, m/s], (W, K-1, n), at samples 1..K-1, for constant velocity from sample 0."""
     elapsed = windows.dt.cumsum(dim=1).unsqueeze(-1)  # (W, K-1, 1)
     qd = windows.qd[:, :1]
     return windows.q[:, :1] + qd * elapsed, qd.expand(-1, elapsed.shape[1], -1)
 
 
 class UrdfValues(Baseline):
-    """The dynamics that the URDF specifies."""
+    """Dynamics with the parameters of the URDF, without and with its drives."""
 
     def predictors(self, arm: EvaluatedArm) -> list[Predictor]:
-        """Return one or two predictors; [] and a note if Pinocchio cannot read the file or is not installed."""
+        """Return one or two predictors. If Pinocchio is absent or cannot read the URDF, return [] and add a note."""
         if arm.urdf is None:
             arm.notes.append(_missing("robot.urdf", "no arm is known"))
             return []
         try:
-            from spelgen.dynamics.pinocchio_dynamics import drives_known, urdf_dynamics  # an extra
+            from spelgen.dynamics.pinocchio_dynamics import drives_known, urdf_dynamics  # needs an extra
 
             plain = urdf_dynamics(arm.urdf, arm.joints)
             predictors = [of_dynamics(URDF, plain, arm.probe)]
-            # without drives in the URDF both predictors would be equal
+            # Without drives in the URDF both predictors would be equal.
             if drives_known(arm.urdf, arm.joints):
                 driven = urdf_dynamics(arm.urdf, arm.joints, drives=True)
                 predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, arm.probe))
-        # Pinocchio and its parser raise many kinds; the evaluation continues without it
+        # Pinocchio and its URDF parser raise exceptions of many types. The evaluation continues without this baseline.
         except Exception as error:
             arm.notes.append(_missing(arm.urdf.name, in_one_line(error)))
             return []
@@ -130,23 +132,23 @@ FRICTION = {
     LEAST_SQUARES: ("parameters", FrictionModel()),
     LEAST_SQUARES_WITH_MEMORY: ("parameters_with_memory", FrictionModel(memory=True)),
 }
-"""By name of the predictor: the key of its parameters in least_squares.json, and its friction model."""
+"""Name of a predictor -> key of its parameters in least_squares.json, and its friction model."""
 
 
 class IdentifiedArm(Baseline):
     """Rigid bodies, friction and armature with parameters identified by least squares."""
 
     def fit(self, arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> dict[str, object]:
-        """Return the identification with the parameters (K,) of each friction model; {} without accelerations."""
+        """Return the identification, and the parameters (K,) per friction model; {} for logs without accelerations."""
         methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
         try:
             require_torques(logs)
             identified = identify_by(arm, logs, methods, preprocessing)
-        # a baseline that cannot be fitted must not stop the fit of the model
+        # An error in a baseline is ignored, so that it does not stop the fit of the model.
         except (LogError, np.linalg.LinAlgError):
             return {}
         fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
-        # with Coulomb friction all results are kept, with bristles only the parameters
+        # All results are kept for Coulomb friction, and only the parameters for bristles.
         parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
         return {**fits["parameters"].to_dict(), **parameters}
 
@@ -163,12 +165,12 @@ class IdentifiedArm(Baseline):
 
 
 class FittedServos(Baseline):
-    """`LinearServos` and `DelayedCommand` with the parameters of a fit's record."""
+    """`LinearServos` and `DelayedCommand`, with parameters from the record of the fit."""
 
     def followers(
         self, linear_servos: LinearServoRecord | None, notes: list[Diagnostic]
     ) -> dict[str, CommandFollower]:
-        """Return both; {} and a note for a model without a record."""
+        """Return both predictors, by name. For a model without a record, return {} and add a note."""
         if linear_servos is None:
             message = "no linear servos to compare with: they are fitted by `train`"
             notes.append(Diagnostic("info", "no-linear-servos", "logs", None, message))
@@ -181,11 +183,11 @@ BASELINES: tuple[Baseline, ...] = (ConstantVelocity(), UrdfValues(), IdentifiedA
 
 
 def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> FittedBaselines:
-    """Return the baselines fitted to training logs, validation logs included, and the coverage of these logs.
+    """Return the baselines fitted to the training and validation logs, and the coverage of these logs.
 
-    preprocessing: resolved by the fit of the model.
+    preprocessing: preprocessing of the fit, in which all default values are resolved.
     """
-    # the coverage of the training logs is needed for the assessment of test logs
+    # The assessment compares the range of motion in test logs with the coverage of the training logs.
     fitted: FittedBaselines = {"coverage": coverage(logs)}
     for baseline in BASELINES:
         fitted |= baseline.fit(arm, logs, preprocessing)

@@ -52,7 +52,7 @@ def inspect(
     inspection = inspect_arm(arm, assume=assume)
     proof = None
     if verify:
-        # imported here: Pinocchio and SymPy, which take seconds
+        # Imported here, because Pinocchio and SymPy take seconds to import.
         from spelgen.certificate.verify import verify as verified
 
         proof = verified(arm.robot, arm.chain, inspection.structure)
@@ -60,10 +60,10 @@ def inspect(
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE
 
-        # a program reads formulas of any length, a person does not
+        # Formulas for programs may have any length; formulas for people are limited.
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
-    # the result comes first; --strict and a failed proof only decide the exit code
+    # The result is printed in any case; --strict and a failed proof only affect the exit code.
     deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
     if strict:
         refuse_warnings(f"{robot}: ", [x.severity for x in inspection.diagnostics].count("warning"))
@@ -75,7 +75,7 @@ def inspect(
 def _text(
     format: str, inspection: Inspection, closed: Formulas | None, proof: Verification | None, urdf: Path
 ) -> str:
-    """Return the result in a format, with a line end; closed: closed forms of M and V."""
+    """Return the text of the inspection in a format, with a line end. closed: closed-form formulas of M and V."""
     if closed and format in ("latex", "sympy"):
         return _formula_file(format, closed, proof)
     if format == "html":
@@ -100,7 +100,7 @@ def _text(
 
 
 def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> str:
-    """Return a file of formulas. The proof and the names of omitted formulas are printed to stderr."""
+    """Return the text of a file of formulas; print the proof and the names of omitted formulas to stderr."""
     from spelgen.certificate import formula_files
 
     names = [formula.name for formula in closed.unwritten]
@@ -138,17 +138,17 @@ def identify(
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
-    # an option of names and not one flag per effect: new effects need no new option
+    # One option takes the names of all friction effects, so that a new effect needs no new option.
     effects = options.names(friction) or []
     for name in effects:
         if name not in EFFECTS:
             raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
     method = LeastSquares(weights, FrictionModel(**dict.fromkeys(effects, True)))
     arm = options.load(robot, joints, tip, angle_tolerance)
-    # codes on the command line are accepted in addition to those in the settings
+    # Error codes on the command line are accepted in addition to the codes in the settings.
     log_mapping = options.log_mapping(arm, mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")
-    # least squares would fit logs in wrong units without an error
+    # Logs are checked first: least squares would fit logs in wrong units without any error.
     for diagnostic in require_sound_logs(logs, arm, log_mapping):
         note(diagnostic)
     result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
@@ -156,7 +156,7 @@ def identify(
         note(diagnostic)
 
     def page() -> str:
-        # pages and charts are imported only for this format
+        # Pages and charts are slow to import and needed for this format only.
         from spelgen.render.arm_pages import identification_page
 
         return identification_page(result, arm)

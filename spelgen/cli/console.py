@@ -21,10 +21,10 @@ from spelgen.labels import counted, printable
 
 METAVARS: dict[object, str] = {int: "N", float: "X", str: "TEXT", Path: "FILE"}
 FAILED = 1
-INTERRUPTED = 130  # 128 + SIGINT, as shells count
-BROKEN_PIPE = 141  # 128 + SIGPIPE
+INTERRUPTED = 130  # exit code of shells: 128 + SIGINT
+BROKEN_PIPE = 141  # exit code of shells: 128 + SIGPIPE
 
-# top-level module -> the extra that installs it
+# Top-level module -> extra of spelgen that installs the module.
 EXTRAS = {"pinocchio": "simulate", "ray": "parallel"}
 EXTRAS |= dict.fromkeys(("casadi", "mujoco", "onnxruntime", "onnxscript", "safetensors"), "deploy")
 
@@ -32,35 +32,35 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an e
 
 
 def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with the option --debug, and with its exceptions reported by `fail`.
+    """Return the command with an additional option --debug; exceptions of the command are reported by `fail`.
 
-    Typer raises usage errors (exit code 2) before the command runs; they are not changed.
+    Usage errors (exit code 2) are unchanged, because typer raises them before the command runs.
     """
 
     @functools.wraps(command)
     def run(*arguments: object, debug: bool = False, **options: object) -> None:
         try:
             command(*arguments, **{name: _local(value) for name, value in options.items()})
-            sys.stdout.flush()  # a closed pipe raises its error here, and not in the interpreter at exit
+            sys.stdout.flush()  # a closed pipe raises its error here and not at the exit of the interpreter
         except (typer.Exit, typer.Abort, typer.BadParameter):
             raise
         except BaseException as error:
             fail(error, debug=debug)
 
-    # annotations are strings, as files begin with `from __future__ import annotations`
+    # eval_str: annotations are strings, because of `from __future__ import annotations`.
     signature = inspect.signature(command, eval_str=True)
     for parameter in signature.parameters.values():
         _name_values(*get_args(parameter.annotation))
     option = inspect.Parameter("debug", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Debug)
     parameters = [*signature.parameters.values(), option]
-    # typer reads the options from these two
+    # Typer reads the options from the signature and the annotations.
     vars(run)["__signature__"] = signature.replace(parameters=parameters)
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
 
 
 def _name_values(annotation: object, *metadata: object) -> None:
-    """Set the name of an option's values in the help: N, X, FILE, or the choices."""
+    """Set the placeholder that the help shows for the value of an option: N, X, FILE, or the choices."""
     value_type = get_args(annotation)[0] if NoneType in get_args(annotation) else annotation
     for info in metadata:
         if isinstance(info, OptionInfo) and info.metavar is None and value_type is not bool:
@@ -68,7 +68,7 @@ def _name_values(annotation: object, *metadata: object) -> None:
 
 
 def _local(value: object) -> object:
-    """Return the local copies of paths that are addresses; other values are unchanged."""
+    """Return the value of an option, in which paths that are addresses are replaced by their local copies."""
     if isinstance(value, list):
         return [_local(element) for element in value]
     return local(value) if isinstance(value, Path) else value
@@ -77,12 +77,13 @@ def _local(value: object) -> object:
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
     """Report an exception on stderr and exit with its exit code; with `debug`, its traceback first."""
     if isinstance(error, BrokenPipeError):
-        # the reader of stdout has ended: no message, and the last flush of the interpreter goes to /dev/null
+        # The reader of stdout has ended. No message is printed; stdout becomes /dev/null, so that the flush at the exit
+        # of the interpreter does not fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(BROKEN_PIPE)
     if debug:
         traceback.print_exception(error)
-    # no traceback: the user knows the reason
+    # An interrupt by the user needs no traceback.
     if isinstance(error, KeyboardInterrupt):
         note("interrupted")
         raise typer.Exit(INTERRUPTED)
@@ -97,7 +98,7 @@ def _message(error: BaseException, debug: bool) -> str:
     extra = EXTRAS.get(package.split(".")[0])
     if extra is not None:
         return f"this needs the package {package}, which is not installed; pip install 'spelgen[{extra}]'"
-    # a full disk or a missing permission is not a defect of spelgen
+    # A full disk or a missing permission is not a defect of spelgen, so it is reported without a traceback.
     if isinstance(error, OSError) and (error.filename is not None or error.strerror):
         file = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return f"{file}{(error.strerror or type(error).__name__).lower()}"
@@ -109,12 +110,13 @@ def _message(error: BaseException, debug: bool) -> str:
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
     """Show a progress bar on stderr if it is a terminal.
 
-    Yields a function of (done, all) and optionally of the title of the current step.
+    Yield a function with the arguments number of finished steps, number of all steps, and optionally title of the
+    current step.
     """
     from rich.console import Console
     from rich.progress import Progress
 
-    # on stderr: stdout has the result only
+    # The bar is on stderr, because stdout contains only the result.
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, total, now=title: bar.update(task, completed=done, total=total, description=now)
@@ -132,7 +134,7 @@ def note(text: object) -> None:
 
 def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
     """Print the result of a command: its lines as text, or its record as one line of JSON."""
-    # one line: logs of a pipeline have one record per line
+    # JSON has one line, as log files of pipelines have one record per line.
     if form == "json":
         print(json.dumps(record, default=str))
         return
@@ -149,7 +151,7 @@ def deliver(text: str, output: Path | None) -> None:
 
 
 def refuse_warnings(subject: str, count: int) -> None:
-    """Exit with 1 if there is any warning, for --strict."""
+    """Exit with code 1 if there is any warning: the effect of the option --strict."""
     if count:
         note(f"{subject}{counted(count, 'warning')}, and --strict allows none")
         raise typer.Exit(FAILED)

@@ -1,4 +1,4 @@
-"""Commands about trained runs: `evaluate` and `estimate` along logs, `report`, and `compare` of many runs."""
+"""Commands about trained runs: `evaluate` and `estimate` along logs, `report`, and `compare` for many runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 Format = Literal["text", "json", "csv"]
-LIMIT_EXCEEDED = 3  # exit code; usage errors have 2
+LIMIT_EXCEEDED = 3  # exit code if a figure exceeds --limit; usage errors have code 2
 LIMIT_HELP = f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each."
 
 
@@ -43,7 +43,7 @@ def evaluate(
 
     The assessment comes first. The result is also written to evaluation.json in the run folder; nothing else is.
     """
-    # a misspelt limit is reported before minutes of rollouts
+    # Limits are checked first, so that a misspelt name is reported before minutes of rollouts.
     paths = options.logs(data, extra_logs)
     limits = list(map(_limit, limit or []))
     from spelgen.evaluation.evaluate import SECONDS, STEPS
@@ -55,7 +55,7 @@ def evaluate(
     from spelgen.logs.preprocessing import Preprocessing
 
     logs = read_test_logs(run, paths, mapping)
-    # after the logs, whose errors are more frequent and reported sooner
+    # The run is loaded after the logs are read, since errors in logs are more frequent.
     model = load_run(run)
     with progress_bar("evaluating") as progress:
         results = evaluate_model(
@@ -68,14 +68,14 @@ def evaluate(
             progress=progress,
         )
     record = results.to_dict()
-    # before anything is printed: a closed pipe must not lose the result
+    # The file is written before anything is printed, so that a closed pipe does not lose the result.
     write_json(RunFolder(run).evaluation, record)
-    # on stderr: stdout has the result only, which scripts read
+    # Diagnostics go to stderr, because scripts read the result from stdout.
     for diagnostic in results.diagnostics:
         note(diagnostic)
     forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
     options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
-    # after the result, so that a script gets the figures in any case
+    # Limits are tested after the result is printed, so that a script gets the figures in any case.
     values = {figure.name: figure.value for figure in figures(results)}
     exceeded = []
     for name, limit_value in limits:
@@ -89,7 +89,7 @@ def evaluate(
 
 
 def _limit(text: str) -> tuple[str, float]:
-    """Return `torque.nmse=0.01` as a name and a number. Raises a usage error for any other text."""
+    """Return a text such as `torque.nmse=0.01` as a name and a number. Raises a usage error for any other text."""
     name, _, value = text.partition("=")
     try:
         if name in LIMITS:
@@ -129,7 +129,7 @@ def estimate(
     from spelgen.render.estimate_page import write_estimate
 
     fit = load_run(run)
-    # reported before logs are read
+    # A model without torques is an error, which is raised here before logs are read.
     torque_model(fit)
     levels = noise_levels(fit)
     joints = list(fit.model.joint_names)
@@ -234,36 +234,36 @@ def compare(
         "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
         "seeds": seeds, "splits": splits, "steps": steps,
     }  # fmt: skip
-    # options of the command line take precedence over the file
+    # Options on the command line replace the values of the file.
     changes = {name: value for name, value in values.items() if value is not None}
     comparison = _comparison(target, paths, mapping).model_copy(update=changes)
     name = target.stem + ("-logs" if paths else "") + ("-ablation" if ablation else "")
-    # the working folders of workers differ, so paths must be absolute
+    # Workers have other working directories, so the path must be absolute.
     folder = (output or Path("comparisons") / name).absolute()
-    # all cores: a comparison takes hours on one
+    # All cores are used by default, because a comparison takes hours on one core.
     parallel = jobs or default_jobs()
-    # two simultaneous comparisons in one folder would overwrite each other's runs
+    # The folder is locked: two simultaneous comparisons would overwrite each other's runs.
     with locked(folder), termination_as_interrupt():
         with progress_bar("simulating") as progress:
             study = prepare_study(comparison, folder, progress)
         note(study.announcement(parallel))
-        # the inputs exist before workers start, and each worker reads the same files
+        # Inputs are written before the workers start, so that all workers read the same files.
         with workers(parallel, address) as run_tasks:
             study = run_study(study, run_tasks, note)
         sections = arm_sections(study)
-        # the tables are printed as well, since a page cannot be read in a terminal
+        # Tables are printed in addition to the page, which cannot be shown in a terminal.
         for section in sections:
             say(fill(f"{section.name}: {section.sentence}", WIDTH, break_on_hyphens=False) + "\n")
             for table in section.tables:
                 say(f"{table.text()}\n")
         say(f"wrote {write_comparison(study, sections)}")
-    # the page is written in any case, with the runs that failed
+    # Failures affect the exit code only after the page is written, which lists the failed runs.
     if study.failures:
         raise typer.Exit(FAILED)
 
 
 def _comparison(target: Path, logs: list[Path], mapping: Path | None) -> Comparison:
-    """Return the comparison of a URDF with these logs, or the comparison in a YAML file."""
+    """Return the comparison on the arm of a URDF with these logs, or the comparison that a YAML file specifies."""
     from spelgen.comparison.arms import YAML, ComparedArm, Comparison, load_comparison
 
     if target.suffix not in YAML:

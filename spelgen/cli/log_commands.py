@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """The arguments of `spelgen.excite`, as options of a command."""
+    """Arguments of the function `spelgen.excite`, as options of a command."""
 
     duration: Annotated[float, option("", "Duration [s].", min=2.0, max=600.0)] = 30.0
     sample_rate: Annotated[float, option("", "Sample rate [Hz].", min=1.0, max=10000.0)] = 100.0
@@ -49,7 +49,7 @@ class MotionOptions:
     seed: Annotated[int, option("", "Seed of the search.", min=0)] = 0
 
     def arguments(self) -> dict[str, Any]:
-        """Return the arguments, with numbers in place of text."""
+        """Return the arguments of `spelgen.excite`; lists of numbers are converted from text."""
         acceleration = options.numbers(self.acceleration, "--acceleration")
         return vars(self) | {"acceleration": acceleration, "start": options.numbers(self.start, "--from")}
 
@@ -78,16 +78,16 @@ def excite(
 
     for path in (output, trajectory, html):
         if path is not None:
-            options.require_free(path, force=force)  # checked first: the search takes minutes
+            options.require_free(path, force=force)  # checked before the search, which takes minutes
     arm = options.load(robot, joints, tip, angle_tolerance)
     with progress_bar("searching") as progress:
         motion = design_motion(arm, progress=progress, **design.arguments())
     written = [str(write_text(output, motion.csv()))]
-    # the CSV remains the main output: `simulate` and logs use it
+    # The ROS trajectory is written in addition to the CSV file, which `simulate` reads.
     if trajectory is not None:
         written.append(str(write_text(trajectory, motion.joint_trajectory())))
     if html is not None:
-        # imported here: pages need packages that take long to import
+        # Imported here, because pages need packages that are slow to import.
         from spelgen.render.arm_pages import motion_page
 
         written.append(str(write_text(html, motion_page(motion, arm))))
@@ -126,7 +126,7 @@ def simulate(
     from spelgen.simulation.simulate import simulate as simulate_arm
 
     arm = options.load(robot, joints, tip, angle_tolerance)
-    # the URDF's names, so that the logs need no mapping
+    # Columns have the joint names of the URDF, so that the logs need no mapping.
     names = arm.chain.joint_names
     motions = [read_motion(file, names) for file in motion or ()]
     truth = output / "as_built.urdf"
@@ -138,7 +138,7 @@ def simulate(
         say(f"wrote {truth} and as_built.yaml, the true arm")
     with progress_bar("simulating") as progress:
         logs = simulate_arm(arm, seed=seed, motions=motions, progress=progress)
-    # logs are written in SI units with the URDF's joint names: no mapping is needed to read them
+    # Logs are in SI units with the joint names of the URDF, so that they need no mapping.
     for path, trajectories in zip(paths.values(), (logs.train, logs.test), strict=True):
         if trajectories:
             write_logs(path, trajectories, names)
@@ -169,9 +169,9 @@ def logs(
     from spelgen.log_checks.check_logs import check_logs
     from spelgen.logs.read import read_bounded_logs
 
-    # a mapping must name the joints of the URDF
+    # The mapping is loaded after the arm, because its names are checked against the joints of the URDF.
     arm = options.load(robot, joints, tip, angle_tolerance)
-    # before the logs are read: they may be readable only with the suggested mapping
+    # A mapping is suggested before the logs are read: without it they may be unreadable.
     if suggest is not None:
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
@@ -183,7 +183,7 @@ def logs(
         say(result.text())
     else:
         say(json.dumps(result.to_dict(), indent=2))
-    # also for logs with errors, whose charts may show the cause
+    # The page is written for logs with errors too, because charts may show the cause.
     if html is not None:
         from spelgen.render.arm_pages import logs_page
 
@@ -191,7 +191,7 @@ def logs(
         note(f"wrote {write_text(html, text)}")
     if result.errors:
         note(SpelgenErrors(result.errors))
-    # errors before warnings
+    # Errors decide the exit code before warnings do.
     if strict:
         refuse_warnings("", len(result.warnings))
     if result.errors:
@@ -199,12 +199,12 @@ def logs(
 
 
 def _suggested(paths: list[Path], arm: Arm, file: Path) -> Path:
-    """Write the mapping that the first log suggests, and return its file; exit with 1 if the log lacks columns."""
+    """Write a mapping that fits the columns of the first log; return its path. Exit with 1 if columns are absent."""
     from spelgen.errors import collect
     from spelgen.logs.formats import log_files
     from spelgen.logs.suggest import suggest_mapping
 
-    # the first log only: a mapping applies to all, which have the same columns
+    # Only the first log is read: a mapping is for logs that all have the same columns.
     logs, errors = log_files(paths)
     collect(errors)
     suggestion = suggest_mapping(logs[0], arm.chain.joint_names, commands=arm.settings.input == "position")

@@ -1,6 +1,6 @@
-"""The command line: each command is one step from a URDF to a report.
+"""Entry point of the command line. Each command is one step from a URDF to a report.
 
-Commands import modules when they run, so that `spelgen --help` is fast and `spelgen inspect` never imports torch.
+A command imports its modules when it runs, so that `spelgen --help` is fast and `spelgen inspect` never imports torch.
 """
 
 import os
@@ -23,43 +23,43 @@ from spelgen.cli.train_command import train
 from spelgen.version import __version__
 
 BaseUsageError: type[Exception] = typer.BadParameter.__mro__[1]
-"""UsageError of click, a copy of which is a private package of typer."""
+"""Exception UsageError of click. Typer contains click as a private package, so it cannot be imported by name."""
 CONTEXT = {"max_content_width": 80, "help_option_names": ["-h", "--help"]}
 
 
 class Command(TyperCommand):
-    """A command whose help shows the names of arguments without their types."""
+    """A command whose help shows arguments by name only, without the type that typer adds."""
 
     def get_help(self, ctx: Any) -> str:
-        """Return the help."""
-        # typer adds `PATH` to the name of each argument, which its metavar states already
+        """Return the help text."""
+        # Typer would add the type, such as `PATH`, to arguments whose metavar states it already.
         for parameter in self.params:
             if isinstance(parameter, TyperArgument):
                 vars(parameter)["display_type"] = lambda ctx: ""
         return super().get_help(ctx)
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the names of the arguments without braces, optional ones in brackets."""
+        """Return the arguments for the usage line: without braces, optional arguments in brackets."""
         return [re.sub(r"[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
 
 
 class CommandGroup(TyperGroup):
-    """All commands. A usage error suggests the nearest command, option or choice."""
+    """The group of all commands. A usage error suggests the nearest command, option or choice."""
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
-        """Read the program's own options."""
+        """Parse the options before the name of the command; usage errors get suggestions."""
         with _suggestions():
             return super().make_context(*arguments, **options)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command."""
+        """Run a command; usage errors get suggestions."""
         with _suggestions():
             return super().invoke(ctx)
 
 
 @contextmanager
 def _suggestions() -> Iterator[None]:
-    """Add suggestions to usage errors."""
+    """Add suggestions to usage errors that are raised in the block."""
     try:
         yield
     except BaseUsageError as error:
@@ -69,13 +69,13 @@ def _suggestions() -> Iterator[None]:
 
 def _suggest(error: Any) -> None:
     """Add the nearest option or choice to the message of a usage error of click."""
-    # click lists all similar names; the message has one of them
+    # Click lists all similar names; the message suggests only the first one.
     nearest = list(vars(error).get("possibilities") or [])[:1]
     if nearest:
         error.possibilities = []
-    # the prefix of pydantic, by which typer checks choices
+    # Pydantic, with which choices are checked, adds this prefix.
     error.message = error.message.replace("Value error, ", "")
-    # click suggests no value of a choice
+    # Click makes no suggestion for an invalid choice, so the choices are read from its message.
     choice = re.fullmatch(r"'(.*)' is not one of (.*)\.", error.message, re.DOTALL)
     if choice:
         choices = re.findall(r"'([^']*)'", choice[2])
@@ -92,7 +92,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-# in the order of a first project, which is the order of `spelgen --help`
+# The commands have the order in which a first project needs them; `spelgen --help` lists them in this order.
 COMMANDS: list[Callable[..., None]] = [inspect, init, build, simulate, identify, excite, logs]
 COMMANDS += [train, evaluate, estimate, report, export, compare, check]
 for command in COMMANDS:
@@ -113,16 +113,16 @@ def common(
     ] = False,
 ) -> None:
     """Derive, train and export dynamics models of robot arms from URDF files and logs."""
-    # help and exit code 0, as git and cargo do; typer would exit with an error
+    # Without a command the help is printed and the exit code is 0; typer would exit with an error.
     if ctx.invoked_subcommand is None:
         say(ctx.get_help())
 
 
 def main() -> None:
     """Entry point of the command `spelgen`."""
-    # before BLAS and torch are imported: the matrices are small, and one thread makes runs deterministic
+    # Set before BLAS and torch are imported. One thread makes runs deterministic, and is fast for small matrices.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):
-        # names from a file may not fit the terminal's encoding
+        # Names from a file may contain characters that the encoding of the terminal does not have.
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     app(prog_name="spelgen")

@@ -30,9 +30,9 @@ def init(
 
     path = output or robot.with_suffix(".yaml")
     options.require_free(path, force=force)
-    # the settings file is not read: this command writes it
+    # The arm is made without a settings file, because this command writes it.
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
-    # damping and friction of the URDF become the first values, which a user then edits
+    # Damping and friction of the URDF are the initial values in the file, which the user edits.
     drives = [StarterJoint(x.name, x.joint_type, x.damping, x.friction) for x in arm.coordinates]
     say(f"wrote {write_text(path, starter(robot.name, drives, arm.bodies[-1].link))}")
 
@@ -58,7 +58,7 @@ def build(
     format: options.TextOrJson = "text",
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
-    # checked before the URDF is read, which takes time
+    # The preset is checked before the URDF is read, which takes time.
     if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
         message = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
         raise typer.BadParameter(message, param_hint="'--preset'")
@@ -69,7 +69,7 @@ def build(
     path = output or Path(f"{robot.stem}_spel.py")
     spec = make_spec(arm, preset, width=width, depth=depth, assume=assume, module=path)
     source = module_text(spec, standalone=standalone)
-    # an unchanged file keeps its date
+    # An unchanged file is not written, so that its modification time is kept.
     is_new = not path.is_file() or path.read_bytes() != source.encode()
     line = f"{path} is up to date"
     if is_new:
@@ -124,14 +124,14 @@ def export(
     from spelgen.exporting.exported import format_by_extension, require_fitting
     from spelgen.fitting.fitted import load_run
 
-    # a format is seldom written: the name of the output states it
+    # By default the suffix of the output selects the format.
     if to is None:
         to = format_by_extension(output)
-    # names and free places are checked before the model is loaded, which takes seconds
+    # The name of the output is checked before the model is loaded, which takes seconds.
     require_fitting(to, output)
     options.require_free(output, force=force)
     result = export_run(load_run(run), to, entries=entry or (), float32=float32)
-    # all files or none: a failed parity check has raised its error before
+    # Nothing is written if the comparison with the model fails, because it raises its error above.
     files = [str(path) for path in result.write(output, force=force)]
     lines = [f"wrote {path}" for path in files]
     answer(format, {"files": files, "summary": result.summary}, *lines, *result.summary)

@@ -1,4 +1,4 @@
-"""Arguments and options of several commands, and the conversion of their values."""
+"""Arguments and options that several commands share, and the conversion of their values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,11 @@ if TYPE_CHECKING:
 def option(
     metavar: str, text: str, *names: str, min: float | None = None, max: float | None = None
 ) -> OptionInfo:
-    """Return an option. metavar: name of its value; "": by its type. names: default: the name of the parameter."""
+    """Return an option of a command.
+
+    metavar: placeholder of the value in the help; "" for a placeholder by type. text: help. names: names of the option;
+    by default the name of the parameter. min, max: bounds of the value.
+    """
     info: OptionInfo = typer.Option(*names, metavar=metavar or None, help=text, min=min, max=max)
     return info
 
@@ -45,7 +49,7 @@ def argument(metavar: str, text: str) -> ArgumentInfo:
 
 
 def output_option(metavar: str, text: str) -> OptionInfo:
-    """Return the option `-o` of a command."""
+    """Return the option `-o` of a command, which names the output file or folder."""
     return option(metavar, text, "-o", "--output")
 
 
@@ -92,24 +96,24 @@ Output = Annotated[Path | None, output_option("FILE", "Write the result to a fil
 
 
 def result_format() -> OptionInfo:
-    """Return the option `--format` of a command; the formats depend on the command."""
+    """Return the option `--format` of a command; each command has its own formats."""
     return option("", "Format of the result; default: that of the suffix of -o, else text.")
 
 
 def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
-    """Return the format, by default the format of the output's suffix if the command has it, else text."""
-    # a suffix that the command has no format for is the user's choice of a name
+    """Return the format of a result: `format`, else the format for the suffix of the output file, else text."""
+    # A suffix without a format of this command is no error: users may choose any file name.
     by_suffix = SUFFIXES.get(output.suffix.lower(), "text") if output else "text"
     return format or (by_suffix if by_suffix in formats else "text")
 
 
 def write_result(format: str | None, output: Path | None, forms: Mapping[str, Callable[[], str]]) -> None:
-    """Print or write a result; forms: functions that return its text, by format."""
+    """Print a result, or write it to a file. forms: format -> function that returns the text of the result."""
     deliver(forms[choose_format(format, output, forms)]() + "\n", output)
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command whose arguments of a dataclass are given as the options that its fields declare."""
+    """Return a command in which an argument that is a dataclass is replaced by one option per field."""
     parameters: list[inspect.Parameter] = []
     groups: dict[str, type] = {}
     declared = get_type_hints(command, include_extras=True)
@@ -131,23 +135,23 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
             values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
         command(**values)
 
-    # typer reads both
+    # Typer reads the options from the signature and the annotations.
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     vars(run)["__signature__"] = inspect.Signature(parameters)
     return run
 
 
 def names(text: str | None) -> list[str] | None:
-    """Return `a, b, "c, d"` as three names, and None as None."""
+    """Return the names in a text separated by commas: `a, b, "c, d"` has three names. None is returned unchanged."""
     if text is None:
         return None
-    # CSV, as a name in quotes may contain a comma
+    # The text is parsed as CSV, because a quoted name may contain a comma.
     cells: list[str] = next(csv.reader([text], skipinitialspace=True), [])
     return [name.strip() for name in cells]
 
 
 def numbers(text: str | None, option: str) -> list[float] | None:
-    """Return `0, 1.5` as two numbers, and None as None. Raises a usage error for any other text."""
+    """Return the numbers in a text such as `0, 1.5`, and None for None. Raises a usage error for any other text."""
     try:
         return None if text is None else [float(number) for number in text.split(",")]
     except ValueError:
@@ -155,12 +159,12 @@ def numbers(text: str | None, option: str) -> list[float] | None:
 
 
 def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
-    """Return `3,2` as (3, 2), `V` as "V" and None as None. Raises a usage error for any other text."""
+    """Return the entry `3,2` of M as (3, 2), the potential `V` as "V", None as None. Raises a usage error otherwise."""
     if text is None:
         return None
     if text == "V":
         return "V"
-    # at most four digits: Python refuses to convert thousands of them, and no arm has as many joints
+    # Numbers have at most four digits, because Python does not convert texts of thousands of digits.
     match = re.fullmatch(r"\s*(\d{1,4})\s*,\s*(\d{1,4})\s*", text, re.ASCII)
     if match is None:
         raise typer.BadParameter("name it as ROW,COLUMN or V", param_hint="'--entry'")
@@ -169,39 +173,40 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
 
 def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
     """Return the paths of all options --data. Raises a usage error if there are none."""
-    # an option and not an argument: logs and a module cannot be confused
+    # Logs are given by an option and not by an argument, so that they cannot be confused with a module.
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
     return [*data, *(extra_logs or [])]
 
 
 def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequence[str] | None) -> LogMapping:
-    """Return the mapping of logs, by default the mapping in the arm's settings, with additional accepted errors.
+    """Return the mapping of log columns, by default from the settings of the arm.
 
-    Raises a usage error for an unknown code.
+    codes: codes of errors in logs that are accepted in addition to the codes in the mapping. Raises a usage error for
+    an unknown code.
     """
     from spelgen.logs.arm_mapping import log_source
 
     for code in codes or ():
-        # a misspelt code would have no effect
+        # An unknown code is an error, because it would have no effect.
         if code not in get_args(Accepted):
             hint = suggestion(code, get_args(Accepted))
             raise typer.BadParameter(f"unknown code {code!r}; {hint}", param_hint="'--accept'")
     chosen = log_source(arm, mapping).mapping
-    # a dict preserves the order, so that the record of a run is deterministic
+    # A dict, unlike a set, preserves the order, so that the record of a run is deterministic.
     accepted = dict.fromkeys((*chosen.accept, *(codes or ())))
     return chosen.model_copy(update={"accept": tuple(accepted)})
 
 
 def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> Arm:
-    """Return the arm of a URDF with the options of a command."""
+    """Return the arm of a URDF. joints, tip, angle_tolerance: values of the options of a command, as text or number."""
     from spelgen.arm.configured_arm import load_arm
 
     return load_arm(robot, names(joints), tip, angle_tolerance)
 
 
 def require_free(path: Path, *, force: bool) -> None:
-    """Raise SpelgenError if an output exists already, unless `force` allows to replace it."""
+    """Raise SpelgenError if an output exists already and `force` is false."""
     if path.exists() and not force:
         do = "--force replaces it, -o names another"
         raise SpelgenError("this output exists already", file=path, do=do)

@@ -1,4 +1,4 @@
-"""The command `train`: a module and log files in, a run folder out."""
+"""The command `train`: it fits a module to log files and writes a run folder."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def train(
     Defaults come from `training` in the robot's settings; --set takes the same keys, which docs/cli_runs.md lists.
     A key that does not apply to the objective is an error.
     """
-    start_time = time.monotonic()  # max_minutes counts from here, reading of logs included
-    # before anything is read: a misspelt key costs no time
+    start_time = time.monotonic()  # max_minutes includes the time to read the logs
+    # Keys are checked before any file is read, so that a misspelt key costs no time.
     request, recorded = Request(objective, read_assignments(assignments or [])), None
     if source is not None:
         from spelgen.fitting.run_folder import RunFolder
@@ -70,7 +70,7 @@ def train(
         if module is not None:
             extra_logs = [module, *(extra_logs or [])]  # with --from, all arguments are logs
         run = RunFolder(source)
-        recorded = run.read_record().mapping  # raises an error if there is no run
+        recorded = run.read_record().mapping  # raises an error if the folder is not a run
         robot = robot or (run.urdf if run.urdf.exists() else None)
         request = _warm_start(request)
     elif "adapt" in request.values:
@@ -78,24 +78,24 @@ def train(
     elif module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, extra_logs)
-    # with --resume, the argument may be the run folder
+    # With --resume the first argument may be the run folder instead of a module.
     folder = output or _default_folder(module, source, resume=resume)
     spec = _specification(module, source, folder if resume else None)
-    # a resumed run keeps the settings of its record: the file of the robot may have changed
+    # A resumed run uses the settings in its record, since the settings file of the robot may have changed.
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
     start = resumed_run(folder, request) if resume else new_run(urdf, request)
     from spelgen.emission.specify import arm_of_spec
     from spelgen.log_checks.check_logs import require_sound_logs
 
-    # the mapping may contain all joints of a URDF, and logs are checked with the arm
+    # The arm is needed to check logs, and for a mapping that contains all joints of the URDF.
     arm = None if urdf is None else arm_of_spec(spec, urdf)
     log_mapping = options.log_mapping(arm or spec.joint_names, mapping or start.mapping or recorded, accept)
-    # torch is imported after the checks above, which therefore report errors without delay
+    # Torch is imported after the checks above, so that their errors are reported without delay.
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
     from spelgen.logs.preprocessing import Preprocessing
 
-    # device and threads are not recorded, as they do not belong to the result
+    # Device and threads are not recorded, because they describe the machine and not the result.
     machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
     try:
@@ -112,7 +112,7 @@ def train(
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
-    # the option that does not apply is known only after the logs chose the objective
+    # Whether an option applies is known only after the logs determined the objective.
     except OptionError as error:
         option = "--objective" if error.element == "objective" else f"--set {error.element}"
         raise UsageError(f"{option}: {error.got}") from error
@@ -120,9 +120,10 @@ def train(
 
 
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
-    """Return the payload in the logs of a fit to a load, by the estimator of the adapted run; None if it has none.
+    """Return the payload in the logs of a model that was adapted to a load; None for any other fit.
 
-    A new fit gets its own noise levels, an adapted run has the noise levels of its source.
+    The estimator of the source run computes it, with noise levels of that run; None if that run has no noise levels.
+    A new fit gets noise levels of its own, an adapted run keeps the noise levels of its source run.
     """
     from spelgen.live.levels import keep_levels, stored_levels
     from spelgen.live.replay import carried_payload
@@ -137,7 +138,7 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
 
     original = load_run(source)
     levels = stored_levels(original)
-    # a run of an earlier version, or one whose logs were too short for the noise levels
+    # Runs of earlier versions, and runs with too short logs, have no noise levels.
     if levels is None:
         return None
     keep_levels(fit, levels)
@@ -146,14 +147,14 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
 
 
 def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payload | None) -> None:
-    """Print the outcome of the fit; exit with 130 if it was interrupted. payload: of the logs, None if unknown."""
+    """Print the outcome of the fit; exit with 130 if it was interrupted. payload: payload in the logs, or None."""
     if TIME_LIMIT in request.values and TIME_LIMIT not in type(fit.config).model_fields:
         objective = fit.config.objective
         note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {objective}")
     posterior = fit.posterior if fit.checkpoint.posterior else None
     record: dict[str, object] = {"run": str(folder), "status": fit.status, "objective": fit.config.objective}
     record |= {"steps": fit.steps, "epochs": fit.epochs, "seconds": fit.seconds}
-    # JSON has no infinity, the loss of a rollout that diverged
+    # The loss of a diverged rollout is infinite, which JSON cannot represent.
     record["validation_loss"] = fit.best_validation if math.isfinite(fit.best_validation) else None
     record["torque_nmse"] = fit.torque_nmse
     record["posterior"] = None if posterior is None else posterior.to_dict()
@@ -166,21 +167,21 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
         outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
     outcome += [] if posterior is None else [table.text() for table in posterior.listings]
     answer(format, record, *outcome, f"run folder: {folder}")
-    # as a shell does: a script must distinguish an interrupted fit from a finished one
+    # By the exit code, a script can distinguish an interrupted fit from a finished one, as in shells.
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)
 
 
 def _outcome(fit: Fit) -> tuple[str, str]:
-    """Return the status of a fit with its reason, and its result, as two sentences."""
+    """Return two sentences: the status of a fit with its reason, and the result of the fit."""
     from spelgen.fitting.servo.report import servo_summary
 
     config, result = fit.config, fit.result
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
-    if not isinstance(config, Rollout):  # windows are only used to evaluate the model
+    if not isinstance(config, Rollout):  # other objectives use windows only to evaluate the model
         summary = servo_summary(fit.record.servo)
         if summary is not None:
             result = summary.text
@@ -196,7 +197,7 @@ def _outcome(fit: Fit) -> tuple[str, str]:
 
 
 def _warm_start(request: Request) -> Request:
-    """Return the request to adapt a fitted model: by default its load, to torques."""
+    """Return the request to adapt a fitted model; by default the load is adapted, with the torque objective."""
     objective, values = request.objective or "torque", dict(request.values)
     if objective == "torque":
         values.setdefault("adapt", "load")
@@ -206,7 +207,7 @@ def _warm_start(request: Request) -> Request:
 
 
 def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -> Path:
-    """Return the run folder: with --resume the argument may be the folder itself."""
+    """Return the default run folder. With --resume, the argument of the command may be the run folder itself."""
     if resume and module is not None and module.is_dir():
         return module
     name = f"{(source or Path()).resolve().name}_adapted" if module is None else module.stem
@@ -214,7 +215,7 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
 
 
 def _specification(module: Path | None, source: Path | None, resumed: Path | None) -> ModelSpec:
-    """Return the specification of the model: of a run that is resumed or adapted, or of a module."""
+    """Return the specification of the model, from the module or from the run that is resumed or adapted."""
     from spelgen.emission.text import read_spec
     from spelgen.fitting.run_folder import RunFolder
 
@@ -225,7 +226,7 @@ def _specification(module: Path | None, source: Path | None, resumed: Path | Non
 
 
 def _unchanged_urdf(module: Path, spec: ModelSpec) -> Path | None:
-    """Return the URDF near a module, None if it is not the one that the module was built from."""
+    """Return the URDF in the folder of a module; None if the module was not built from this file."""
     from spelgen.emission.specify import find_urdf
     from spelgen.urdf.document import urdf_bytes
 
@@ -233,6 +234,6 @@ def _unchanged_urdf(module: Path, spec: ModelSpec) -> Path | None:
         path = find_urdf(module, spec.urdf)
     except ModuleError:
         return None
-    # settings and limits of a changed URDF would belong to another arm
+    # A changed URDF is not used, because its settings and limits may not apply to the model.
     is_same = hashlib.sha256(urdf_bytes(path)).hexdigest() == spec.urdf_sha256
     return path if is_same else None

@@ -1,4 +1,4 @@
-"""The settings of the command `train`: the command line, then the robot's settings or the record of the resumed run."""
+"""The settings of `train`: from the command line, else from the robot's settings or the record of a resumed run."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ OF_LOGS = PREPROCESSING | {"validation_fraction", "seed"}
 
 
 class UsageError(typer.BadParameter):
-    """An option that does not apply; the message names the option."""
+    """Usage error about an option that does not apply; the message names the option."""
 
     def format_message(self) -> str:
-        """Return the message without the name of a parameter before it."""
+        """Return the message without the prefix that names a parameter."""
         return self.message
 
 
 class Assignments(TrainingSettings):
-    """The keys of `--set`: training settings of a robot, and options of one fit.
+    """The keys of the option `--set`: the training settings of a robot, and options of a single fit.
 
-    adapt: see `TorqueFit`. device, threads: of torch. progress: whether a progress bar is shown.
+    adapt: see `TorqueFit`. device, threads: device and number of threads of torch. progress: whether a progress bar is
+    shown.
     """
 
     adapt: Adaptation | None = None
@@ -48,7 +49,7 @@ class Assignments(TrainingSettings):
 class Request:
     """The options of the command `train`.
 
-    values: the values of `--set` by key. warm_start: whether the model was fitted before.
+    values: key of `--set` -> value. warm_start: whether the model was fitted before.
     """
 
     objective: str | None
@@ -56,17 +57,17 @@ class Request:
     warm_start: bool = False
 
     def values_of(self, keys: Iterable[str]) -> dict[str, Any]:
-        """Return the values of these keys."""
+        """Return key -> value, without keys that `--set` has not set."""
         return {name: self.values[name] for name in keys if name in self.values}
 
     def settings(self, defaults: TrainingSettings) -> TrainingSettings:
-        """Return `defaults` with the preprocessing, split and seed of the command line."""
+        """Return `defaults` in which preprocessing, split and seed are replaced by values of the command line."""
         return defaults.model_copy(update=self.values_of(OF_LOGS))
 
 
 @dataclass(frozen=True)
 class Start:
-    """The settings of a fit and of its logs."""
+    """The settings at the start of a run: of the fit and of its logs."""
 
     options: FitOptions
     settings: TrainingSettings
@@ -74,17 +75,17 @@ class Start:
 
 
 def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
-    """Return the checked values of `KEY=VALUE`; `prior.bodies=0.1` sets one field of a group.
+    """Return key -> checked value for texts `KEY=VALUE`; `prior.bodies=0.1` sets one field of a group.
 
     Raises a usage error for an unknown key, with the nearest known one, and for an invalid value.
     """
-    keys = Assignments.model_fields.keys() - {"objective"}  # an option of its own
-    # all assignments first, since the fields of one group are checked together
+    keys = Assignments.model_fields.keys() - {"objective"}  # has its own option
+    # All assignments are collected before they are checked, since the fields of a group are checked together.
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         name, _, field = key.strip().replace("-", "_").partition(".")
-        # checked before the keys: the user may have written a blank in place of `=`
+        # The sign `=` is checked before the key: the user may have typed a blank in its place.
         if not equals:
             raise UsageError(f"--set: got {assignment!r}, expected KEY=VALUE")
         if name not in keys:
@@ -105,37 +106,37 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
 
 
 def new_run(urdf: Path | None, request: Request) -> Start:
-    """Return the start of a new run: the command line takes precedence over the robot's settings."""
+    """Return the settings of a new run; the command line takes precedence over the robot's settings."""
     from spelgen.fitting.fit import FitOptions
     from spelgen.settings.settings import load_settings
 
-    # without a URDF there is no settings file with defaults
+    # The robot's settings are found by the URDF; without a URDF, general defaults are used.
     settings = TrainingSettings() if urdf is None else load_settings(urdf).training
     options, defaults = request.values_of(OWNERS), dict(settings.options)
     objective = request.objective or settings.objective
     if request.warm_start and objective == "rollout":
         defaults["torque_first"] = False  # a torque fit would discard the weights of the run
     if objective is None and TIME_LIMIT in options:
-        # the objective is chosen from the logs, so the option is not an error for any objective
+        # The objective is chosen later from the logs, so this option must not be an error for any objective.
         defaults[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return Start(FitOptions(objective, options, defaults), request.settings(settings))
 
 
 def resumed_run(folder: Path, request: Request) -> Start:
-    """Return the start of a resumed run: the command line takes precedence over the run's record."""
+    """Return the settings of a resumed run; the command line takes precedence over the record of the run."""
     from spelgen.fitting.fit import FitOptions
     from spelgen.fitting.run_folder import RunFolder
 
     run = RunFolder(folder)
     record = run.read_record()
-    # validation logs that were passed from Python are in no file
+    # Validation logs that were passed from Python are not stored in a file, so the run cannot be resumed here.
     if record.validation_fraction is None and record.validation:
         raise RunError(
             "a run whose validation logs were passed from Python",
             file=folder,
             do="resume it by spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
         )
-    # not validated: Python accepts values that settings files do not
+    # Recorded values are not validated: runs from Python may have values that settings files do not accept.
     recorded = {"seed": record.seed, **asdict(record.preprocessing)}
     if record.validation_fraction is not None:
         recorded["validation_fraction"] = record.validation_fraction

@@ -1,4 +1,4 @@
-"""The arms and models of a comparison: one URDF with options, or a YAML file that lists arms; and their logs."""
+"""The arms, models and logs of a comparison, which is specified by a URDF with options, or by a YAML file."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,6
 
 
 class ComparedArm(Group):
-    """An arm: its URDF and logs. Without logs the arm is simulated by the protocol of its settings.
+    """An arm of a comparison. Without logs the arm is simulated by the protocol of its settings.
 
-    data: log files and folders. mapping: YAML file with columns and units of the logs; default: the settings of
-    the URDF. joints, tip: as for `spelgen build`.
+    data: log files and folders. mapping: YAML file with columns and units of the logs; by default the mapping in the
+    settings of the URDF. joints, tip: selection of the arm in the URDF, as for `spelgen build`.
     """
 
     urdf: Path
@@ -50,7 +50,7 @@ class ComparedArm(Group):
     tip: str | None = None
 
     def files(self) -> Iterator[tuple[str, Path]]:
-        """Yield each path with its key."""
+        """Yield each path of the arm, after the key of the YAML file that contains it."""
         yield "urdf", self.urdf
         yield from (("data", path) for path in self.data)
         if self.mapping is not None:
@@ -64,13 +64,13 @@ class ComparedArm(Group):
 
 
 class Comparison(Group):
-    """Every preset on every arm, with every seed and split.
+    """A comparison: every preset is trained on every arm, with every seed and split.
 
-    presets: names or YAML files of designs; default: closed-form and hybrid on logs, all presets on a simulated arm.
-    seeds: runs with the seeds 0, 1, ...; default: 1 on logs, `comparison.seeds` of the arm's settings if simulated.
-    splits: 1 uses train.* and test.* of the logs, or holds out a quarter of the trajectories; k: k-fold
-    cross-validation over whole trajectories. width, depth: of hidden layers. training: options as in a robot's
-    settings, for all arms. steps: training steps on simulated arms.
+    presets: names or YAML files of designs; by default closed-form and hybrid on logs, and all presets on a simulated
+    arm. seeds: number of seeds 0, 1, ...; by default 1 on logs, and `comparison.seeds` of the settings of a simulated
+    arm. splits: 1 for training on train.* and testing on test.* of the logs, or on a quarter of the trajectories; k for
+    k-fold cross-validation over whole trajectories. width, depth: size of the hidden layers. training: training
+    settings for all arms, with the keys of a robot's settings. steps: number of training steps on simulated arms.
     """
 
     arms: Annotated[dict[Name, ComparedArm], Field(min_length=1)]
@@ -84,7 +84,7 @@ class Comparison(Group):
 
 
 def ablation_designs() -> dict[str, str | Design]:
-    """Return designs from phnode to hybrid that differ by one change each, by name."""
+    """Return name -> design, a sequence from phnode to hybrid in which each design changes one property."""
     friction = replace(load_design("phnode"), dissipation="per-joint")
     inputs = replace(friction, input="derived")
     return {
@@ -98,9 +98,9 @@ def ablation_designs() -> dict[str, str | Design]:
 
 
 def load_comparison(path: Path) -> Comparison:
-    """Return the comparison in a YAML file; its paths are relative to the file's folder.
+    """Return the comparison that a YAML file specifies. Paths in the file are relative to the folder of the file.
 
-    Raises SettingsError, or SpelgenErrors with all errors of the file.
+    Raises SettingsError for an error in the file, or SpelgenErrors for several.
     """
     document = read_document(path)
     comparison = validated(Comparison, document.value(), document)
@@ -110,7 +110,7 @@ def load_comparison(path: Path) -> Comparison:
         errors.append(SettingsError(got, file=path, line=line, element=element, do=do))
     collect(errors)
     arms = {name: arm.in_folder(path.parent) for name, arm in comparison.arms.items()}
-    # names of presets are no paths
+    # Names of presets are kept; only paths of YAML files are resolved against the folder.
     presets = comparison.presets
     if presets is not None:
         presets = tuple(str(path.parent / name) if _is_file(name) else name for name in presets)
@@ -122,7 +122,7 @@ def _is_file(preset: str) -> bool:
 
 
 def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Location, str, str]]:
-    """Yield location, error and advice for each unknown preset and for each file that the folder does not have."""
+    """Yield location, error and advice for each unknown preset and for each absent file."""
     for number, preset in enumerate(comparison.presets or ()):
         if preset not in (*PRESET_NAMES, *ablation_designs()) and not _is_file(preset):
             yield ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
@@ -136,17 +136,17 @@ Progress = Callable[[int, int], None]
 
 
 class ArmInputs(ComparedArm):
-    """Files that the runs of an arm read.
+    """The files that all runs on one arm read.
 
-    urdf: URDF that models are built from. truth: URDF of the simulated arm; None if the logs are the user's. digest: of
-    the URDF, settings and logs.
+    urdf: URDF from which models are built. truth: URDF of the simulated arm; None for logs of the user. digest: hash of
+    the URDF, the settings and the logs.
     """
 
     truth: Path | None = None
     digest: str
 
     def load(self) -> Arm:
-        """Return the arm that models are built from."""
+        """Return the arm from which models are built."""
         return load_arm(self.urdf, self.joints, self.tip)
 
     def log_mapping(self) -> LogMapping:
@@ -154,12 +154,12 @@ class ArmInputs(ComparedArm):
         return log_source(self.load(), self.mapping).mapping
 
     def split(self, number: int, splits: int) -> tuple[list[Trajectory], list[Trajectory]]:
-        """Return training and test trajectories of one of `splits` splits. Raises LogError.
+        """Return the training and test trajectories of split `number` of `splits`. Raises LogError.
 
-        The test trajectories are test.* of the logs or a quarter of all; of several splits, one fold of a k-fold
-        cross-validation. They are chosen by a fixed seed, so all models have the same.
+        A single split tests on the logs test.*, or on a quarter of all trajectories. Several splits are the folds of a
+        cross-validation. The seed of the choice is fixed, so all models are tested on the same trajectories.
         """
-        # loaded again in each worker: paths are sent to it instead of arms
+        # Each worker loads the arm again, because jobs contain paths and not arms.
         arm = self.load()
         train = read_logs(self.data, arm, self.mapping, "train")
         test = []
@@ -169,13 +169,14 @@ class ArmInputs(ComparedArm):
             return train, test
         logs = [*train, *test]
         if splits == 1:
-            # a quarter for testing, as the logs have no test.* files
+            # Without test.* files a quarter of the trajectories is held out for testing.
             held_out = split_validation(logs, 0.25, 0)
             return list(held_out.training), list(held_out.validation)
         if len(logs) < splits:
             expected = f"{splits} or more, for as many splits"
             raise LogError(f"{len(logs)} trajectories", element="data", expected=expected)
-        # whole trajectories: samples of one trajectory are correlated, and a split within it would leak
+        # Folds consist of whole trajectories: the samples of a trajectory are correlated, so a split within a
+        # trajectory would leak training data into the test.
         folds = np.array_split(np.random.default_rng(0).permutation(len(logs)), splits)
         return set_aside(logs, folds[number])
 
@@ -183,19 +184,19 @@ class ArmInputs(ComparedArm):
 def arm_inputs(
     arm: ComparedArm, folder: Path, splits: int = 1, progress: Progress | None = None
 ) -> ArmInputs:
-    """Return the inputs of an arm's runs; the logs of an arm without logs are simulated into the folder.
+    """Return the input files of the runs on an arm. If the arm has no logs, simulate logs into the folder.
 
-    Raises the errors of `load_arm`, `load_mapping`, `read_logs` and `simulate`, before anything is trained.
+    Raises the errors of `load_arm`, `load_mapping`, `read_logs` and `simulate`.
     """
     loaded = load_arm(arm.urdf, arm.joints, arm.tip)
     mapping = log_source(loaded, arm.mapping).mapping
     files, errors = log_files(arm.data)
     collect(errors)
-    # these keys of the settings change no run
+    # These keys of the settings do not affect runs, so they are omitted from the digest.
     apart: dict[str, bool | set[str]] = {"about": True, "comparison": {"seeds", "published"}}
     settings = [loaded.settings.model_dump_json(exclude_unset=True, exclude=apart)]
     settings.append(mapping.model_dump_json(exclude_unset=True))
-    # size and time in place of the content: logs may have gigabytes
+    # The digest uses size and modification time instead of the content, since logs may have gigabytes.
     versions = [(file, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     sources = json.dumps((loaded.robot.digest, arm.joints, arm.tip, settings, versions), default=str)
     inputs = ArmInputs(**dict(arm), digest=hashlib.sha256(sources.encode()).hexdigest()[:16])
@@ -203,7 +204,7 @@ def arm_inputs(
         changes = {"urdf": folder / "known.urdf", "truth": arm.urdf, "data": (folder,)}
         inputs = inputs.model_copy(update=changes | {"joints": loaded.joints, "tip": loaded.tip})
         _simulate(inputs, loaded, folder, progress)
-    # too few logs are an error now and not after hours of training
+    # The first split is made now, so that too few logs are an error before hours of training.
     inputs.split(0, splits)
     return inputs
 
@@ -213,7 +214,7 @@ def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress |
 
     Models know only a copy of the URDF without inertials, drives and friction, so that no model starts from the truth.
     """
-    # Pinocchio is an extra, not needed for the user's own logs
+    # Imported here, because Pinocchio is an extra that logs of the user do not need.
     from spelgen.simulation.simulate import simulate
 
     if loaded.settings.input == "position":
@@ -222,7 +223,7 @@ def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress |
             expected="torques: the simulated protocol has no commands",
             do="give logs of the arm with --data",
         )  # fmt: skip
-    # written last: without it the other files may be incomplete
+    # inputs.json is written last: if it is absent, the other files may be incomplete.
     complete = folder / "inputs.json"
     if complete.exists() and read_json(complete, RunError) == {"digest": inputs.digest}:
         return
@@ -240,7 +241,7 @@ def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress |
 
 def _kinematics(urdf: Path) -> bytes:
     """Return a URDF without inertials, friction, visuals and collision bodies."""
-    # `load_arm` has read this file, so its size and entities have been checked
+    # Size and entities of the URDF were checked when `load_arm` read it.
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     tree = etree.ElementTree(etree.fromstring(urdf.read_bytes(), parser))
     for element in list(tree.iter("dynamics", "visual", "collision", "inertial")):

@@ -35,18 +35,19 @@ if TYPE_CHECKING:
 class ComparisonTuning:
     """Constants of `spelgen compare`."""
 
-    # Largest number of windows that a loss is measured on; more windows are subsampled evenly.
+    # Largest number of windows from which a loss is computed; a larger set is subsampled evenly.
     windows: int = 512
     # Number of timed training steps. Their median is used, because other programs run at the same time.
     timed_steps: int = 5
     # Time over which motions are predicted [s], as in Wang et al., Sci Rep 15:33179 (2025).
     horizon: float = 1.0
-    # The other constants are used only to estimate the time of a comparison; measured with robots/two_link.urdf.
-    # Time of the measurements of a run after training [s].
+    # Time of the measurements after the training of a run [s]. This constant and the next two only serve to estimate
+    # the time of a comparison; they were measured with robots/two_link.urdf.
     measuring: float = 10.0
-    # Time of a momentum step, which solves no differential equation, relative to a step on predicted windows.
+    # Time of a training step with the momentum objective, divided by the time of a step with the rollout objective.
+    # The ratio is below 1 because the momentum objective integrates no differential equation.
     momentum_cost: float = 0.5
-    # Time of a run on logs [s] as long as no run of this arm and preset is finished.
+    # Assumed time of a run on logs [s], used until a run of the same arm and preset is finished.
     run_on_logs: float = 60.0
 
 
@@ -55,10 +56,10 @@ TUNING = ComparisonTuning()
 
 @dataclass(frozen=True)
 class PredictionLoss:
-    """Squared errors of predicted windows, summed over joints, mean over windows and samples; rad, m, s.
+    """Squared errors of predicted windows, summed over joints, mean over windows and samples; units rad, m, s.
 
-    loss: position + velocity (eq. 8 of the paper). position: squared geodesic distance or distance. velocity: squared
-    velocity error. None: not finite.
+    position: squared position error, for revolute joints the squared geodesic distance. velocity: squared velocity
+    error. loss: sum of both (eq. 8 of the paper). None: the error is not finite.
     """
 
     loss: float | None
@@ -68,7 +69,11 @@ class PredictionLoss:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of the networks. outputs: of M, D, G and V. inputs: of M. parameters: all trained numbers of the model."""
+    """Sizes of a model.
+
+    outputs: number of outputs of the networks of M, D, G and V. inputs: number of inputs of the network of M.
+    parameters: number of trained parameters of the model.
+    """
 
     outputs: tuple[int, ...]
     inputs: int
@@ -79,9 +84,10 @@ class Sizes:
 class SimulatedFigures:
     """Figures of a model of a simulated arm.
 
-    train, test: losses of windows as long as in training. prediction: loss over 1 s of the test motions. mass_error:
-    see `mass_error`. step_seconds: time of a training step, see `step_seconds` [s]. example: a test motion and its
-    prediction; None if no test motion lasts 1 s. mass: (T, n, n), learned M at the measured positions of the example.
+    train, test: losses on training and test logs, for windows as long as in training. prediction: loss of predictions
+    over 1 s of the test motions. mass_error: relative error of M, see `mass_error`. step_seconds: time of a training
+    step [s], see `step_seconds`. example: a test motion and its prediction; None if no test motion lasts 1 s. mass:
+    (T, n, n) learned M at the measured positions of the example.
     """
 
     sizes: Sizes
@@ -104,7 +110,7 @@ def simulated_figures(
     config = fit.config if isinstance(fit.config, Rollout) else Rollout()
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
-    # M must be positive definite at all positions within the limits; its error is measured at logged positions
+    # Positive definiteness of M is tested within the joint limits, the error of M is measured at logged positions.
     joints = fit.record.joints
     ranges = list(map(working_range, load_arm(truth, joints).chain.coordinates))
     low, high = torch.tensor(ranges, dtype=torch.float64).T
@@ -125,10 +131,10 @@ def simulated_figures(
 
 
 def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
-    """Return the median time of the loss of a batch and its gradient, without the optimizer [s]."""
+    """Return the median time to compute the loss of a batch and its gradient [s]; the optimizer is not included."""
     windows = spread_windows(logs, config.window, decimation)[: config.batch or DEFAULTS.batch]
     scales = loss_scales(windows, model.joint_types)
-    # Loaded models are frozen; a training step needs gradients.
+    # Parameters of loaded models are frozen, but a training step needs gradients.
     model.requires_grad_(True)
     durations = []
     for _ in range(TUNING.timed_steps):
@@ -140,15 +146,15 @@ def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, d
 
 
 def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
-    """Return about `TUNING.windows` windows at most, evenly spread, that start a multiple of `decimation` apart."""
-    # The stride is a multiple of the decimation, at whose samples the controller changes its torque.
+    """Return at most about `TUNING.windows` windows, evenly spread over the logs."""
+    # The stride is a multiple of the decimation, because the controller changes its torque at these samples only.
     starts = sum(max(0, len(log) - (samples - 1) * decimation) for log in logs)
     stride = -(-max(1, -(-starts // TUNING.windows)) // decimation) * decimation
     return cut_windows(logs, samples, stride, decimation, measured=False)
 
 
 def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> PredictionLoss:
-    """Return the loss of windows that are predicted from their first sample, with `substeps` steps per sample."""
+    """Return the loss of predictions from the first sample of the windows. substeps: integrator steps per sample."""
     with torch.no_grad():
         q, qd = roll_out(model, windows, substeps)
         difference = position_difference(q, windows.q[:, 1:], model.joint_types)
@@ -158,19 +164,19 @@ def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> Predict
 
 
 def sizes(model: ArmModel) -> Sizes:
-    """Return the number of outputs and inputs of the networks of M, D, G and V; residual networks included."""
+    """Return the numbers of outputs and inputs of the networks of M, D, G and V, residual networks included."""
     outputs, inputs = [], 0
     for quantity in ("mass", "friction", "input_network", "potential"):
         count = 0
         for name, module in model.named_modules():
             masks = [x for key, x in module.named_buffers(recurse=False) if key.startswith("mask")]
             if masks and quantity in name.split("."):
-                # the potential of an arm without gravity has one output that depends on no joint
+                # Outputs without inputs are not counted: V of an arm without gravity has one such output.
                 count = int(masks[-1].flatten(1).any(dim=1).sum())
                 if quantity == "mass":
                     inputs = int(masks[0].flatten(1).any(dim=0).sum())
         outputs.append(count)
-    # friction without a network is one function of each joint
+    # Friction without a network counts as one output per joint.
     outputs[1] = outputs[1] or model.n
     return Sizes(tuple(outputs), inputs, parameter_count(model))
 
@@ -178,11 +184,11 @@ def sizes(model: ArmModel) -> Sizes:
 def predict_example(
     predictor: Predictor, logs: Sequence[Trajectory], steps: int, decimation: int
 ) -> PredictedMotion | None:
-    """Predict `steps` steps of `decimation` samples in the middle of the first log that is long enough."""
+    """Predict the middle of the first log that has `steps` steps of `decimation` samples; None without such a log."""
     span = steps * decimation
     for log in logs:
         if len(log) > span:
-            # a multiple of the decimation: the controller holds its torque for `decimation` samples
+            # The start is a multiple of the decimation, because the controller holds its torque for that many samples.
             start = (len(log) - 1 - span) // (2 * decimation) * decimation
             piece = log[start : start + span + 1]
             window = cut_windows([piece], steps + 1, decimation=decimation, measured=False)

@@ -1,4 +1,4 @@
-"""One run of a comparison: build a preset for an arm, train it, measure it on the test logs."""
+"""One run of a comparison: build a model from a preset, train it, and evaluate it on the test logs."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ if TYPE_CHECKING:
     from spelgen.settings.fits import FitConfig
 
 Errors = dict[str, dict[str, float | None]]
-"""By measure, the one that ranks models first, and by predictor; None: not finite."""
+"""Measure -> predictor -> error; None for an error that is not finite. The first measure ranks the models."""
 
 
 @dataclass(frozen=True)
 class RunResult:
     """Figures of a finished run.
 
-    key: digest of all that the run depends on. seconds: time of training [s]. parameters: number of trained values
-    that the model uses. simulated: further figures of an arm whose truth is known.
+    key: hash of all inputs of the run. seconds: time of training [s]. parameters: number of trained parameters that the
+    model uses. simulated: further figures for a simulated arm, whose true parameters are known.
     """
 
     key: str
@@ -59,7 +59,7 @@ class RunResult:
 
     @classmethod
     def read(cls, path: Path) -> RunResult:
-        """Read result.json. Raises RunError."""
+        """Return the result in a file result.json. Raises RunError if the file is malformed."""
         try:
             return TypeAdapter(cls).validate_python(read_json(path, RunError))
         except ValidationError as error:
@@ -67,9 +67,10 @@ class RunResult:
 
 
 class Job(Group):
-    """A run of a comparison.
+    """A run of a comparison, finished or not.
 
-    design: a preset, an ablation design, or a YAML file. protocol: settings of fits to simulated logs.
+    design: name of a preset or of an ablation design, or path of a YAML file. protocol: settings of fits to simulated
+    logs.
     """
 
     arm: str
@@ -97,11 +98,11 @@ class Job(Group):
 
     @property
     def key(self) -> str:
-        """Return a digest of all that the result depends on; the places of files are not part of it."""
+        """Return a hash of all inputs of the run; paths of files are not included."""
         protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
         options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
-        # The content of the design, not its name: a YAML file may have changed.
-        # another version of spelgen may have other results
+        # The content of the design is included, and not its name, since a YAML file may have changed.
+        # The version is included, since results may differ between versions of spelgen.
         sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
         return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
 
@@ -116,7 +117,7 @@ class Job(Group):
         return build(arm, self.named_design, width=self.width, depth=self.depth, seed=self.seed)
 
     def result(self) -> RunResult | None:
-        """Return the result of exactly this run; None if it is not finished. Raises RunError."""
+        """Return the stored result if its key is the key of this run, else None. Raises RunError."""
         path = self.folder / "result.json"
         if not path.is_file():
             return None
@@ -124,17 +125,17 @@ class Job(Group):
         return result if result.key == self.key else None
 
     def config(self, model: ArmModel) -> FitConfig | FitOptions:
-        """Return the configuration of the fit, or its options."""
+        """Return the configuration of the fit to simulated logs, or the options of the fit to logs of the user."""
         if self.inputs.truth is not None:
             return self.equal_steps()
         objective = self.training.objective
-        # a momentum fit is for networks: the other presets of the comparison have their default
+        # The momentum objective is for networks only; rigid-body presets are fitted with their default objective.
         if objective == "momentum" and isinstance(model, RigidBodyDynamics):
             objective = None
         return FitOptions(objective, {}, self.training.options)
 
     def equal_steps(self) -> Rollout:
-        """Return the same number of steps for all models, without the regularizer towards the URDF."""
+        """Return a rollout fit with the same number of steps for all models, without a prior from the URDF."""
         epochs, decay = -(-self.protocol.steps // WINDOWS.epoch_steps), self.protocol.weight_decay
         options = self.training.options | {"urdf_weight": 0.0, "epochs": epochs, "patience": epochs}
         options |= {"momentum_steps": self.protocol.momentum_steps}
@@ -144,20 +145,20 @@ class Job(Group):
 
     def preprocessing(self) -> Preprocessing:
         """Return the preprocessing of the logs; simulated states have no noise and are not filtered."""
-        # a filter would only add delay to exact states
+        # Simulated states have no noise, so a filter would only distort them.
         unfiltered = {} if self.inputs.truth is None else {"cutoff": 0.0}
         return Preprocessing(**(self.training.preprocessing | unfiltered))
 
 
 def run_job(job: Job) -> RunResult:
-    """Train and measure, or resume from the checkpoint of an interrupted run; write result.json.
+    """Train and evaluate a model, write result.json and return it; an interrupted run is resumed from its checkpoint.
 
-    Raises the errors of `fit` and `evaluate`, and KeyboardInterrupt if the process is asked to end.
+    Raises the errors of `fit` and `evaluate`, and KeyboardInterrupt if the process is asked to terminate.
     """
     finished = job.result()
     if finished is not None:
         return finished
-    # one worker per core: more threads would wait for one another
+    # One thread per worker: there is one worker per core, so more threads would wait for each other.
     torch.set_num_threads(1)
     run = RunFolder(job.folder)
     resume = _own_checkpoint(job, run)
@@ -168,11 +169,11 @@ def run_job(job: Job) -> RunResult:
         validation=job.training.validation_fraction, seed=job.seed, arm=job.inputs.urdf, folder=job.folder,
         options=RunOptions(mapping=job.inputs.log_mapping(), resume=resume, force=not resume),
     )  # fmt: skip
-    # no result is written: the same command resumes the run
+    # An interrupted run has no result, so that the same command resumes it.
     if trained.status == "interrupted":
         raise KeyboardInterrupt
     seconds = time.monotonic() - start
-    # figures are measured without gradients, which would take memory
+    # Gradients are switched off for the evaluation to save memory.
     model.requires_grad_(False).eval()
     simulated = None
     if job.inputs.truth is None:
@@ -191,7 +192,7 @@ def run_job(job: Job) -> RunResult:
 
 
 def _own_checkpoint(job: Job, run: RunFolder) -> bool:
-    """Test for a checkpoint of exactly this run in the folder; the checkpoint of another run is discarded."""
+    """Return True if the folder has a checkpoint of this run; a checkpoint with another key is discarded."""
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()
@@ -201,12 +202,12 @@ def _own_checkpoint(job: Job, run: RunFolder) -> bool:
 
 
 def _errors(results: Results) -> Errors:
-    """Return the errors of all predictors, by measure: replays, horizons from the longest on, torque."""
+    """Return measure -> predictor -> error, in the order replays, horizons (longest first), torque."""
     errors: Errors = {}
     for replay in results.replays:
         measure = f"position RMS, {replay.name} [{thousandths(results.joint_types)}]"
         errors[measure] = {name: 1000 * error.mean for name, error in replay.errors.items()}
-    # the first measure ranks the models: the longest horizon is the hardest
+    # The first measure ranks the models: long horizons come first, since they are the most difficult.
     for horizon in reversed(results.horizons):
         open_loop = [name for name in horizon.errors if not name.endswith(observed(""))]
         relative = {name: horizon.errors[name].mean_relative_rms for name in open_loop}

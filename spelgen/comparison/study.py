@@ -1,4 +1,4 @@
-"""A comparison from its arms to its results: prepare the inputs, estimate the time, run the unfinished jobs."""
+"""Steps of a comparison: prepare the inputs of all arms, estimate the time, run the unfinished jobs."""
 
 import statistics
 import time
@@ -22,7 +22,7 @@ from spelgen.settings.settings import load_settings
 from spelgen.tasks import RunTasks
 
 PRESETS_ON_LOGS: tuple[str, ...] = ("closed-form", "hybrid")
-# the paper's models are first
+# The models of the paper (Wang et al., Sci Rep 15:33179, 2025) are first.
 SIMULATED_PRESETS: tuple[str, ...] = ("phnode", "spel", "spel-kan", "minimal", "hybrid", "closed-form")
 
 
@@ -30,8 +30,8 @@ SIMULATED_PRESETS: tuple[str, ...] = ("phnode", "spel", "spel-kan", "minimal", "
 class Study:
     """A comparison that is ready to run.
 
-    jobs: all runs. results: of finished runs, by name. failures: reason, by the name of an arm or
-    run. estimates: expected time of the other runs [s], by name.
+    jobs: all runs. results: name of a finished run -> result. failures: name of an arm or run -> reason.
+    estimates: name of an unfinished run -> expected time [s].
     """
 
     folder: Path
@@ -42,7 +42,7 @@ class Study:
 
     @property
     def arms(self) -> dict[str, list[RunResult]]:
-        """Return the results of each arm, in the order of the jobs."""
+        """Return name of an arm -> results of its finished runs, in the order of the jobs."""
         arms: dict[str, list[RunResult]] = {}
         for job in self.jobs:
             if job.name in self.results:
@@ -59,7 +59,7 @@ class Study:
             text += f", {len(self.results)} finished before"
         if not self.estimates:
             return text
-        # parallel runs end together at best, and not before the longest one
+        # Lower bound of the time: equal load of all workers, and at least the time of the longest run.
         seconds = max(sum(self.estimates.values()) / parallel, *self.estimates.values(), 0.0)
         return f"{text}; estimated time {duration(seconds)}"
 
@@ -70,7 +70,7 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist,
     RunError if no arm can be used, and the error of a single arm.
     """
-    # A misspelt preset is an error before logs are simulated.
+    # Presets are checked first, so that a misspelt name is an error before logs are simulated.
     for preset in set(comparison.presets or ()) - ablation_designs().keys():
         load_design(preset)
     jobs: list[Job] = []
@@ -86,11 +86,11 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     if not jobs:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
         raise RunError(f"no arm that can be compared ({reasons})")
-    # A result counts only if its key is equal: other options or sources mean another run.
+    # `Job.result` returns only a result with the key of the job: results of other options or inputs are not used.
     finished = {job.name: job.result() for job in jobs}
     results = {name: result for name, result in finished.items() if result is not None}
     waiting = [job for job in jobs if job.name not in results]
-    # runs that differ only by seed or split take about the same time
+    # Time is estimated once per arm and preset, as runs that differ only in seed or split take about equally long.
     models = {(job.arm, job.preset): job for job in reversed(waiting)}
     seconds = {model: _estimate(job, results) for model, job in models.items()}
     estimates = {job.name: seconds[job.arm, job.preset] for job in waiting}
@@ -98,15 +98,16 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
 
 
 def run_study(study: Study, run_tasks: RunTasks, note: Callable[[str], None]) -> Study:
-    """Run the jobs that are not finished and return the study with their results; comparison.json has these too.
+    """Run the unfinished jobs, write comparison.json and return the study with all results.
 
-    note: called with a line for each run that ends. A run with an error is a failure; the same command runs it again.
+    A run with an error becomes a failure of the study; the same command runs it again. note: function called with a
+    line of text after each run.
     """
     waiting = [job for job in study.jobs if job.name in study.estimates]
     results, failures = dict(study.results), dict(study.failures)
     start, done, total = time.monotonic(), 0.0, sum(study.estimates.values())
     for count, (job, outcome) in enumerate(run_tasks(run_job, waiting), start=1):
-        # Progress in estimated seconds and not in runs, as presets differ in cost.
+        # Progress is measured in estimated seconds and not in runs, because presets differ in cost.
         done += study.estimates[job.name]
         if isinstance(outcome, Exception):
             failures[job.name] = _reason(outcome)
@@ -119,7 +120,7 @@ def run_study(study: Study, run_tasks: RunTasks, note: Callable[[str], None]) ->
             line += f"; about {duration((time.monotonic() - start) * (total / done - 1))} left"
         note(f"{count}/{len(waiting)} {job.name}: {line}")
     finished = replace(study, results=results, failures=failures, estimates={})
-    # curves are only in result.json of each run
+    # Curves are omitted here: result.json of each run contains them.
     figures = [record(replace(result, simulated=None)) for result in results.values()]
     write_json(study.folder / "comparison.json", {"schema": 1, "failures": failures, "results": figures})
     return finished
@@ -133,7 +134,7 @@ def duration(seconds: float) -> str:
 
 
 def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) -> list[Job]:
-    """Return the runs of an arm, seed by seed, so that an interrupted comparison has all presets of the first seeds."""
+    """Return the runs of an arm ordered by seed: an interrupted comparison has all presets for the first seeds."""
     settings = load_settings(inputs.truth or inputs.urdf)
     protocol, simulated = settings.comparison, inputs.truth is not None
     presets = comparison.presets or (SIMULATED_PRESETS if simulated else PRESETS_ON_LOGS)
@@ -156,7 +157,7 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
 
 
 def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
-    """Return the expected time of a run [s], from finished runs of this arm and preset, else from its steps."""
+    """Return the expected time of a run [s]: of finished runs of this arm and preset, else from the training steps."""
     finished = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
     if finished:
         return statistics.median(finished) + TUNING.measuring

@@ -1,4 +1,4 @@
-"""Tables and sentences of a comparison: medians over seeds and splits, and published figures."""
+"""Tables and sentences of a comparison: medians over seeds and splits, next to published figures."""
 
 import math
 import statistics
@@ -15,7 +15,7 @@ from spelgen.settings.training import PublishedFigures
 
 BASELINE = "phnode"
 Runs = Mapping[str, Sequence[RunResult]]
-"""Runs of all seeds and splits of an arm, by preset."""
+"""Preset -> results of the runs of an arm with all seeds and splits."""
 Numbers = dict[str, float | None]
 Figure = Callable[[SimulatedFigures], float | None]
 
@@ -38,12 +38,12 @@ SIZES: dict[str, Figure] = {
     "smallest eigenvalue of M / mean": lambda run: run.invariants.least_eigenvalue,
 }
 RATIO = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
-"""Rows that are followed by the baseline's figure divided by the figure of each model."""
+"""Label of a row -> name in the label of the next row, which shows the baseline's figure divided by each model's."""
 
 
 @dataclass(frozen=True)
 class ArmResults:
-    """The results of one arm: a sentence, tables of which the first shows the result, and the results themselves."""
+    """The results of one arm: a sentence, tables (the main result first), and the results of all runs."""
 
     name: str
     sentence: str
@@ -62,10 +62,10 @@ def arm_sections(study: Study) -> list[ArmResults]:
 
 
 def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFigures]) -> list[Table]:
-    """Return the tables of an arm, the one with the result first. published: figures of a publication, by preset."""
+    """Return the tables of an arm, the main result first. published: preset -> figures of a publication."""
     runs = _by_preset(results)
     figures = {name: [run.simulated for run in x if run.simulated] for name, x in runs.items()}
-    # Logs of the user have no truth: only errors on test logs can be ranked.
+    # Logs of the user have no known true parameters: models are ranked by their errors on test logs only.
     if not all(figures.values()):
         return [_ranking(runs)]
     losses: dict[str, Numbers] = {}
@@ -87,22 +87,23 @@ def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFi
 
 
 def arm_sentence(results: Sequence[RunResult]) -> str:
-    """Return one sentence: the best model of an arm, and the factors by which its error is smaller than the others."""
+    """Return a sentence: the best model of an arm, and the factors between its error and the errors of all others."""
     runs, measure = _by_preset(results), next(iter(results[0].errors))
     errors = {name: error for name, error in _medians(runs, measure).items() if error is not None}
     models = [name for name in errors if name in runs]
     if not models:
         return f"No model has a finite {measure}."
-    # medians are sorted, the smallest first
+    # Medians are sorted, so the first model has the smallest error.
     best = errors[models[0]]
-    # equal to three digits: in effect the same model, as closed-form and hybrid without residual terms
+    # Models with errors equal to three digits are named together, for example closed-form and hybrid without residual
+    # terms, which are the same model.
     equal = [name for name in models if number(errors[name]) == number(best)]
     sentence = f"{listed(equal)} {'have' if len(equal) > 1 else 'has'} the smallest {measure}: {number(best)}"
     smaller, larger = [], []
     for name, error in errors.items():
         if name not in equal and error < best:
             smaller.append(f"{name} ({number(error)})")
-        # a factor to an error of zero is not defined
+        # If the best error is zero, factors are undefined.
         elif name not in equal and best:
             larger.append(f"{number(error / best)} times smaller than with {name}")
     if larger:
@@ -121,7 +122,7 @@ def comparison_sentence(sections: Sequence[ArmResults]) -> str:
     wins: dict[str, int] = {}
     for section in sections:
         runs, measure = _by_preset(section.results), next(iter(section.results[0].errors))
-        # Medians are sorted: the first name that is a model and not a baseline.
+        # Medians are sorted and contain baselines: the first name with runs is the best model.
         best = next(name for name in _medians(runs, measure) if name in runs)
         wins[best] = wins.get(best, 0) + 1
     best_first = sorted(wins.items(), key=lambda item: -item[1])
@@ -137,7 +138,7 @@ def _by_preset(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:
 
 
 def _ranking(runs: Runs) -> Table:
-    """Return the errors of models and baselines on the user's logs, the best one first."""
+    """Return a table of the errors of models and baselines on logs of the user, sorted by error."""
     rows = [Row(measure, _medians(runs, measure)) for measure in next(iter(runs.values()))[0].errors]
     seconds = {name: statistics.median(run.seconds for run in x) for name, x in runs.items()}
     rows.append(Row("parameters", {name: x[0].parameters for name, x in runs.items()}, ranked=False))
@@ -149,7 +150,7 @@ def _ranking(runs: Runs) -> Table:
 
 
 def _medians(runs: Runs, measure: str) -> Numbers:
-    """Return the median error of each model and baseline, the smallest first; an error that is not finite is last."""
+    """Return model or baseline -> median error, in ascending order; errors that are not finite are last."""
     values: dict[str, list[float | None]] = {}
     for preset, of_preset in runs.items():
         for run in of_preset:
@@ -167,11 +168,11 @@ def _losses(
         medians = _summary(figures, figure, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        # the paper compares ratios: absolute losses depend on its units and sampling
+        # Ratios are added, because absolute losses of the paper depend on its units and sampling.
         if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))
-    # only presets that a paper has figures of
+    # Only presets with published figures have a column.
     records = {name: published[name].model_dump(exclude_none=True) for name in figures if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}
@@ -187,12 +188,12 @@ def _losses(
 def _summary(
     figures: Mapping[str, Sequence[SimulatedFigures]], figure: Figure, combine: Callable[[list[float]], float]
 ) -> Numbers:
-    """Return a figure of each preset, combined over its runs."""
+    """Return preset -> one figure, combined over the runs of the preset. combine: median, for example."""
     return {name: _combined(list(map(figure, of_preset)), combine) for name, of_preset in figures.items()}
 
 
 def _combined(values: Sequence[float | None], combine: Callable[[list[float]], float]) -> float | None:
-    """Return the combined value; None if it is not finite."""
-    # infinite and not left out: a model that diverges with one seed of two must not rank by the other
+    """Return the values combined to one number; None if the result is not finite."""
+    # None counts as infinity: if it were omitted, a model that diverges with one of two seeds would rank by the other.
     combined = combine([math.inf if value is None else value for value in values])
     return combined if math.isfinite(combined) else None

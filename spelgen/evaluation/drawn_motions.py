@@ -1,4 +1,4 @@
-"""The motions that charts show: predictions, torques and replays of median and of largest error."""
+"""The motions that charts show: the predictions, torques and replays of median error and of largest error."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,9 +26,10 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnMotion:
-    """Positions q (T, n) along a part of a log, at times t (T,) [s] from its first sample.
+    """Positions q (T, n) [rad, m] along a part of a log, at times t (T,) [s] since the first sample of the part.
 
-    which: "typical" for the median error of all such motions, "worst" for the largest. error: None if not finite.
+    which: "typical" for the motion of median error, "worst" for the motion of largest error. error: error of the model
+    on this motion; None if not finite.
     """
 
     which: str = ""
@@ -40,10 +41,11 @@ class DrawnMotion:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PredictedMotion(DrawnMotion):
-    """A motion and its prediction, (T, n). error: divided by the motion, or RMS [rad, m] of a replayed log.
+    """A measured motion and its prediction, (T, n) each.
 
-    start: time of the first sample in the log [s]; None of a log that is replayed as a whole. u: commands of position
-    servos, without velocities.
+    error: prediction error divided by the size of the motion, or RMS error [rad, m] of a replayed log. start: time of
+    the first sample in the log [s]; None for a log that is replayed as a whole. u: commands of position servos (T, n)
+    [rad, m]; such a motion has no velocities.
     """
 
     start: float | None = None
@@ -55,10 +57,10 @@ class PredictedMotion(DrawnMotion):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TorqueTrace(DrawnMotion):
-    """Joint torques (T, n) [Nm, N] along ten seconds of a log; error: nMSE of the model.
+    """Measured joint torques (T, n) [Nm, N] along ten seconds of a log, and the torques of the predictors.
 
-    predicted: by predictor. parts: terms of the model's torque. energy: work of the drives since the start and its
-    parts, (T,) [J].
+    error: normalised mean squared error (nMSE) of the model. predicted: predicted torques (T, n) per predictor. parts:
+    terms of the model's torque, (T, n) each. energy: terms of the energy balance since the first sample, (T,) [J] each.
     """
 
     qd: Curve
@@ -72,8 +74,8 @@ Drawn = TypeVar("Drawn", bound=DrawnMotion)
 
 
 def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
-    """Return the motion of median error, and the motion of largest error if there are several."""
-    # a sort keeps the order of equal errors: the same logs give the same page
+    """Return the motion of median error and, if there are several motions, the motion of largest error."""
+    # Sorting keeps the order of motions with equal errors, so the same logs always give the same page.
     ordered = sorted(motions, key=lambda motion: math.inf if motion.error is None else motion.error)
     if not ordered:
         return ()
@@ -84,8 +86,8 @@ def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
 
 
 def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
-    """Return the motion at about `max_samples` samples at most."""
-    # every sample at the same distance: filtered curves would hide spikes that the errors contain
+    """Return the motion subsampled to about `max_samples` samples at most."""
+    # Samples are omitted, not averaged: a filter would hide spikes, which the reported errors contain.
     stride = -(-len(motion.t) // max_samples)
     arrays = {name: values for name, values in vars(motion).items() if isinstance(values, np.ndarray)}
     curves: dict[str, Any] = {name: values[::stride] for name, values in arrays.items()}
@@ -93,7 +95,7 @@ def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
 
 
 def predicted_motion(trajectory: str, windows: Windows, states: States, k: int = 0) -> PredictedMotion:
-    """Return window k and its prediction."""
+    """Return the measured motion and the predicted states of window k of a trajectory."""
     predicted_q, predicted_qd = states
     return PredictedMotion(
         trajectory=trajectory,
@@ -106,24 +108,24 @@ def predicted_motion(trajectory: str, windows: Windows, states: States, k: int =
 
 
 def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
-    """Return the measured and the predicted motion of a log of position servos.
+    """Return the measured and the predicted motion of a replayed log of position servos.
 
-    error: (T-1, n) predicted minus measured positions after the first sample [rad, m]."""
+    error: (T-1, n) predicted minus measured positions [rad, m] at all samples except the first."""
     return PredictedMotion(
         trajectory=log.name,
         error=number(float(np.sqrt(np.square(error).mean()))),
         t=log.t - log.t[0],
         q=log.q,
         u=log.u,
-        # the first position is given, not predicted
+        # The first position is the initial condition, so it is measured and not predicted.
         predicted_q=np.concatenate([log.q[:1], log.q[1:] + error]),
     )
 
 
 def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
-    """Return ten seconds from the middle of each log, as logs begin and end at rest, at the samples of a chart."""
+    """Return ten seconds of each log, subsampled for charts: from the middle, as logs begin and end at rest."""
     motions = []
-    # logs too slow for accelerations by a filter still show their torques
+    # At a low sample rate a filter gives no accelerations; torques are then shown per sample interval, see `_steps`.
     slow = [piece for piece in logs.pieces if not shows_accelerations(piece.sample_rate)]
     for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
@@ -133,7 +135,7 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 
 
 def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
-    """Return the sample intervals of a log too slow for a filter: mean motion, acceleration and torque in each."""
+    """Return mean motion, acceleration and torque per sample interval, for a log of low sample rate."""
     steps = cut_windows([piece], 2, measured=logs.used.filtered)
     qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt
     q, qd, tau = steps.q.mean(dim=1).numpy(), steps.qd.mean(dim=1).numpy(), steps.tau[:, 0].numpy()
@@ -147,7 +149,7 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
         inputs = np.eye(q.shape[-1])
-        if isinstance(model, PortHamiltonian):  # gears may connect motors and joints
+        if isinstance(model, PortHamiltonian):  # the input matrix G may couple motors and joints
             inputs = model.input_matrix(q).numpy()
         gravity = model.gravity(q)
         curves = {
@@ -158,11 +160,11 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
         }
     torques = {name: predicted_torques(predictor, samples) for name, predictor in dynamics.items()}
     predicted = {name: _at_joints(inputs, torque) for name, torque in torques.items()}
-    # at the joints, where the terms of the model act; logs have the torques of the motors
+    # Logs contain motor torques; they are converted to joint torques, to which the terms of the model belong.
     measured = _at_joints(inputs, samples.tau)
-    # the samples are evenly spaced after the filter
+    # After the filter, samples are evenly spaced.
     t = np.arange(len(samples.q)) / samples.rate
-    # friction includes an offset of the torque
+    # The friction term of the model includes the constant torque offset.
     stored = curves["inertia"] + curves["Coriolis"] + curves["gravity"]
     works = {
         "work of the drives": measured,
@@ -186,6 +188,6 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
 
 
 def _at_joints(inputs: np.ndarray, torques: np.ndarray) -> np.ndarray:
-    """Return joint torques (T, n) of motor torques; inputs: (n, n) or (T, n, n)."""
+    """Return joint torques (T, n) [Nm, N] for motor torques (T, n); inputs: input matrix G, (n, n) or (T, n, n)."""
     by_joint: np.ndarray = (inputs @ torques[..., None])[..., 0]
     return by_joint

@@ -63,40 +63,41 @@ def evaluate(
 ) -> Results:
     """Predict the states and torques of test logs and measure the errors.
 
-    Dynamics are evaluated open loop, and with the constant disturbance that a momentum observer estimates before a
-    prediction starts (see `horizons.observe`). The result is deterministic, and nothing is written.
+    Motion is predicted open loop, and again with a constant disturbance that a momentum observer estimates before each
+    prediction starts (see `horizons.observe`). The result is deterministic, and no file is written.
 
     Args:
         model: an emitted model, a fit, or the folder of a run.
         logs: test logs of the same arm.
-        arm: of ``load_arm``, or the path of a URDF; by default the fit's. For the URDF as a baseline, and tip errors.
-        baselines: dynamics that are evaluated in addition to those of `baselines.registry`, by name, for example
+        arm: result of ``load_arm``, or the path of a URDF; by default the arm of the fit. It is needed for the URDF as
+            a baseline, and for tip errors.
+        baselines: name -> dynamics, evaluated in addition to the baselines of `baselines.registry`, for example
             ``{"truth": identify(...).dynamics}``.
-        preprocessing: of states and torques; by default as the model was fitted.
-        steps: horizons [samples].
-        seconds: horizons [s]. Horizons longer than every trajectory are omitted, with a note.
-        truth: true arm of simulated logs, or its URDF, for the errors of M.
-        progress: called with the number of finished rollouts, the number of all, and the name of the next one.
+        preprocessing: filter and delay of states and torques; by default the preprocessing of the fit.
+        steps: prediction horizons [samples].
+        seconds: prediction horizons [s]. Horizons longer than every trajectory are omitted, with a note.
+        truth: true arm of simulated logs, or the path of its URDF, for the errors of M.
+        progress: function called with the number of finished rollouts, of all rollouts, and the name of the next one.
 
     Returns:
         Errors of the model and of all baselines, and the curves behind them.
 
     Raises LogError.
     """
-    # checks come before rollouts, which take minutes
+    # All checks precede the rollouts, which take minutes.
     tested = subject(model, arm)
     logs = [logs] if isinstance(logs, Trajectory) else list(logs)
-    # columns are matched by name: another order of the joints is no error, a missing joint is
+    # Joints are matched by name: the order of the joints in a log may differ, but a missing joint is an error.
     for trajectory in logs:
         require_joints(trajectory, tested.joints)
     notes = check(logs, tested.joints, tested.model.joint_types)
     seen = [trajectory.name for trajectory in logs if trajectory.name in tested.trained_on]
-    if seen:  # a run keeps only the names of its logs
+    if seen:  # names are compared, as a run records only the names of its logs
         message = (
             f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
         )
         notes.append(Diagnostic("warning", SEEN, "logs", None, message))
-    # an arm under servos has no torques, so inverse dynamics and rollouts under torques are undefined for it
+    # Logs of position servos have no torques, so they are evaluated by replaying their commands.
     if tested.model.input_quantity == "position":
         if baselines:
             expected = "none: the model is one of position servos"
@@ -113,11 +114,11 @@ def evaluate(
 def _preprocessing(
     used: Preprocessing | None, chosen: Preprocessing | None, logs: Sequence[Trajectory]
 ) -> Preprocessing:
-    """Return the preprocessing of test logs: the given one, or the fit's, or the default."""
+    """Return the preprocessing of test logs: `chosen`, else the preprocessing of the fit, else the default."""
     if chosen is None and used is not None:
         return used
     preprocessing = chosen or Preprocessing()
-    # the delay is a property of the logger, independent of the filter
+    # The torque delay is a property of the logger and not of the filter, so the fitted delay is kept.
     if used is not None and preprocessing.torque_delay is None:
         preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
     return preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
@@ -133,18 +134,19 @@ def _evaluate_torques(
     truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
-    """Evaluate the torques, and the motion under the logged torques."""
+    """Evaluate the inverse dynamics, and the motion predicted under the logged torques."""
     samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=tested.reach)
     samples = [sample for sample in samples if len(sample.q)]
-    # a rollout needs an initial sample and one more
+    # A rollout needs at least two samples: the initial state and one prediction.
     pieces = used.pieces(logs, shortest=2)
     tests = EvaluatedLogs(pieces, samples, used, tested.reach, tested.model.joint_types)
     lengths = horizon_lengths(tests, *ahead, notes)
-    # windows as long as in training: on longer ones errors of the dynamics would hide errors of the integrator
+    # The windows are as long as in training: on longer ones errors of the dynamics would hide integration errors.
     probe = tests.windows(tested.window - 1, TUNING.probed_model_windows)
-    # residual terms that were not selected only cost time
+    # Residual terms that the fit did not select are zero; they are removed to save time.
     model = without_idle_residuals(tested.model)
-    # chosen per predictor: stiff friction needs more steps, and its error must not count as an error of the dynamics
+    # The number of integrator steps is chosen per predictor: stiff friction needs more, and an integration error must
+    # not count as an error of the dynamics.
     solver = accurate_solver(model, probe)
     arm = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
     predictors = [Predictor(MODEL, solver, model), *torque_predictors(arm)]
@@ -157,7 +159,7 @@ def _evaluate_torques(
             progress(len(horizons), len(lengths), f"predicting {name} ahead")
         horizon, predictions = predict(name, k, tests, predictors, tip, notes)
         horizons.append(horizon)
-        # the curves of the longest horizon contain the shorter ones
+        # Curves are kept for the longest horizon only, since they contain all shorter horizons.
         if k == max(lengths.values()):
             longest = predictions
     all_dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
@@ -170,7 +172,7 @@ def _evaluate_torques(
             expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
             do="omit --quick",
         )
-    # after the errors, which include these joints: only the assessment omits them
+    # Joints with coarsely quantised torque are found after the errors: only the assessment omits these joints.
     steps = coarse_torques(logs, tested.joints, notes) if torque else {}
     masses = {}
     if truth is not None:
@@ -189,7 +191,7 @@ def _evaluate_torques(
 def _results(
     tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces
 ) -> Results:
-    """Return the results with the names of the arm and the logs."""
+    """Return the results of an evaluation, to which names of the arm, the joints and the logs are added."""
     return Results(
         robot=tested.spec.robot if tested.spec else type(tested.model).__name__,
         joints=tuple(tested.joints),
@@ -202,7 +204,7 @@ def _results(
 
 
 def _evaluate_commands(tested: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
-    """Evaluate the positions under the logged commands."""
+    """Evaluate the positions that are predicted under the logged position commands."""
     for trajectory in logs:
         require_commands(trajectory)
     followers = command_followers(tested.linear_servos, notes)
@@ -216,7 +218,7 @@ def _tip(tested: Subject, notes: list[Diagnostic]) -> TipPosition | None:
     try:
         tip = tested.spec.options.tip if tested.spec else None
         return tip_kinematics(tested.urdf, tip, joints=tested.joints).position
-    except (ValueError, SpelgenError) as error:  # the evaluation continues without it
+    except (ValueError, SpelgenError) as error:  # the evaluation continues without this result
         message = f"no tip errors: {in_one_line(error)}"
         notes.append(Diagnostic("info", "no-tip", tested.urdf.name, None, message))
         return None

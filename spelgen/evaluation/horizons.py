@@ -1,4 +1,4 @@
-"""Predictions of test logs some samples or seconds ahead, by all predictors from the same starting points."""
+"""Predictions of the motion in test logs over several horizons; all predictors start from the same samples."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,31 +22,31 @@ from spelgen.logs.windows import Windows, cut_windows, joined
 
 
 def past_steps(rate: float) -> int:
-    """Return the number of steps of the observer before a prediction, at a sample rate [Hz]."""
+    """Return the number of steps that the observer runs before a prediction, at a sample rate [Hz]."""
     return max(1, round(TUNING.observed_past * rate))
 
 
 def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor]:
-    """Observe the disturbance torque in the first `past` steps of W windows: causal, without accelerations.
+    """Estimate the disturbance torque in the first `past` steps of W windows, causally and without accelerations.
 
         r(t) = K (p(t) - p(0) - integral from 0 to t of (G tau + C^T qd - g - friction + r)),    r(0) = 0
 
     (De Luca and Mattone, ICRA 2003, eq. 9; ICRA 2005), so that r' = K (d - r), with d the residual of the momentum
-    balance: r is d after a first-order filter with time constant 1 / K. A prediction then keeps r constant, as
-    offset-free control does (Pannocchia and Rawlings, AIChE J. 49:426, 2003).
+    balance: r is d after a first-order filter with time constant 1 / K. The prediction keeps r constant, as in
+    offset-free control (Pannocchia and Rawlings, AIChE J. 49:426, 2003).
 
-    Two differences from the reference: d is constant between samples, so that the filter is solved exactly; and r is
-    divided by the response of the filter to d = 1, so that a constant disturbance is found at once instead of after
-    some time constants.
+    Two details differ from the reference. First, d is assumed constant between samples, so that the filter has an exact
+    solution. Second, r is divided by the step response of the filter, so that a constant disturbance is estimated
+    without the delay of some time constants.
 
     Args:
-        dynamics: of `integrable`.
-        windows: of more than `past` steps.
+        dynamics: result of `integrable`.
+        windows: windows of more than `past` steps.
         past: number of steps of the observer.
 
     Returns:
-        The windows without these steps, and the disturbance (W, n): a generalised force [Nm, N] if the state of the
-        dynamics has momenta, an acceleration [rad/s^2, m/s^2] if it has velocities.
+        The windows without their first `past` steps, and the disturbance (W, n): a generalised force [Nm, N] if the
+        state of the dynamics contains momenta, an acceleration [rad/s^2, m/s^2] if the state contains velocities.
     """
     q = windows.q[:, : past + 1]
     qd = windows.qd[:, : past + 1]
@@ -56,7 +56,7 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     cache = dynamics.prepare()
     pose = dynamics.at(q, prepared=cache)
     p = dynamics.momentum(pose, qd)
-    # the input is constant in each interval: at a sample, it has the values of the intervals after and before it
+    # Inputs are constant per interval. At a sample both values are used: of the next and of the previous interval.
     inputs = torch.stack([torch.cat([tau, tau[:, -1:]], dim=1), torch.cat([tau[:, :1], tau], dim=1)])
     _, (at_start, at_end) = dynamics.port_hamiltonian_rhs(pose, p, inputs, cache, *known_past(dynamics, z))
     residual = p.diff(dim=1) / dt - (at_start[:, :-1] + at_end[:, 1:]) / 2  # d in each interval, (W, past, n)
@@ -71,22 +71,23 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
 
 def without_past(windows: Windows, past: int) -> Windows:
-    """Return the windows without their first `past` steps; z remains the state at the first sample."""
+    """Return the windows without their first `past` steps; z is still the friction state before these steps."""
     dt, q, qd, tau = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
     return Windows(dt, q, qd, tau, windows.z)
 
 
 TipPosition = Callable[[Tensor], Tensor]
-"""Return the position of the tip (..., 3) [m] at q (..., n) [rad, m]."""
+"""Function that returns the position of the tip (..., 3) [m] at q (..., n) [rad, m]."""
 
 
 @dataclass(frozen=True)
 class StateErrors:
-    """Errors at the end of a horizon, root mean square (RMS) over windows, per joint where a tuple.
+    """Errors at the end of a horizon: root mean square (RMS) over windows; a tuple has one value per joint.
 
-    q, qd: [rad, rad/s; m, m/s], revolute positions as angles on the circle. q_relative_rms, qd_relative_rms:
-    divided by the RMS change of q and qd over the horizon. mean_relative_rms: mean of both over all joints. tip_mm:
-    distance of the tip [mm]. None: not finite, or unknown.
+    q, qd: errors of positions and velocities [rad, rad/s; m, m/s]; revolute positions are compared modulo a revolution.
+    q_relative_rms, qd_relative_rms: these errors divided by the RMS change of q and qd over the horizon.
+    mean_relative_rms: mean of both relative errors over all joints. tip_mm: position error of the tip [mm]. None: the
+    error is not finite, or unknown.
     """
 
     q: tuple[float | None, ...]
@@ -99,10 +100,11 @@ class StateErrors:
 
 @dataclass(frozen=True)
 class Horizon:
-    """Errors of predictions some samples ahead.
+    """Errors of all predictors at one prediction horizon.
 
-    steps: number of samples. seconds: mean length [s]. windows: number of predictions. errors: by predictor, open
-    loop, and by `observed(predictor)` with the disturbance that a momentum observer estimates.
+    steps: length [samples]. seconds: mean length [s]. windows: number of predictions. errors: errors per name; the
+    name of a predictor is for open-loop predictions, `observed(name)` for predictions with the disturbance that a
+    momentum observer estimates.
     """
 
     name: str
@@ -116,8 +118,9 @@ class Horizon:
 class EvaluatedLogs:
     """Test logs, cut at gaps and filtered.
 
-    pieces: segments without gaps, from which windows are cut. samples: torques and accelerations of dense logs,
-    see `dynamics_samples`. used: the preprocessing. reach: break-away displacement of the bristles of friction.
+    pieces: segments without gaps, from which windows are cut. samples: torques and accelerations of logs that are dense
+    enough for a filter, see `dynamics_samples`. used: the preprocessing. reach: break-away displacements (n, K) [rad,
+    m] of the friction bristles.
     """
 
     pieces: Sequence[Trajectory]
@@ -133,20 +136,20 @@ class EvaluatedLogs:
 
     @property
     def longest(self) -> int:
-        """Number of steps of the longest piece."""
+        """Length of the longest piece [steps between samples]."""
         return max(map(len, self.pieces)) - 1
 
     def stride(self, span: int, window_count: int) -> int:
-        """Return the samples between the starts of windows of `span` steps, for about `window_count` windows."""
+        """Return the samples from the start of a window to the next, for `window_count` windows of `span` steps."""
         return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // window_count)
 
     def starts(self, span: int, window_count: int) -> list[tuple[Trajectory, int]]:
-        """Return the piece and the first sample of each of these windows."""
+        """Return the piece and the index of the first sample of each window; see `stride` for the arguments."""
         stride = self.stride(span, window_count)
         return [(piece, k) for piece in self.pieces for k in range(0, len(piece) - span, stride)]
 
     def windows(self, span: int, window_count: int) -> Windows:
-        """Return these windows; they are shorter than `span` if all pieces are."""
+        """Return about `window_count` windows of `span` steps, shorter ones if all pieces are shorter."""
         span = min(span, self.longest)
         stride, measured = self.stride(span, window_count), self.used.filtered
         return cut_windows(self.pieces, span + 1, stride, measured=measured, reach=self.reach)
@@ -154,7 +157,10 @@ class EvaluatedLogs:
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Predictions of W windows. starts: piece and first sample of each. states: q and qd (W, K-1, n) by predictor."""
+    """Predictions of W windows.
+
+    starts: piece and index of the first sample of each window. states: predicted q and qd (W, K-1, n) per predictor.
+    """
 
     windows: Windows
     starts: list[tuple[Trajectory, int]]
@@ -164,7 +170,7 @@ class Predictions:
 def horizon_lengths(
     logs: EvaluatedLogs, steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
 ) -> dict[str, int]:
-    """Return the number of samples of each horizon by name; longer ones than every trajectory are noted instead."""
+    """Return the number of samples per name of a horizon. A horizon longer than every trajectory only gives a note."""
     lengths = {counted(k, "step"): k for k in steps}
     lengths |= {f"{duration:g} s": round(duration * logs.rate) for duration in seconds}
     possible = {}
@@ -185,26 +191,26 @@ def predict(
     tip: TipPosition | None,
     notes: list[Diagnostic],
 ) -> tuple[Horizon, Predictions]:
-    """Evaluate rollouts of `steps` samples: open loop, and with the disturbance observed before they start."""
+    """Evaluate rollouts of `steps` samples: open loop, and with the disturbance observed before the rollout starts."""
     past = past_steps(logs.rate)
-    # without room for the past, the open-loop prediction is still evaluated
+    # If the logs are too short for the observer before a rollout, only open-loop predictions are evaluated.
     if past + steps > logs.longest:
         message = f"no observer over {name}: the longest trajectory has {logs.longest} steps"
         notes.append(Diagnostic("info", "no-observer", "logs", None, message))
         past = 0
-    # the cost of a rollout is proportional to its steps
+    # Long rollouts have fewer windows, as the cost of a rollout is proportional to its number of steps.
     window_count = max(TUNING.fewest_windows, min(TUNING.most_windows, TUNING.most_predicted_steps // steps))
     windows = logs.windows(past + steps, window_count)
     ahead = without_past(windows, past)
     states = {}
-    # both rollouts of a predictor start from the friction state at the end of the observed past
+    # Both rollouts of a predictor start from the friction state at the end of the observer's steps.
     for predictor in predictors:
         if not past or not isinstance(predictor.solver, Solver):
             states[predictor.name] = predictor.solver(ahead)
             continue
         with torch.no_grad():
             started, disturbance = observe(integrable(predictor.solver.dynamics), windows, past)
-        # one batch of both rollouts needs half as many operations
+        # Both rollouts form one batch, which needs half as many operations.
         disturbances = torch.cat([torch.zeros_like(disturbance), disturbance])
         q, qd = predictor.solver(joined([started, started]), disturbances)
         count = len(started)
@@ -219,14 +225,14 @@ def predict(
 def end_errors(
     states: States, windows: Windows, joint_types: Sequence[str], tip: TipPosition | None
 ) -> StateErrors:
-    """Return the errors at the end of each window. states: predicted q and qd (W, K-1, n)."""
+    """Return the errors at the last sample of the windows. states: predicted q and qd (W, K-1, n)."""
     q, qd = (predicted[:, -1] for predicted in states)  # (W, n)
     measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
-    # angles of revolute joints are compared modulo a revolution
-    # root mean square and not the mean: large errors decide whether a simulation can be used
+    # Angles of revolute joints are compared modulo a revolution. The RMS is used instead of the mean absolute error,
+    # since large errors decide whether a simulation is usable.
     q_error = _rms(position_difference(q, measured_q, joint_types))
     qd_error = _rms(qd - measured_qd)
-    # relative to the motion, so that joints and horizons can be compared
+    # Errors are divided by the RMS motion over the horizon, so that joints and horizons can be compared.
     q_relative = q_error / _rms(position_difference(measured_q, windows.q[:, 0], joint_types))
     qd_relative = qd_error / _rms(measured_qd - windows.qd[:, 0])
     mean = torch.cat([q_relative, qd_relative]).mean(dim=0, keepdim=True)
@@ -239,5 +245,5 @@ def end_errors(
 
 
 def _rms(values: Tensor) -> Tensor:
-    """Return the root mean square over windows, (W, ...) -> (...)."""
+    """Return the root mean square over the first dimension (windows), (W, ...) -> (...)."""
     return values.square().mean(dim=0).sqrt()

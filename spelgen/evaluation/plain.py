@@ -1,4 +1,4 @@
-"""Arrays and numbers in JSON: five digits, None if not finite."""
+"""Conversion of arrays and numbers to JSON: rounded to five digits, None if not finite."""
 
 import math
 from typing import Annotated
@@ -10,33 +10,33 @@ from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
 def number(value: float) -> float | None:
     """Return a number rounded to five digits; None if it is not finite."""
-    # JSON has neither infinity nor NaN; five digits are more than any figure is known to, and keep pages small
+    # JSON has no infinity and no NaN. Five digits exceed the accuracy of every figure, and keep pages small.
     if math.isfinite(value):
         return float(f"{value:.5g}")
     return None
 
 
 def listed(values: np.ndarray) -> object:
-    """Return an array (...,) as nested lists of numbers."""
+    """Return an array of any shape as nested lists of numbers."""
     if values.ndim == 0:
         return number(values.item())
     return list(map(listed, values))
 
 
 def array(values: object) -> np.ndarray:
-    """Return the array (...,) of nested lists of `listed`; NaN for None."""
+    """Return the array for nested lists from `listed`; None becomes NaN."""
     return np.array(values, dtype=float)
 
 
 Curve = Annotated[np.ndarray, PlainValidator(array), PlainSerializer(listed)]
-"""An array along a trajectory; nested lists in JSON."""
+"""Array along a trajectory, stored in JSON as nested lists."""
 
 
 def record(value: object) -> dict[str, object]:
-    """Return the JSON form of a dataclass with numbers and curves."""
+    """Return a dataclass that contains numbers and curves as an object for JSON."""
     return dict(TypeAdapter(type(value)).dump_python(value))
 
 
 def finite(values: np.ndarray | torch.Tensor) -> tuple[float | None, ...]:
-    """Return the numbers of (T,) unrounded; None for nan and inf."""
+    """Return the values of an array (T,) as floats, not rounded; None in place of NaN and infinity."""
     return tuple(x if math.isfinite(x) else None for x in values.tolist())

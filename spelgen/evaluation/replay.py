@@ -1,4 +1,4 @@
-"""Evaluate arms under position servos by replaying logged commands: over whole logs, and over windows."""
+"""Evaluate arms under position servos by replaying the logged commands over whole logs, and over windows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,8 @@ from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split
 class ReplayErrors:
     """Root mean square position errors of one predictor [rad, m].
 
-    trajectories: by log, over time and joints. mean: mean of these. joints: (n,) over time and all logs.
+    trajectories: error per log, over time and joints. mean: mean of the errors of all logs. joints: error per joint
+    (n,), over time and all logs.
     """
 
     trajectories: dict[str, float]
@@ -31,7 +32,7 @@ class ReplayErrors:
 
 @dataclass(frozen=True)
 class Replay:
-    """Errors of replayed commands per predictor. name: the replayed segments, for example whole logs."""
+    """Errors of each predictor on replayed commands. name: description of the segments, for example whole logs."""
 
     name: str
     errors: dict[str, ReplayErrors]
@@ -42,7 +43,7 @@ PositionErrors = tuple[Trajectory, np.ndarray]
 
 
 class ServoModel:
-    """The model as a `CommandFollower`."""
+    """The trained model as a `CommandFollower`: it predicts positions under position commands."""
 
     about = "the model"
 
@@ -50,13 +51,13 @@ class ServoModel:
         self._model = without_idle_residuals(model)
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the positions per part, (K, n). All parts run in one batch, in which shorter ones are padded."""
-        # one number for all parts, which form one batch; more steps than needed only cost time
+        """Return the predicted positions of each part, (K, n) [rad, m]. Shorter parts of the batch are padded."""
+        # All parts form one batch, so they have the same number of integrator steps: the largest that a part needs.
         steps = max(steps_between(log) for log, _ in parts)
         lengths = [rows.stop - rows.start - 1 for _, rows in parts]
         commands, intervals = [], []
         for (log, rows), length in zip(parts, lengths, strict=True):
-            # the operations of a rollout are small: they cost the same for one part and for many
+            # A batch is used because the operations of a rollout are small: many parts take as long as one.
             padding = (0, max(lengths) - length)
             delayed = delayed_commands(log, rows, float(self._model.servo.delay), steps)
             commands.append(np.pad(delayed, (padding, (0, 0), (0, 0)), mode="edge"))
@@ -72,9 +73,10 @@ def replays(
     baselines: Mapping[str, CommandFollower],
     notes: list[Diagnostic],
 ) -> tuple[tuple[Replay, ...], list[PositionErrors]]:
-    """Replay whole logs, and consecutive windows of one second, by the model and the baselines.
+    """Replay whole logs, and consecutive windows of one second, with the model and the baselines.
 
-    Returns both, and the position errors of the model over whole logs. The baselines are described in `notes`.
+    Returns the replays of logs and of windows, and the position errors of the model over whole logs. A description of
+    each baseline is appended to `notes`.
     """
     pieces = [piece for log in logs for piece in split_at_gaps(log, shortest=3)]
     windows: list[LogRows] = []
@@ -86,14 +88,14 @@ def replays(
             first_qd.append(qd[start])
     for name, baseline in baselines.items():
         notes.append(Diagnostic("info", "baseline", "logs", None, f"{name}: {baseline.about}"))
-    # the model is one of the predictors: all are measured by the same code
+    # The model is treated as one of the predictors, so that the same code measures all errors.
     predictors = {MODEL: ServoModel(model), **baselines}
-    # a log begins at rest; a window begins in motion
+    # Whole logs are replayed from zero velocity, as they begin at rest; windows start with a measured velocity.
     logs_from_rest: list[LogRows] = [(piece, slice(0, len(piece))) for piece in pieces]
     at_rest = np.zeros((len(pieces), pieces[0].q.shape[1]))
     replay, missed = _replay("whole log", predictors, logs_from_rest, at_rest)
     results = [replay]
-    # logs shorter than a window have no second table
+    # If all logs are shorter than a window, there are no errors over windows.
     if windows:
         name = f"windows of {TUNING.replay_window:g} s"
         results.append(_replay(name, predictors, windows, np.stack(first_qd))[0])
@@ -103,7 +105,7 @@ def replays(
 def _replay(
     name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
-    """Return the errors per predictor, and the position errors (K, n) of the model on each part.
+    """Return the errors of all predictors, and the position errors (K, n) [rad, m] of the model on each part.
 
     qd: (parts, n) initial velocities [rad/s, m/s].
     """
@@ -118,9 +120,9 @@ def _replay(
 
 
 def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
-    """Return the errors (K, n) [rad, m] of parts of logs, pooled by the names of the logs."""
+    """Return RMS errors per log and per joint. names: log of each part. errors: (K, n) [rad, m] of each part."""
     by_name: dict[str, list[np.ndarray]] = {}
-    # a log with gaps is several pieces of one name
+    # A log with gaps consists of several parts with the same name.
     for name, error in zip(names, errors, strict=True):
         by_name.setdefault(name, []).append(np.square(error))
     trajectories = {name: float(np.sqrt(np.concatenate(x).mean())) for name, x in by_name.items()}

@@ -20,7 +20,7 @@ from spelgen.evaluation.verdict import Verdict
 from spelgen.labels import MODEL, counted
 from spelgen.listing import WIDTH
 
-# It changes if evaluation.json of an earlier version cannot be read any more.
+# Version of the format of evaluation.json. It changes if files of an earlier version cannot be read any more.
 SCHEMA = 11
 
 
@@ -28,12 +28,12 @@ SCHEMA = 11
 class Results:
     """All measurements of `evaluate`, shown as an assessment and tables; `to_dict` is evaluation.json.
 
-    parameters: number of trained parameters. traces: curves behind the figures, of predictions over the longest
-    horizon. cutoff: of the filter of the test logs [Hz], None without one. substeps: integrator steps of the model per
-    sample interval. torque: errors by predictor, empty if the logs are too sparse for accelerations. torque_steps: see
-    `coarse_torques`. replays: of the commands of an arm under position servos. mass_errors: relative errors of M by
-    predictor, if the truth is known. assessment: of the model, with the coverage of its training logs; None before
-    the assessment.
+    parameters: number of trained parameters. traces: curves from which the figures are computed, with predictions over
+    the longest horizon. cutoff: cutoff frequency of the filter of the test logs [Hz]; None without a filter. substeps:
+    integrator steps of the model per sample interval. torque: torque errors per predictor; empty if the sample rate is
+    too low for accelerations. torque_steps: quantisation steps of torques, see `coarse_torques`. replays: errors of
+    replayed commands of an arm under position servos. mass_errors: relative errors of M per predictor, if the true M is
+    known. assessment: assessment of the model, which uses the coverage of the training logs; None before it is made.
     """
 
     robot: str
@@ -53,21 +53,21 @@ class Results:
     assessment: Verdict | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON form, versioned by `schema`."""
+        """Return the results as an object for JSON, whose key `schema` is the version of the format."""
         return {"schema": SCHEMA} | record(self)
 
     @classmethod
     def from_dict(cls, content: Mapping[str, object]) -> Results:
-        """Return the results of a `to_dict`. Raises ValueError for other content."""
+        """Return the results from an object that `to_dict` has returned. Raises ValueError for other content."""
         return TypeAdapter(cls).validate_python(content)
 
     def text(self) -> str:
-        """Return the assessment, then every table, in which the best of each row is starred."""
+        """Return the assessment and all tables as text; a star marks the smallest error of each row."""
         paragraphs = [f"{self._heading()}; * marks the best of a row"]
         paragraphs += [table.text() for table in result_tables(self)]
         if self.assessment is not None:
             words = f"{self.assessment.sentence} {self.assessment.because}"
-            # a hyphen of a name is no place for a line break: the name could not be searched for
+            # Lines are not broken at hyphens: a text search would not find a name with a line break.
             paragraphs.insert(0, textwrap.fill(words, WIDTH, break_on_hyphens=False))
         return "\n\n".join(paragraphs)
 

@@ -30,16 +30,16 @@ def rollout(
     """Integrate the motion of a model under torques that are constant in each interval.
 
     Args:
-        model: an emitted model or any other dynamics.
+        model: emitted model, or any other dynamics of an arm with n joints.
         q: (..., n) initial positions [rad, m].
         qd: (..., n) initial velocities [rad/s, m/s].
         tau: (..., T, n) torques of the T intervals [Nm, N].
-        dt: length of the intervals [s], or of each interval (..., T).
+        dt: length of the intervals [s]: a number, or (..., T) for intervals of different length.
         solver: ``rk4``: classical Runge-Kutta; ``dopri5``: adaptive steps of torchdiffeq.
-        substeps: of rk4 in each interval.
+        substeps: number of steps of rk4 per interval.
 
     Returns:
-        Positions and velocities, each (..., T + 1, n), the initial state included.
+        Positions [rad, m] and velocities [rad/s, m/s], each (..., T + 1, n), the initial state included.
     """
     batch = np.broadcast_shapes(q.shape[:-1], tau.shape[:-2])
     samples, n = tau.shape[-2:]
@@ -55,10 +55,11 @@ def rollout(
 
 @dataclass(frozen=True)
 class Invariants:
-    """Measured invariants: the first is positive, the second is not, if the model satisfies them.
+    """Measured invariants of a model: M is positive definite, and without input the energy H does not rise.
 
-    least_eigenvalue: smallest of M over 100,000 random q, divided by the mean eigenvalue. energy_rise: largest rise of
-    H in one of 10,000 steps of 1 ms without input, divided by the largest kinetic energy; None without any motion.
+    least_eigenvalue: smallest eigenvalue of M over 100,000 random q, divided by the mean eigenvalue; it must be
+    positive. energy_rise: largest rise of H in one of 10,000 steps of 1 ms without input, divided by the largest
+    kinetic energy; it must not be positive, except for rounding. None: nothing moved.
     """
 
     least_eigenvalue: float
@@ -75,11 +76,11 @@ def invariants(model: ArmModel, windows: Windows, low: Tensor, high: Tensor) -> 
 
 def _least_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
     """Return the smallest eigenvalue of M over random q in [low, high] (n,), divided by the mean eigenvalue."""
-    # a fixed seed: the same model has the same figure
+    # The seed is fixed, so that the result is reproducible.
     generator = torch.Generator().manual_seed(0)
     count = TUNING.sampled_positions
     q = low + (high - low) * torch.rand(count, len(low), dtype=low.dtype, generator=generator)
-    chunks = q.chunk(10)  # limits the memory, which would be gigabytes
+    chunks = q.chunk(10)  # one batch of all positions would need gigabytes of memory
     eigenvalues = torch.cat([torch.linalg.eigvalsh(model.mass_matrix(chunk)) for chunk in chunks])
     return (eigenvalues.min() / eigenvalues.mean().abs()).item()
 
@@ -89,7 +90,7 @@ def _energy_rise(model: ArmModel, windows: Windows) -> float | None:
     q, qd = windows.q[: TUNING.started_states, 0], windows.qd[: TUNING.started_states, 0]
     no_input = q.new_zeros(len(q), TUNING.free_steps, model.n)
     q, qd = rollout(model, q, qd, no_input, 1e-3)
-    # the initial state is measured and may have any energy; later states are the model's own
+    # The first state is omitted: it is measured, and only later states are computed by the model.
     q, qd = q[:, 1:], qd[:, 1:]
     energy = model.hamiltonian(q, model.momentum(q, qd))
     kinetic = (energy - model.potential_energy(q)).max().item()
@@ -103,7 +104,7 @@ def true_mass(robot: Arm | Path | str, q: Tensor, joints: Sequence[str] | None =
     Args:
         robot: The true arm, or the path of its URDF.
         q: Positions (T, n) [rad; m].
-        joints: Names of the n joints in the order of q; None: from the settings, or the longest chain.
+        joints: Names of the n joints in the order of q; None: the joints in the settings, else the longest chain.
     """
     from spelgen.dynamics.pinocchio_arm import arm_dynamics
 
@@ -114,15 +115,15 @@ def true_mass(robot: Arm | Path | str, q: Tensor, joints: Sequence[str] | None =
 
 
 def mass_error(learned: Tensor, true: Tensor) -> float:
-    """Return the relative error of M, without unit: root mean square of the entries of L^-1 (learned - true) L^-T.
+    """Return the dimensionless error of M: the root mean square of the entries of L^-1 (learned - true) L^-T.
 
-    L L^T is the mean of the true M, so each entry counts in the units of its own joints.
+    L is the Cholesky factor of the mean true M. It scales each entry by the inertia of the joints of the entry.
 
     Args:
         learned: M (T, n, n) of a model.
         true: M (T, n, n) of the arm.
     """
-    # the mean of the true M: with the M of each position, an error near a singular M would dominate
+    # The mean of the true M scales all errors: scaled by M at each position, errors near a singular M would dominate.
     factor = torch.linalg.cholesky(true.mean(dim=0))
     half = torch.linalg.solve_triangular(factor, learned - true, upper=False)
     relative = torch.linalg.solve_triangular(factor, half.mT, upper=False)
@@ -132,7 +133,7 @@ def mass_error(learned: Tensor, true: Tensor) -> float:
 def mass_errors(
     dynamics: Mapping[str, RigidDynamics], truth: Arm | Path | str, joints: Sequence[str], q: Tensor
 ) -> dict[str, float]:
-    """Return the relative error of M by predictor, at evenly spread positions.
+    """Return the relative error of M of each predictor, at a subset of the test positions.
 
     Args:
         dynamics: The model and the baselines, by name.
@@ -140,7 +141,7 @@ def mass_errors(
         joints: Names of the n joints.
         q: Positions (T, n) [rad; m] of the test logs.
     """
-    # M changes slowly along a trajectory: more positions give the same error
+    # Positions are subsampled: M changes slowly along a trajectory, so more positions give the same error.
     q = q[:: max(1, len(q) // TUNING.mass_positions)]
     true = true_mass(truth, q, joints)
     with torch.no_grad():

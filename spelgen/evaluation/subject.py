@@ -1,4 +1,4 @@
-"""The model that is evaluated, with its fit and its arm if they are known."""
+"""The model that is evaluated, with its fit and its arm if known."""
 
 import copy
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,11 @@ from spelgen.urdf.read import read_urdf
 
 @dataclass(frozen=True)
 class Subject:
-    """The evaluated model. joints: names as in the URDF and in logs. urdf: of its robot, fit: None if unknown."""
+    """The evaluated model.
+
+    joints: names of the joints in the URDF and in logs. urdf: URDF of the robot; None if unknown. fit: fit of the
+    model; None if unknown.
+    """
 
     model: ArmModel
     joints: Sequence[str]
@@ -36,47 +40,47 @@ class Subject:
 
     @property
     def spec(self) -> ModelSpec | None:
-        """Specification of the model; None of a model that was not built from a URDF."""
+        """Specification of the model; None for a model that was not built from a URDF."""
         return spec_of(self.model)
 
     @property
     def window(self) -> int:
-        """Number of samples of the windows that it was fitted to, or a typical one."""
+        """Number of samples of the training windows; a typical number for a model not fitted to windows."""
         if self.fit is not None and isinstance(self.fit.config, OnWindows):
             return self.fit.config.window
         return TUNING.model_window
 
     @property
     def reach(self) -> BristleReach:
-        """Break-away displacement (n, K) [rad, m] of the bristles of its friction, or a typical one."""
+        """Break-away displacements (n, K) [rad, m] of friction bristles; typical ones if the model has no bristles."""
         reach = bristle_reach(self.model)
-        # if the model's friction has no state, z is still computed for least squares with bristles
+        # Without bristles in the model, z is still needed for the baseline of least squares with bristles.
         return reach if reach.elements else reach_of(self.model.joint_types)
 
     @property
     def trained_on(self) -> frozenset[str]:
-        """Names of its training and validation logs."""
+        """Names of the training and validation logs of the model."""
         names = [] if self.fit is None else [*self.fit.record.training, *self.fit.record.validation]
         return frozenset(names)
 
     @property
     def baselines(self) -> FittedBaselines:
-        """The baselines that were fitted with it; {} if there are none."""
+        """Baselines that were fitted to the training logs of the model; {} if there are none."""
         return {} if self.fit is None else self.fit.baselines
 
     @property
     def fitted_arm(self) -> Arm | None:
-        """The arm that the baselines of its fit were fitted for. Raises UrdfError, ArmError or SettingsError."""
+        """Arm for which the baselines of the fit were fitted. Raises UrdfError, ArmError or SettingsError."""
         urdf = None if self.fit is None else self.fit.urdf
         return arm_of_model(self.model, urdf) if urdf is not None and self.baselines else None
 
     def assessed(self, results: Results) -> Results:
-        """Return the results of its evaluation with their assessment."""
+        """Return the results of the evaluation of this model, with the assessment added."""
         limits, independent = [], []
         if self.spec is not None:
             depends = {*self.spec.potential, *(k for entry in self.spec.entries for k in entry[3])}
             for k, joint in enumerate(self.spec.joints):
-                # a single limit states no range
+                # A joint with only one limit has no range.
                 bound = None if joint.lower is None or joint.upper is None else (joint.lower, joint.upper)
                 limits.append(bound)
                 if k not in depends:
@@ -85,21 +89,21 @@ class Subject:
 
     @property
     def linear_servos(self) -> LinearServoRecord | None:
-        """Parameters of the linear servos that were fitted with it."""
+        """Parameters of the linear servos that were fitted to the training logs of the model."""
         servo = None if self.fit is None else self.fit.record.servo
         linear: LinearServoRecord | None = None if servo is None else servo["linear"]
         return linear
 
 
 def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = None) -> Subject:
-    """Return the subject of an evaluation: a model, a fit or the folder of a run; arm: see `evaluate`."""
+    """Return the subject of an evaluation. tested: a model, a fit or the folder of a run. arm: see `evaluate`."""
     if isinstance(tested, str | Path):
         tested = load_run(tested)
     model, fit = (tested.model, tested) if isinstance(tested, Fit) else (tested, None)
     urdf = None if fit is None else fit.urdf
     if arm is not None:
         urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
-    # logs are float64 on the CPU
+    # Logs are read as float64 on the CPU, so the model must have the same type and device.
     if any(weights.dtype != torch.float64 or not weights.is_cpu for weights in model.parameters()):
         model = copy.deepcopy(model).double().cpu()
     return Subject(model, model.joint_names, urdf, fit)
@@ -110,13 +114,13 @@ def read_test_logs(
 ) -> list[Trajectory]:
     """Return the test logs of a run's arm: the files test.* of a folder, or all files if none has this name.
 
-    mapping: None: the mapping of the training logs.
+    mapping: mapping of the log columns; None for the mapping of the training logs.
     """
     run = RunFolder(folder)
     record, spec = run.read_record(), run.read_spec()
-    # test logs usually come from the same logger as the training logs
+    # By default the mapping of the training logs is used, since test logs usually come from the same logger.
     if mapping is None:
         mapping = record.mapping
-    elif isinstance(mapping, str | Path) and run.urdf.exists():  # it may contain all joints of the URDF
+    elif isinstance(mapping, str | Path) and run.urdf.exists():  # a mapping may contain all joints of a URDF
         mapping = load_mapping(mapping, read_urdf(run.urdf).joint)
     return read_logs(paths, spec.joint_names, mapping, "test", joint_types=spec.joint_types)

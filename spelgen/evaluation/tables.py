@@ -1,4 +1,4 @@
-"""Tables and figures of an evaluation, by predictor or model: for the terminal, notebooks, files and pages."""
+"""Tables and figures of an evaluation, with a column per predictor: for the terminal, notebooks, files and pages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, URDF, observed, share, thousandths
 from spelgen.listing import Listing, number
 
-if TYPE_CHECKING:  # `spelgen --help` lists the figures without loading torch
+if TYPE_CHECKING:  # `spelgen --help` lists the figures; an import at run time would load torch
     from spelgen.evaluation.results import Results
 
 OBSERVER = (
@@ -20,28 +20,28 @@ OBSERVER = (
 )
 
 Numbers = Mapping[str, float | None]
-"""Numbers per column; None: unknown."""
+"""Column -> number; None for an unknown number."""
 MASS_TITLE = "Error of the mass matrix, relative to the true one (at positions of the test logs)"
 CSV_HEAD = ("table", "row", "predictor", "value")
 LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
-"""The figures that `spelgen evaluate --limit` takes."""
+"""Names of the figures that `spelgen evaluate --limit` accepts."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity per column. ranked: whether the smallest number is best."""
+    """Row of a table: one quantity, with a number per column. ranked: whether the smallest number is best."""
 
     label: str
     values: Numbers
     ranked: bool = True
 
     def text(self, column: str) -> str:
-        """Return the number of a column; an empty text without one."""
+        """Return the number of a column as text; an empty text if the column has no number."""
         return number(self.values[column]) if column in self.values else ""
 
     @property
     def best(self) -> list[str]:
-        """Return the columns with the smallest number; [] if there is only one column."""
+        """Return the columns that contain the smallest number; [] if there is only one column."""
         if not self.ranked or len(self.values) < 2:
             return []
         smallest = min((value for value in self.values.values() if value is not None), default=None)
@@ -50,7 +50,10 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A row for each quantity, a column for each predictor or model. title, note: explain the numbers and the rows."""
+    """Table with a row per quantity and a column per predictor or model.
+
+    title: explains the numbers. note: explains the rows.
+    """
 
     title: str
     rows: tuple[Row, ...]
@@ -62,14 +65,14 @@ class Table:
         return list(dict.fromkeys(name for row in self.rows for name in row.values))
 
     def text(self) -> str:
-        """Return the table for a terminal; the best of each row is starred."""
+        """Return the table for a terminal; a star marks the smallest number of each row."""
         return self.listing().text()
 
     def listing(self) -> Listing:
-        """Return the table with numbers as text."""
+        """Return the table with its numbers converted to text."""
         lines, columns = [], self.columns
         for row in self.rows:
-            # a blank in place of the star keeps the digits of a column below one another
+            # Numbers without a star end with a blank, so that the digits of a column are aligned.
             stars = ["*" if name in row.best else " " for name in columns]
             texts = [f"{row.text(name)} {star}" for name, star in zip(columns, stars, strict=True)]
             lines.append((row.label, *texts))
@@ -77,7 +80,7 @@ class Table:
 
 
 def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
-    """Return a table of ranked rows, by label and column."""
+    """Return a table of ranked rows. rows: label of a row -> column -> number."""
     return Table(title, tuple(map(Row, rows, rows.values())), note)
 
 
@@ -90,8 +93,8 @@ def result_tables(results: Results) -> list[Table]:
 
 
 def _without_empty_baselines(full: Table) -> Table:
-    """Return the table without columns of baselines that have no number."""
-    # the column of the model remains: that it has no number is a result
+    """Return the table without the columns of baselines that have no number."""
+    # The column of the model is kept even without numbers: it shows that the model has no result.
     columns, rows = {MODEL}, []
     for row in full.rows:
         columns |= {name for name, value in row.values.items() if value is not None}
@@ -110,7 +113,7 @@ def joined(runs: Mapping[str, Results]) -> list[Table]:
                 rows.setdefault(row.label, {})[run] = row.values[MODEL]
     common = []
     for title, rows in tables.items():
-        # a number that one run does not have cannot be compared
+        # Rows that are absent in one run are omitted, since they cannot be compared.
         of_all = {label: values for label, values in rows.items() if len(values) == len(runs)}
         if of_all:
             common.append(table(title, of_all))
@@ -118,7 +121,7 @@ def joined(runs: Mapping[str, Results]) -> list[Table]:
 
 
 def csv_text(results: Results) -> str:
-    """Return the numbers of all tables as CSV, a line for each; unknown values are empty."""
+    """Return the numbers of all tables as CSV, one line per number; an unknown number is an empty cell."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(CSV_HEAD)
@@ -134,19 +137,19 @@ def summary(results: Results) -> Listing | None:
         return None
     errors = {name: x.mean_nmse for name, x in results.torque.items()}
     rows: dict[str, Numbers] = {"torque that is unexplained": errors, "error of M(q)": results.mass_errors}
-    # in the order of increasing information, which shows the improvement of each step
+    # Columns are ordered by the information used (URDF, then logs), which shows the improvement of each step.
     names = [name for name in (URDF, LEAST_SQUARES, MODEL) if name in errors]
     lines = []
     for label, values in rows.items():
         numbers = [values.get(name) for name in names]
-        # M has no row if the true one is unknown
+        # The row of M exists only if the true M is known.
         if values:
             lines.append((label, *("-" if value is None else share(value) for value in numbers)))
     return Listing(f"{results.robot} on the test logs", ("", *names), tuple(lines))
 
 
 def _horizon_tables(results: Results) -> list[Table]:
-    """Return the errors per horizon, and the errors per joint of the last one."""
+    """Return tables of the errors per horizon, and of the errors per joint at the last horizon."""
     if not results.horizons:
         return []
     relative, tips, note = {}, {}, ""
@@ -156,14 +159,14 @@ def _horizon_tables(results: Results) -> list[Table]:
             head = f"{head} ({horizon.seconds:.3g} s)"
         relative[head] = {name: errors.mean_relative_rms for name, errors in horizon.errors.items()}
         tips[head] = {name: errors.tip_mm for name, errors in horizon.errors.items()}
-        # short logs have no observer, and need no explanation of it
+        # On short logs there are no predictions with an observer, so the note does not explain it.
         if observed(MODEL) in horizon.errors:
             note = OBSERVER
     q = {name: errors.q for name, errors in horizon.errors.items()}
     qd = {name: errors.qd for name, errors in horizon.errors.items()}
     title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
     tables = [table(title, relative, note)]
-    # no tip is known without a URDF
+    # Without a URDF the tip is unknown, and the table of tip errors is omitted.
     if any(value is not None for row in tips.values() for value in row.values()):
         tables.append(table("Error of the tip's position [mm]", tips))
     tables.append(_by_joint(results, f"Position error{{}} after {head}", "position", q))
@@ -171,7 +174,7 @@ def _horizon_tables(results: Results) -> list[Table]:
 
 
 def _torque_tables(results: Results) -> list[Table]:
-    """Return the nMSE of the torques, and their errors per joint."""
+    """Return tables of the nMSE of the torques, and of the torque errors per joint."""
     if not results.torque:
         return []
     rows = {
@@ -195,7 +198,7 @@ def _replay_tables(results: Results) -> list[Table]:
         rows: dict[str, Numbers] = {}
         for log in replay.errors[MODEL].trajectories:
             rows[log] = {name: 1000 * errors.trajectories[log] for name, errors in replay.errors.items()}
-        # last, as a sum below its terms
+        # The mean is the last row, as a sum is written below its terms.
         rows["mean of all"] = {name: 1000 * errors.mean for name, errors in replay.errors.items()}
         joints = {name: [1000 * rms for rms in errors.joints] for name, errors in replay.errors.items()}
         title = f"Commands replayed, {replay.name}: RMS"
@@ -210,7 +213,7 @@ def _by_joint(
 ) -> Table:
     """Return a table with a row for each joint; the unit is in the title if all joints have the same."""
     units = [asdict(UNITS[joint_type])[quantity] for joint_type in results.joint_types]
-    # a unit per row only if needed: it makes the first column wide
+    # If all joints have the same unit, it is in the title: a unit in each row would widen the first column.
     labels, common = results.joints, f" [{units[0]}]"
     if len(set(units)) > 1:
         pairs = zip(results.joints, units, strict=True)
@@ -219,13 +222,16 @@ def _by_joint(
 
 
 def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | None]]) -> dict[str, Numbers]:
-    """Return the errors of all predictors per joint."""
+    """Return rows per joint: label of a joint -> predictor -> error. errors: predictor -> error of each joint."""
     return {label: {name: values[k] for name, values in errors.items()} for k, label in enumerate(labels)}
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One of the few figures that summarise an evaluation. unit: "variance" and "motion" mean a fraction of these."""
+    """One of the few figures that summarise an evaluation.
+
+    unit: for "variance" or "motion" the value is a fraction of the torque's variance or of the motion.
+    """
 
     name: str
     label: str
@@ -246,7 +252,7 @@ def figures(results: Results) -> list[Figure]:
         torque = results.torque[MODEL]
         candidates.append(("torque.nmse", "nMSE of torques", "variance", torque.mean_nmse))
         candidates.append(("joint.nmse", "nMSE of the worst joint's torque", "variance", torque.worst_nmse))
-    # the longest horizon is the hardest, and the relevant one for simulation
+    # The longest horizon is reported: it is the most difficult one, and the relevant one for simulation.
     for horizon in results.horizons[-1:]:
         errors, horizon_name = horizon.errors[MODEL], f"after {horizon.name}"
         candidates.append(

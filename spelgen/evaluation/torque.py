@@ -21,10 +21,10 @@ from spelgen.logs.trajectory import Trajectory, joined_column
 class TorqueErrors:
     """Errors of the inverse dynamics of one predictor on `dynamics_samples`.
 
-    nMSE: mean squared error divided by the variance of the torque. nmse: of each trajectory, mean over joints. All
-    others are pooled over the samples of all trajectories, so that a short log has little weight. joint_nmse, rmse
-    [Nm, N]: per joint, None if the torque is constant. mean_nmse: mean over joints. nmse_with_pauses: mean over joints,
-    with the samples of pauses between motions.
+    The nMSE is the mean squared error divided by the variance of the torque. nmse: nMSE per trajectory, mean over
+    joints. All other errors are pooled over the samples of all trajectories, so that a short log has little weight.
+    joint_nmse: nMSE per joint, None for a joint of constant torque. rmse: RMS error per joint [Nm, N].
+    mean_nmse: mean nMSE over joints. nmse_with_pauses: mean nMSE over joints, pauses between motions included.
     """
 
     nmse: dict[str, float | None]
@@ -40,14 +40,14 @@ class TorqueErrors:
 
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
-    """Return the torque errors on these samples; pauses count in `nmse_with_pauses` only."""
+    """Return the torque errors of the dynamics on these samples; only `nmse_with_pauses` includes pauses."""
     errors_by_log, by_trajectory = [], {}
     for sample in samples:
         residual, rows = predicted_torques(dynamics, sample) - sample.tau, is_moving(sample.qd)
         by_trajectory[sample.name] = mean_nmse(residual[rows], sample.tau[rows])
         errors_by_log.append((residual, sample.tau, rows))
     residual, torque, rows = map(np.concatenate, zip(*errors_by_log, strict=True))
-    # pooled over samples: a mean over logs would give a log of one second the weight of one of an hour
+    # Errors are pooled over samples: in a mean over logs, one second would have the weight of an hour-long log.
     by_joint = _nmse(residual[rows], torque[rows])
     return TorqueErrors(
         nmse=by_trajectory,
@@ -67,7 +67,10 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 
 
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
-    """Return z, (T, n, K), and the direction, (T, n), of these samples as arguments, see `known_past`."""
+    """Return the arguments of the dynamics for the friction state z (T, n, K) and the direction (T, n) of the samples.
+
+    See `known_past`.
+    """
     past = (None if x is None else torch.from_numpy(x) for x in (samples.z, samples.direction))
     return known_past(dynamics, *past)
 
@@ -81,11 +84,11 @@ def mean_nmse(residual: np.ndarray, torque: np.ndarray) -> float | None:
 
 
 def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """Return the nMSE of each joint, (T, n) -> (n,); NaN of a constant torque."""
+    """Return the nMSE of each joint, (n,), for residual and torque (T, n); NaN for a joint of constant torque."""
     deviation = torque.std(axis=0)
     largest = np.abs(torque).max(axis=0, initial=0.0)
     varies = deviation > LEAST_SQUARES.negligible * largest  # otherwise constant up to rounding
-    # a prediction that is not finite must not be confused with a constant torque
+    # A residual that is not finite becomes infinity: NaN means constant torque.
     squares = np.nan_to_num(np.square(residual).mean(axis=0), nan=np.inf, posinf=np.inf)
     nmse: np.ndarray = np.full_like(squares, np.nan)
     nmse[varies] = squares[varies] / deviation[varies] ** 2
@@ -93,7 +96,7 @@ def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
 
 
 def _mean(nmse: np.ndarray) -> float | None:
-    """Return the mean over joints whose torque varies; None without any, or if an error is not finite."""
+    """Return the mean nMSE over the joints of varying torque; None without such a joint, or if an nMSE is infinite."""
     varying = nmse[~np.isnan(nmse)]
     return finite(varying.mean(keepdims=True))[0] if varying.size else None
 
@@ -101,10 +104,10 @@ def _mean(nmse: np.ndarray) -> float | None:
 def coarse_torques(
     logs: Sequence[Trajectory], joints: Sequence[str], notes: list[Diagnostic]
 ) -> dict[str, float]:
-    """Return the quantisation step [Nm, N] per joint, for torques not much larger than it, and note them."""
+    """Return joint -> quantisation step [Nm, N], for joints whose torque is not much larger than it; add notes."""
     steps = {}
     for k, joint in enumerate(joints):
-        # infinite for a log that is not quantised; the median: most of the logs are quantised
+        # A log without quantisation counts as infinite; the median is finite if most logs are quantised.
         step = float(np.median(np.nan_to_num([quantisation_step(log.tau[:, k]) for log in logs], nan=np.inf)))
         torque = joined_column(logs, "tau")[:, k]
         if np.isfinite(step) and has_few_levels(step, float(np.ptp(torque))):

@@ -1,6 +1,7 @@
-"""The curves behind the figures of an evaluation: for pages, and as `traces` of evaluation.json.
+"""The curves from which the figures of an evaluation are computed: for pages, and `traces` in evaluation.json.
 
-All are arrays [rad, m, s, Nm, N, kg m^2, J], NaN for unknown numbers; JSON has five digits.
+All curves are arrays in SI units [rad, m, s, Nm, N, kg m^2, J], with NaN for unknown numbers. In JSON, numbers have
+five digits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +34,7 @@ from spelgen.logs.trajectory import Trajectory, coverage, joined_column
 
 @dataclass(frozen=True, eq=False)
 class Quantiles:
-    """Quantiles of errors over windows, by time: 10, 50 and 90 %."""
+    """Quantiles (10, 50 and 90 %) of an error over all windows, at each time of a prediction."""
 
     low: Curve
     median: Curve
@@ -42,7 +43,7 @@ class Quantiles:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Errors over time [s], by predictor: divided by the motion, and of the tip [mm] if it is known."""
+    """Errors over the time of a prediction [s], per predictor: divided by the motion, and of the tip [mm] if known."""
 
     seconds: Curve
     windows: int
@@ -52,14 +53,14 @@ class Growth:
 
 @dataclass(frozen=True, eq=False)
 class MassCurves:
-    """The lower triangle of M, rows in sequence, along a trajectory, (entries, T)."""
+    """Lower triangle of M along a trajectory, (entries, T) [kg m^2, kg m, kg], entries in row-major order."""
 
     entries: Curve
 
 
 @dataclass(frozen=True, eq=False)
 class MassTrace:
-    """M along a trajectory, by predictor."""
+    """M of each predictor along a trajectory."""
 
     trajectory: str
     t: Curve
@@ -68,7 +69,7 @@ class MassTrace:
 
 @dataclass(frozen=True, eq=False)
 class FrictionTrace:
-    """Friction torque over velocity, (n, T), by predictor; one joint moves at a time, at the mean position."""
+    """Friction torque over velocity of each predictor, (n, T); one joint moves at a time, at the mean position."""
 
     qd: Curve
     by: dict[str, Curve]
@@ -76,7 +77,7 @@ class FrictionTrace:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """All curves of an evaluation. coverage: of the test logs, see `logs.trajectory.coverage`."""
+    """All curves of an evaluation. coverage: ranges of motion in the test logs, see `logs.trajectory.coverage`."""
 
     coverage: dict[str, object]
     growth: Growth | None = None
@@ -92,10 +93,13 @@ def motion_traces(
     predictions: Predictions | None,
     tip: TipPosition | None,
 ) -> Traces:
-    """Return all curves of an arm under torques. dynamics: by predictor. predictions: over the longest horizon."""
+    """Return all curves of an arm under torques.
+
+    dynamics: name of a predictor -> dynamics. predictions: predictions over the longest horizon.
+    """
     growth: Growth | None = None
     predicted: tuple[PredictedMotion, ...] = ()
-    # errors are divided by the motion, which is zero at rest
+    # At rest there are no relative errors, because errors are divided by the motion.
     if predictions is not None and predictions.windows.q.diff(dim=1).abs().max() >= AT_REST:
         errors = _relative_errors(predictions, logs.joint_types)
         growth = _growth(predictions, errors, tip)
@@ -113,13 +117,13 @@ def motion_traces(
 
 
 def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
-    """Return the logs of median and of largest error of an arm under position servos."""
+    """Return the curves of an arm under position servos: the replayed logs of median and of largest error."""
     motions = [thinned(replayed_motion(log, error), TUNING.log_samples) for log, error in errors]
     return Traces(coverage([log for log, _ in errors]), trajectories=typical_and_worst(motions))
 
 
 def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> dict[str, Tensor]:
-    """Return the RMS error over joints by predictor, divided by the motion, (W, K-1)."""
+    """Return the RMS error over joints of each predictor, divided by the motion, (W, K-1)."""
     windows = predictions.windows
     scales = loss_scales(windows, joint_types)
     errors = {}
@@ -133,13 +137,13 @@ def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> di
 def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosition | None) -> Growth:
     windows = predictions.windows
     seconds = windows.dt.cumsum(dim=1).mean(dim=0).numpy()
-    # errors grow by orders of magnitude: as many points for the first tenth as for the last
+    # Times are spaced geometrically, because errors grow by orders of magnitude.
     times = np.unique(np.geomspace(1, len(seconds), TUNING.curve_times).round().astype(int)) - 1
     relative, tips = {}, {}
     for name, (q, _) in predictions.states.items():
         if is_drawn(name):
             relative[name] = _quantiles(errors[name][:, times])
-            # the tip needs a URDF, which a model from Python may not have
+            # The tip is known only with a URDF, which a model from Python may not have.
             if tip is not None:
                 distance = tip(q[:, times]) - tip(windows.q[:, 1 + times])
                 tips[name] = _quantiles(1000 * distance.norm(dim=-1))
@@ -147,7 +151,7 @@ def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosi
 
 
 def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[PredictedMotion, ...]:
-    """Return the predictions of the model that charts show. errors: (W,) at the end of each window."""
+    """Return the model's predictions of median and largest error. errors: (W,) error at the end of each window."""
     motions = []
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
         motion = predicted_motion(piece.name, predictions.windows, predictions.states[MODEL], k)
@@ -164,14 +168,14 @@ def _quantiles(values: Tensor) -> Quantiles:
 
 
 def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> MassTrace:
-    """Return M along a motion of the charts."""
+    """Return M of each predictor along a motion that charts show."""
     q = torch.from_numpy(motion.q.copy())
     row, column = np.tril_indices(q.shape[-1])
     curves = {}
     for name, predictor in dynamics.items():
         with torch.no_grad():
             mass = torch.as_tensor(predictor.mass_matrix(q)).numpy()
-        # a curve with infinite values would stretch the axis of all others
+        # Curves with infinite values are omitted: they would make the axis useless for all other curves.
         if np.isfinite(mass).all():
             curves[name] = MassCurves(mass[:, row, column].T)
     return MassTrace(motion.trajectory, motion.t, curves)
@@ -179,11 +183,11 @@ def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> M
 
 def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory]) -> FrictionTrace:
     q = joined_column(pieces, "q")
-    # the fastest samples are often spikes of differenced positions
+    # The quantile excludes the fastest samples, which are often spikes of differentiated positions.
     fast = np.quantile(np.abs(joined_column(pieces, "qd")), 0.995, axis=0)
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense near zero, where friction reverses
     speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n)
-    alone = torch.diag_embed(speeds)  # one joint at a time
+    alone = torch.diag_embed(speeds)  # (81, n, n): only one joint moves at a time
     positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)
     curves = {}
     for name, predictor in dynamics.items():

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class EvaluationTuning:
-    """Measurements of an evaluation, and thresholds of its verdict."""
+    """Settings of the measurements of an evaluation, and thresholds of the assessment in words."""
 
     # [s] Time that the momentum observer runs before a prediction; 0.2 and 0.3 s are no better on the UR10e of
     # `benchmarks/arms.py`.
@@ -16,51 +16,52 @@ class EvaluationTuning:
     most_windows: int = 1000
     # [1] Largest number of predicted steps per predictor and horizon: long horizons have fewer windows.
     most_predicted_steps: int = 10_000
-    # [1] Smallest number of windows of a long horizon, as far as the logs have as many.
+    # [1] Smallest number of windows of a long horizon, if the logs are long enough.
     fewest_windows: int = 100
-    # [1] Number of test windows on which the number of integration steps is chosen.
+    # [1] Number of test windows from which the number of integration steps of a model is chosen.
     probed_model_windows: int = 64
-    # [1] Explained fraction of the torque variance that contact detection requires; a convention of this package.
+    # [1] Fraction of the torque variance that a model must explain for contact detection: a choice of this package.
     explained_for_contacts: float = 0.99
-    # [1] Explained fraction of the torque variance that feed-forward control requires.
+    # [1] Fraction of the torque variance that a model must explain for feed-forward control.
     explained_for_feed_forward: float = 0.95
-    # [1] Explained fraction that gravity compensation requires: gravity and friction explain about as much on most
-    # logs.
+    # [1] Fraction of the torque variance that a model must explain for gravity compensation: on most logs gravity
+    # and friction explain about this fraction.
     explained_for_gravity: float = 0.8
-    # [1] Error relative to the motion up to which a prediction is called a simulation.
+    # [1] Largest prediction error, divided by the motion, for which the assessment recommends simulation.
     close_prediction: float = 0.1
-    # [1] Error relative to the motion up to which a prediction is called a rough simulation.
+    # [1] Largest prediction error, divided by the motion, for which the assessment recommends rough simulation.
     rough_prediction: float = 0.3
-    # [1] Fraction of a joint's largest velocity below which it is called near standstill.
+    # [1] Motion below this fraction of a joint's largest velocity is called slow.
     slow: float = 0.1
-    # [1] Ratio of the errors of slow and fast motion from which on it is reported.
+    # [1] A ratio of the errors of slow and fast motion above this value is reported.
     uneven: float = 1.4
-    # [1] Fraction of a joint's range below which the range of the logs is called narrow.
+    # [1] Logs that cover less than this fraction of a joint's range are reported as narrow.
     narrow_range: float = 0.5
-    # [1] Positions of the test logs at which M is compared with the true one.
+    # [1] Approximate number of test positions at which M is compared with the true M.
     mass_positions: int = 500
-    # [1] Random positions at which M must be positive definite.
+    # [1] Number of random positions at which the smallest eigenvalue of M is computed.
     sampled_positions: int = 100_000
-    # [1] Number of steps of 1 ms of the motion without input.
+    # [1] Number of steps of 1 ms of the simulated motion without input, in which the energy must not rise.
     free_steps: int = 10_000
-    # [1] Initial states of the motion without input.
+    # [1] Number of initial states of the simulated motion without input.
     started_states: int = 8
-    # [1] Largest number of words of the first sentence of a verdict.
+    # [1] Largest number of words of the first sentence of an assessment.
     headline: int = 20
-    # [1] Length of the windows on which the number of integration steps is chosen, for a model not fitted to windows.
+    # [samples] Length of the windows from which the number of integration steps is chosen, for a model that was not
+    # fitted to windows.
     model_window: int = 5
-    # [s] Length of replays that are restarted from the measured state.
+    # [s] Length of the windows that are replayed from a measured state.
     replay_window: float = 1.0
 
     # Resolution of the curves of a report.
 
-    # [s] Time along a log over which torques are drawn.
+    # [s] Length of the part of a log of which charts show the torques.
     torque_seconds: float = 10.0
-    # [1] Samples of a curve along a log or a prediction.
+    # [1] Number of samples of a curve along a part of a log or along a prediction.
     curve_samples: int = 240
-    # [1] Samples of the curve of a log that is replayed as a whole.
+    # [1] Number of samples of a curve along a log that is replayed as a whole.
     log_samples: int = 600
-    # [1] Times at which the growth of errors is drawn.
+    # [1] Number of times in the chart of errors over the prediction horizon.
     curve_times: int = 24
 
 

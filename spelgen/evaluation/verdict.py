@@ -27,14 +27,17 @@ TORQUE_USES: tuple[tuple[float, Sequence[str], Sequence[str]], ...] = (
     (TUNING.explained_for_gravity, ["gravity compensation"], ["feed-forward control"]),
     (-math.inf, [], ["control"]),
 )
-"""By the minimum explained fraction of a torque's variance: the uses that the model is good enough for, or not."""
+"""Minimum explained fraction of the torque variance, uses for which the model is sufficient, uses for which not."""
 Limits = Sequence[tuple[float, float] | None]
-"""Lower and upper position of each joint [rad, m]; None without limits."""
+"""Lower and upper position limit of each joint [rad, m]; None for a joint without limits."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """An assessment. sentence: uses, failures, motions to record. because: the figures behind it."""
+    """An assessment in words.
+
+    sentence: suitable uses, failures, and motions to record. because: figures that support the sentence.
+    """
 
     sentence: str
     because: str
@@ -42,7 +45,7 @@ class Verdict:
 
 @dataclass
 class _Uses:
-    """The uses that a model is good enough for, the uses that it is not, and the figures that prove both."""
+    """Uses for which a model is sufficient, uses for which it is not, and the figures that prove both."""
 
     good: list[str] = field(default_factory=list)
     bad: list[str] = field(default_factory=list)
@@ -57,15 +60,15 @@ def verdict(
 ) -> Verdict:
     """Return the assessment of an evaluation.
 
-    identified: content of least_squares.json, for the coverage of the training logs. limits: of the joints.
-    independent: names of joints on whose position the dynamics do not depend, as of a vertical first axis.
+    identified: content of least_squares.json, for the coverage of the training logs. limits: position limits of the
+    joints. independent: names of joints on whose position the dynamics do not depend, such as a vertical first axis.
     """
-    # each assessment adds the uses that its figures prove
+    # Each assessment function adds uses, and the figures that prove them.
     uses = _Uses()
     _assess_torques(results, uses)
     _assess_motion(results, uses)
     _assess_replays(results, uses)
-    # such as an evaluation with --quick on logs without accelerations
+    # An evaluation may have no figures, for example with --quick on logs without accelerations.
     if not uses.proofs:
         return Verdict("No verdict: no horizon and no torque was evaluated.", "")
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
@@ -84,7 +87,7 @@ def verdict(
     details += [f"next, record {motion}" for motion in list(recommendations)[:1]]
     because = [] if elastic is None else [f"{elastic.where}: {elastic.message}."]
     for detail in details:
-        # longer details follow the first sentence
+        # A detail that would make the first sentence too long becomes a sentence of its own.
         if len(f"{sentence}; {detail}".split()) <= TUNING.headline:
             sentence += f"; {detail}"
         else:
@@ -95,7 +98,7 @@ def verdict(
 
 
 def _assess_torques(results: Results, uses: _Uses) -> None:
-    """Assess the torques by the worst joint, since a mean would hide it."""
+    """Assess the torques by the joint of the largest error, since a mean over joints would hide this joint."""
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
         return
@@ -114,7 +117,7 @@ def _assess_torques(results: Results, uses: _Uses) -> None:
 
 
 def _worst_torque(results: Results) -> tuple[str, float]:
-    """Return the joint of the largest nMSE of the model, and this nMSE; joints logged in coarse steps are omitted."""
+    """Return the joint of the model's largest nMSE, and the nMSE; joints of coarsely quantised torque are omitted."""
     torque = results.torque.get(MODEL)
     pairs = [] if torque is None else zip(results.joints, torque.joint_nmse, strict=False)
     worst = ("", -math.inf)
@@ -125,7 +128,7 @@ def _worst_torque(results: Results) -> tuple[str, float]:
 
 
 def _assess_motion(results: Results, uses: _Uses) -> None:
-    # a long horizon may diverge while a shorter one does not
+    # Predictions may diverge over a long horizon and not over a shorter one.
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
     if results.horizons and not finite:
         uses.bad.append("simulation")
@@ -147,7 +150,7 @@ def _assess_motion(results: Results, uses: _Uses) -> None:
 
 
 def _assess_replays(results: Results, uses: _Uses) -> None:
-    # the first replay is of whole logs: over windows, drift is not visible
+    # Only the first replay is assessed, which is over whole logs: windows of one second do not show drift.
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
         is_best = error == min(errors.mean for errors in replay.errors.values())
@@ -157,13 +160,13 @@ def _assess_replays(results: Results, uses: _Uses) -> None:
 
 
 def _relative(errors: StateErrors | None) -> float:
-    """Return the mean error divided by the motion; infinite if it is unknown."""
+    """Return the mean error divided by the motion; infinity if the error is unknown."""
     error = None if errors is None else errors.mean_relative_rms
     return math.inf if error is None else error
 
 
 def _better_baselines(results: Results) -> list[str]:
-    """Return sentences about the horizons at which a constant velocity, or another baseline, beats the model."""
+    """Return sentences about the horizons at which constant velocity or another baseline has a smaller error."""
     times: list[str] = []
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
@@ -176,7 +179,7 @@ def _better_baselines(results: Results) -> list[str]:
         if errors[best] < model_error:
             better.setdefault(best, []).append(f"after {horizon.name}")
     torque = {name: x.mean_nmse for name, x in results.torque.items() if x.mean_nmse is not None}
-    # torques are compared without the observer, which does not estimate them
+    # Torques are compared without the observer, which only corrects predictions of motion.
     best = min(torque, key=torque.__getitem__, default=MODEL)
     if MODEL in torque and best != MODEL:
         better.setdefault(best, []).append("in torque")
@@ -191,7 +194,7 @@ def _better_baselines(results: Results) -> list[str]:
 def _worst_joint(results: Results) -> tuple[str, str, str]:
     """Return the joint of the largest torque error, or of the largest motion error if only motion fails.
 
-    Also returns the speed at which the torque error is larger, and a sentence about the joint.
+    Also return the word for the speed at which its torque error is larger, and a sentence about the joint.
     """
     joint, error = _worst_torque(results)
     moving, motion_error = _worst_motion(results)
@@ -207,7 +210,7 @@ def _worst_joint(results: Results) -> tuple[str, str, str]:
 
 
 def _worst_motion(results: Results) -> tuple[str, float]:
-    """Return the joint of the largest error in the longest rollouts, divided by its motion, and this error."""
+    """Return the joint of the largest relative error at the longest horizon, and the error divided by the motion."""
     for last in results.horizons[-1:]:
         errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN
         if np.isfinite(errors).all():
@@ -216,7 +219,7 @@ def _worst_motion(results: Results) -> tuple[str, float]:
 
 
 def _slow_or_fast(results: Results, k: int) -> str:
-    """Return the words for slow or for fast motion of joint k, whichever has the larger torque residual, or ""."""
+    """Return the words for slow or fast motion of joint k: for the larger torque residual, or "" if neither is."""
     if not results.traces.torques:
         return ""
     residuals, speeds = [], []
@@ -225,7 +228,7 @@ def _slow_or_fast(results: Results, k: int) -> str:
         speeds.append(np.abs(trace.qd[:, k]))
     squares, speed = np.square(np.concatenate(residuals)), np.concatenate(speeds)
     slow = speed < TUNING.slow * np.nanmax(speed)
-    # a root mean square needs more than five samples
+    # With at most five slow or fast samples a root mean square is too uncertain.
     if not 5 < slow.sum() < len(slow) - 5:
         return ""
     ratio = np.sqrt(np.nanmean(squares[slow]) / np.nanmean(squares[~slow]))
@@ -242,11 +245,14 @@ def _recommendations(
     worst: str,
     speed: str,
 ) -> dict[str, str]:
-    """Return motions to record, the most useful first, with reasons. worst: the worst joint, at `speed`."""
+    """Return motions to record, with reasons, the most useful first.
+
+    worst: joint of the largest error. speed: words for the speed of larger error, see `_worst_joint`.
+    """
     recommendations = {}
     trained = identified.get("coverage") or {}
     unseen = identified.get("unseen_directions")
-    # first: parameters that no log determines cannot be improved by any further fit
+    # Undetermined parameters come first: no further fit to these logs can improve them.
     if unseen:
         reason = f"The training logs do not excite {unseen} directions of the base parameters."
         recommendations["a richer motion (as spelgen excite proposes)"] = reason
@@ -259,11 +265,11 @@ def _recommendations(
     fractions = {}
     for joint, covered, bound in zip(results.joints, trained.get("q", ()), limits, strict=False):
         if bound is not None and bound[1] > bound[0] and joint not in independent:
-            # one revolution covers the range of a continuous joint
+            # One revolution covers a continuous joint, so larger ranges count as one revolution.
             fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
     if fractions:
         joint = min(fractions, key=fractions.__getitem__)
-        # only the narrowest joint: one recommendation is followed, a list is not
+        # Only the joint of the narrowest range is named: users follow one recommendation rather than a list.
         if fractions[joint] < TUNING.narrow_range:
             reason = f"{joint} has moved over {share(fractions[joint], 'its range')}."
             recommendations[f"wider motion of {joint}"] = reason
@@ -273,14 +279,14 @@ def _recommendations(
 def _outside(
     trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str], independent: Collection[str]
 ) -> list[str]:
-    """Return the quantities whose range in the test logs exceeds their range in the training logs by a tenth."""
+    """Return the quantities whose range in the test logs exceeds the range in the training logs by a tenth."""
     exceeded = []
     for quantity, word in (("q", "positions"), ("qd", "velocities")):
         ranges = zip(joints, trained.get(quantity, ()), tested.get(quantity, ()), strict=False)
         for name, inner, outer in ranges:
             if quantity == "q" and name in independent:
                 continue
-            # a tenth: models extrapolate a little without harm
+            # A tenth is tolerated, because models extrapolate over small distances.
             room = 0.1 * (inner["high"] - inner["low"])
             if outer["low"] < inner["low"] - room or outer["high"] > inner["high"] + room:
                 exceeded.append(f"{word} of {name}")

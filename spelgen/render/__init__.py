@@ -1,1 +1,1 @@
-"""Results to charts, tables and HTML pages."""
+"""Rendering of results as charts, tables and HTML pages."""

@@ -1,4 +1,4 @@
-"""The pages of a derived structure, an identification by least squares, a proposed motion, and logs of an arm."""
+"""HTML pages about an arm: derived structure, identification by least squares, proposed motion, and logs."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ def inspection_page(
     proof: Verification | None = None,
     urdf: Path | None = None,
 ) -> str:
-    """Return the page about an inspection.
+    """Return the page about the derived structure of an arm.
 
     Args:
         inspection: The derived structure.
-        closed: Closed forms of the entries of M and V.
+        closed: Closed-form formulas of the entries of M and V.
         proof: Verification of the structure.
         urdf: URDF of the arm, for a picture of it.
     """
     text = None
-    if closed:  # SymPy is imported only for formulas
+    if closed:  # SymPy is slow to import and needed for formulas only
         from spelgen.certificate.formula_files import text as written
 
         text = written(closed, width=100)
@@ -60,9 +60,9 @@ def inspection_page(
 
 
 def identification_page(identification: Identification, arm: Arm) -> str:
-    """Return the page: base parameters with confidence intervals, the arm, and the torque residual."""
+    """Return the page about an identification: base parameters with intervals, the arm, and the torque residual."""
     record: Content = identification.to_dict()
-    # from the JSON form, which is the contract that the page shows
+    # The page shows the JSON form, which is the public interface.
     words = [parameter["determined"] for parameter in record["base_parameters"]]
     never = [name for name, visibility in record["identifiability"].items() if visibility == "never"]
     return render_page(
@@ -82,10 +82,10 @@ def identification_page(identification: Identification, arm: Arm) -> str:
 
 
 def motion_page(excitation: Excitation, arm: Arm) -> str:
-    """Return the page about a motion of `arm`, approach included."""
+    """Return the page about a proposed motion of `arm`, including the approach to its first position."""
     motion = excitation.approach.then(excitation.motion)
-    # twice the points of a chart: the animation uses the same arrays
-    step = -(-len(motion.t) // (2 * TUNING.points))  # ceil
+    # The motion has twice the points of a chart, because the animation uses the same arrays.
+    step = -(-len(motion.t) // (2 * TUNING.points))  # rounded up
     t, q, qd = (x[::step] for x in (motion.t, motion.q, motion.qd))
     drawn = AnimatedMotion("motion", "approach and motion", t.round(3), q.round(4))
     rows = [
@@ -103,7 +103,7 @@ def motion_page(excitation: Excitation, arm: Arm) -> str:
 
 
 def logs_page(report: LogReport, arm: Chain, inputs: np.ndarray) -> str:
-    """Return the page about the report. inputs: G, (n, n), joint torques = G times logged torques."""
+    """Return the page about a report on logs. inputs: input matrix G (n, n): joint torques = G times logged torques."""
     return render_page(
         "logs.html.jinja",
         robot=report.robot,
@@ -116,16 +116,16 @@ def logs_page(report: LogReport, arm: Chain, inputs: np.ndarray) -> str:
 
 
 def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
-    """Return charts of each joint: position; velocity with dq/dt; torque with the URDF's gravity torque.
+    """Return the charts of each joint: position; velocity with dq/dt; torque with the gravity torque of the URDF.
 
-    Of position servos: position with command. inputs: G, (n, n), see `logs_page`.
+    For position servos there is one chart: position with command. inputs: input matrix G (n, n), see `logs_page`.
     """
-    # split first, so that dq/dt has no difference across a gap
+    # The log is split at gaps first, so that dq/dt contains no difference across a gap.
     segments = [segment[:: -(-len(log.t) // TUNING.points)] for segment in split_at_gaps(log)]
     t, q = joined_column(segments, "t"), joined_column(segments, "q")
     position = [("logged", q, "truth")]
     rows = [JointRow("position", "position", "position", position)]
-    # position servos have no torques to compare with the URDF
+    # Logs of position servos contain commands and no torques.
     if log.u is not None:
         position.append(("commanded", joined_column(segments, "u"), "predicted"))
     else:
@@ -133,7 +133,7 @@ def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
         velocity = [("logged", joined_column(segments, "qd"), "truth"), ("dq/dt", derivative, "predicted")]
         torque = [("logged", joined_column(segments, "tau") @ inputs.T, "truth")]
         if any(body.inertia for body in arm.bodies):
-            # gravity only: acceleration and friction of the URDF would hide a wrong sign or unit of the torque
+            # Only the gravity torque is shown: with the other terms a wrong sign or unit of the torque is hard to see.
             still = np.zeros_like(q)
             gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
             torque.append(("gravity of the URDF", gravity, "predicted"))

@@ -24,7 +24,7 @@ from spelgen.templates import json_data
 
 @dataclass(frozen=True)
 class Cell:
-    """An entry of M. style: zero, constant or varying. joints: on which it depends (0-based)."""
+    """Cell of the table of M. style: zero, constant or varying. joints: indices of the joints it depends on."""
 
     style: str
     text: str
@@ -34,9 +34,10 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class AnimatedMotion:
-    """Positions q and predicted, (T, n) [rad, m], at times t (T,) [s]; error: (T, n), 1 has the last colour.
+    """A motion of the animated picture: positions q and predicted, (T, n) [rad, m], at times t (T,) [s].
 
-    name: of the charts whose time axis belongs to the motion. label: in the list of motions.
+    error: (T, n) errors that colour the links, from 0 to 1 for the whole colour scale. name: identifier that charts of
+    this motion refer to. label: text in the list of motions.
     """
 
     name: str
@@ -49,7 +50,7 @@ class AnimatedMotion:
 
 @dataclass(frozen=True)
 class AnimatedArm:
-    """The picture of the arm. data: JSON for the script. motions: their labels. tubes: see ``Scene``."""
+    """The animated picture of an arm. data: JSON for the script. motions: their labels. tubes: see ``Scene``."""
 
     data: Markup
     motions: tuple[str, ...]
@@ -57,7 +58,7 @@ class AnimatedArm:
 
 
 def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
-    """Return both triangles of M, (n, n): each entry with its dependence on joints, the reason and a short formula."""
+    """Return all entries of M, (n, n) cells: each with the joints it depends on, the reason and a short formula."""
     explanations = _explanations(arm, structure)
     cells = {}
     for entry in structure.entries:
@@ -69,8 +70,8 @@ def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
 
 
 def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
-    """Return, by entry name, the dependence of the entry, the facts that mention it, and its formula."""
-    # the facts of `spelgen inspect`: a page and a terminal must not explain an entry differently
+    """Return name of an entry of M -> text: the joints it depends on, the facts that mention it, and its formula."""
+    # `spelgen inspect` prints the same facts, so that pages and the terminal explain an entry equally.
     every_fact = facts(arm, structure)
     closed = {formula.name: formula for formula in formulas(arm, structure).rows}
     explanations = {}
@@ -80,12 +81,12 @@ def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
         default = f"depends on {joints_in_ranges(entry.joints)} only"
         lines = [f"{name} {predicates.get(entry.kind, default)}."]
         for fact in every_fact:
-            # joints that M does not depend on are a fact about every entry that varies
+            # The fact that M does not depend on some joints applies to every varying entry.
             of_all = entry.kind == "varying" and fact.statement.startswith("M does not depend")
             if of_all or name in re.findall(r"M\d+(?:,\d+)?", fact.statement):
                 lines.append(str(fact))
         formula = closed[name]
-        # long formulas would cover the page; the command writes them
+        # Long formulas are omitted: they would fill the page, and `spelgen inspect --formulas` prints them.
         if formula.expression is not None:
             lines.append(f"{name} = {text(formula.expression)}")
         elif entry.kind != "zero":
@@ -96,7 +97,7 @@ def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
 
 
 def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) -> AnimatedArm:
-    """Return the arm with its motions; without any, with a motion through the joint ranges."""
+    """Return the animated arm with its motions; if there are none, with a motion through the joint ranges."""
     shapes = scene(urdf, arm.joint_names)
     motions = motions or [_sweep(arm)]
     data = record(shapes) | {"motions": list(map(record, motions))}
@@ -104,11 +105,11 @@ def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) 
 
 
 def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
-    """Return predictions, with the position error as colour, then test motions with the torque residual as colour."""
+    """Return predicted motions, whose colour is the position error, then test motions, coloured by torque residual."""
     motions = []
     for example in traces.trajectories:
         extent = np.ptp(example.q, axis=0)
-        # the error of a joint that hardly moves is divided by 1 % of the largest extent of the joints
+        # Errors are divided by the joint's extent of motion, but at least by 1 % of the largest extent of all joints.
         error = (example.predicted_q - example.q) / np.maximum(extent, 1e-2 * extent.max() + 1e-9)
         label = f"{example.which} prediction and measured motion ({example.trajectory})"
         curves = (example.t, example.q, _colour(error), example.predicted_q)
@@ -121,7 +122,7 @@ def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
 
 
 def _colour(error: np.ndarray) -> np.ndarray:
-    """Return relative errors (T, n) on the scale of colours, on which an error of 0.5 has the last one."""
+    """Return relative errors (T, n) on the colour scale [0, 1], whose last colour represents an error of 0.5."""
     return np.asarray((np.abs(error) / 0.5).round(3))
 
 
@@ -129,10 +130,10 @@ def _sweep(arm: Chain) -> AnimatedMotion:
     """Return sines of all joints about the middle of their ranges, with three different periods."""
     t = np.linspace(0, 12, 121)
     low, high = np.array(list(map(working_range, arm.coordinates))).T
-    # amplitudes of at most 1.2 rad and 0.3 m: at the limits of 100 turns of some URDFs the picture would be a blur
+    # Amplitudes are at most 1.2 rad and 0.3 m: some URDFs have limits of 100 revolutions, too fast for a picture.
     largest = [0.3 if coordinate.joint_type == "prismatic" else 1.2 for coordinate in arm.coordinates]
     joint = np.arange(len(low))
-    # periods of 12, 6 and 4 s, so that the motion of neighbouring joints is distinguishable and the whole is periodic
+    # Periods of 12, 6 and 4 s make the motions of neighbouring joints distinguishable; the sum repeats after 12 s.
     phase = 2 * np.pi / 12 * t[:, None] * (1 + joint % 3) + joint
     q = (low + high) / 2 + np.minimum(0.4 * (high - low), largest) * np.sin(phase)
     return AnimatedMotion("sweep", "a motion through the joints' ranges", t.round(3), q.round(4))

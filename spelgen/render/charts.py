@@ -1,7 +1,7 @@
-"""Charts as inline SVG. The page's style sheet sets the colours, for light, dark and print.
+"""Charts as inline SVG. The style sheet of the page sets the colours for light and dark screens and for print.
 
 All charts have the same margins, so that the time axes of charts in a column are aligned. `data-` attributes of an SVG
-element contain the axes, from which a script computes the values at a pixel.
+element contain its axes, from which a script computes the values at the mouse pointer.
 """
 
 import math
@@ -17,7 +17,7 @@ Values = Sequence[float] | np.ndarray
 
 @dataclass(frozen=True)
 class Margins:
-    """Margins around the curves [pixels]. bare: bottom margin of a chart whose x axis has no numbers."""
+    """Margins around the plot area [pixels]. bare: bottom margin of a chart whose x axis has no numbers."""
 
     left: int = 52
     right: int = 14
@@ -33,20 +33,21 @@ MARGINS = Margins()
 class RenderTuning:
     """Limits of the charts and the 3D view of a page."""
 
-    # [1] Points of a line: at 400 pixels more are not visible and only make the page larger.
+    # [1] Largest number of points of a line: on 400 pixels more points are not visible, and the page becomes larger.
     points: int = 300
-    # [1] Decades of a logarithmic axis, counted from the largest value.
+    # [1] Largest number of decades of a logarithmic axis, counted from its largest value.
     decades: float = 8.0
-    # [1] Baselines with an error beyond this multiple of the model's error are cut off, so that the others are
+    # [1] Errors of baselines above this multiple of the model's error are cut off, so that other lines remain
     # distinguishable.
     outlier: float = 100.0
-    # [1] Ratio of root mean square to median above which a few starts dominate; a normal distribution has 1.5.
+    # [1] If the RMS error exceeds this multiple of the median, a few predictions dominate the RMS; a normal
+    # distribution has a ratio of 1.5.
     dominated: float = 2.0
-    # [1] Quantile of the measured friction that sets the axis: outliers are cut off.
+    # [1] Quantile of the measured friction that limits the axis, so that outliers are cut off.
     bulk: float = 0.995
-    # [1] An entry of M below this fraction of the largest entry is a rounding error.
+    # [1] An entry of M below this fraction of the largest entry is treated as a rounding error of zero.
     zero: float = 1e-9
-    # [1] Faces of all links together, so that a page stays below 1 MB.
+    # [1] Largest number of faces of all links together, for pages below 1 MB.
     faces: int = 4000
     # [1] Radius of the tube that represents a link without a mesh, relative to the extent of the arm.
     tube_radius: float = 0.028
@@ -57,7 +58,7 @@ TUNING = RenderTuning()
 
 @dataclass(frozen=True)
 class Axis:
-    """Linear or logarithmic scale: the values low..high lie at the pixels start..end."""
+    """Linear or logarithmic axis, which maps the values low..high to the pixels start..end."""
 
     low: float
     high: float
@@ -66,8 +67,8 @@ class Axis:
     log: bool = False
 
     def pixels(self, values: np.ndarray) -> np.ndarray:
-        """Return the pixels (T,) of values (T,); a value outside the axis lies on its edge."""
-        # Clipped first: browsers limit the range of coordinates.
+        """Return the pixels (T,) of values (T,); values outside the axis are clipped to its ends."""
+        # Values are clipped, because browsers limit the range of coordinates.
         scale = np.log if self.log else np.asarray
         low, high, clipped = map(scale, (self.low, self.high, np.clip(values, self.low, self.high)))
         pixels: np.ndarray = self.start + (clipped - low) / (high - low) * (self.end - self.start)
@@ -79,19 +80,19 @@ class Axis:
         return inside
 
     def ticks(self) -> list[tuple[float, str]]:
-        """Return about five round values within the axis: pixel and label of each."""
+        """Return the ticks at about five round values within the axis: pixel and label of each tick."""
         steps = _log_steps if self.log else _steps
         values, labels = steps(self.low, self.high)
         return list(zip(self.pixels(values).tolist(), labels, strict=True))
 
     def data(self) -> str:
-        """Return first and last pixel, their values, and 1 for a logarithmic axis, for a script."""
+        """Return the axis as text for a script: first and last pixel, their values, and 1 if logarithmic."""
         return f"{self.start:g} {self.end:g} {self.low:.6g} {self.high:.6g} {int(self.log)}"
 
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """One curve: x and y, (T,), with a gap at values that are not finite. style: its CSS class."""
+    """A curve through the points x, y (T,), interrupted at values that are not finite. style: CSS class."""
 
     label: str
     x: Values
@@ -101,13 +102,13 @@ class Line:
 
     @property
     def heights(self) -> np.ndarray:
-        """All values of y, (T,), for the range of the axis."""
+        """Values (T,) that determine the range of the y axis."""
         return _floats(self.y)
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the SVG path of the segments between gaps, in relative steps of tenths of a pixel."""
+        """Return the SVG path of the segments between gaps; coordinates are rounded to tenths of a pixel."""
         x, y = _floats(self.x), _floats(self.y)
-        # evenly spaced samples with the last one included: the line ends at the last value
+        # Evenly spaced samples include the last one, so that the line ends at the last value.
         rows = np.linspace(0, len(x) - 1, min(len(x), TUNING.points)).round().astype(int)
         x, y = x[rows], y[rows]
         gaps = ~(np.isfinite(x) & np.isfinite(y))
@@ -119,7 +120,7 @@ class Line:
         for segment in np.split(np.round(corners, 1), np.flatnonzero(gaps)):
             finite = segment[np.isfinite(segment[:, 0])]
             if len(finite) > 1:
-                # Relative steps are short numbers, which make a page smaller.
+                # The path has relative coordinates, because short numbers make the page smaller.
                 segments.append(f"M{_spaced(finite[0])}l{_spaced(np.diff(finite, axis=0))}")
         return "".join(segments)
 
@@ -131,7 +132,7 @@ class Dots(Line):
     shape = "dots"
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return an SVG path of the points within both axes: lines of length zero, whose round caps are dots."""
+        """Return an SVG path with a line of length zero per point within both axes: its round caps are a dot."""
         x, y = _floats(self.x), _floats(self.y)
         inside = x_axis.contains(x) & y_axis.contains(y)
         dots = np.stack([x_axis.pixels(x[inside]), y_axis.pixels(y[inside])], axis=1)
@@ -151,14 +152,14 @@ class Band:
 
     @property
     def heights(self) -> np.ndarray:
-        """All values of both curves, (2 T,), for the range of the axis."""
+        """Values of both curves (2 T,), which determine the range of the y axis."""
         return np.concatenate([_floats(self.low), _floats(self.high)])
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the outline, clipped to the axis; values that are not finite lie on its upper edge."""
-        # the upper quantile of a diverged prediction may be infinite while the lower one is finite
+        """Return the SVG path of the outline, clipped to the axis; values that are not finite count as infinite."""
+        # A diverged prediction may have an infinite upper quantile and a finite lower quantile.
         low, high = (np.nan_to_num(_floats(y), nan=np.inf) for y in (self.low, self.high))
-        # along the lower curve, then backwards along the upper curve
+        # The outline follows the lower curve, then the upper curve backwards.
         x = x_axis.pixels(_floats(self.x))
         columns = np.concatenate([x, x[::-1]])
         rows = y_axis.pixels(np.concatenate([low, high[::-1]]))
@@ -170,7 +171,7 @@ Mark = Line | Band
 
 @dataclass(frozen=True)
 class LegendEntry:
-    """A line of a legend: CSS classes of the mark, and its label."""
+    """An entry of a legend: CSS classes of the mark, and the label of the mark."""
 
     style: str
     label: str
@@ -178,13 +179,13 @@ class LegendEntry:
 
 @dataclass(frozen=True)
 class Chart:
-    """An SVG element, and the legend of its visible marks."""
+    """A chart: an SVG element, and the legend of its visible marks."""
 
     svg: str
     legend: tuple[LegendEntry, ...]
 
     def __html__(self) -> str:
-        """Return the element, for templates."""
+        """Return the SVG element; templates call this method to insert it without escaping."""
         return self.svg
 
 
@@ -201,10 +202,10 @@ def line_chart(
     width: int = 400,
     height: int = 190,
 ) -> Chart:
-    """Return lines, bands and dots over axes and grid; without any finite value, a chart with a note.
+    """Return a chart of lines, bands and dots with axes and grid; a chart with a note if no value is finite.
 
     Args:
-        marks: Curves in the order of the legend.
+        marks: Lines, bands and dots in the order of the legend.
         title: Accessible name of the chart.
         x_label: Label of the x axis; "": no label and no numbers, for a chart above another one with the same axis.
         y_label: Label of the y axis.
@@ -224,7 +225,7 @@ def line_chart(
         return Chart(render("chart.html.jinja", **size, x=None), ())
     bottom = height - (MARGINS.bottom if x_label else MARGINS.bare)
     x_axis = _axis(x_values, MARGINS.left, width - MARGINS.right, pad=0.0, log=log_x)
-    # SVG counts pixels downwards: the y axis starts at the bottom
+    # SVG counts pixels from the top, so the first pixel of the y axis is the bottom.
     y_axis = _axis(y_values, bottom, MARGINS.top, pad=0.0 if limits else 0.06, log=log)
     legend, beyond = [], []
     for mark in marks:
@@ -241,7 +242,7 @@ def line_chart(
         x_label=x_label,
         y_label=y_label,
         motion=motion,
-        # lines are drawn above bands and dots, the model's line above the baselines' lines
+        # Later marks cover earlier ones: lines cover bands and dots, and the model's line covers the baselines' lines.
         marks=sorted(marks, key=lambda mark: (mark.shape == "line", mark.style == "model")),
         beyond=beyond,
     )
@@ -253,12 +254,12 @@ def _floats(values: Values) -> np.ndarray:
 
 
 def _spaced(pixels: np.ndarray) -> str:
-    """Return the numbers of pixels (T, 2) or (2,) rounded to tenths and separated by blanks."""
+    """Return pixel coordinates (T, 2) or (2,) as text: rounded to tenths and separated by blanks."""
     return " ".join(f"{round(pixel, 1):g}" for pixel in pixels.ravel().tolist())
 
 
 def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
-    """Return the finite values of all columns (T,), for `positive` the positive ones only, (K,)."""
+    """Return the finite values of all columns (T,) as one array (K,); if `positive`, only the positive values."""
     values = np.concatenate([np.zeros(0), *columns])
     drawable: np.ndarray = values[np.isfinite(values) & ((values > 0) | (not positive))]
     return drawable
@@ -269,19 +270,19 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
     low, high = float(values.min()), float(values.max())
     if log:
         low = max(low, high * 10.0**-TUNING.decades)
-        # margins of equal width on a logarithmic axis are equal factors
+        # On a logarithmic axis, margins of equal width are equal factors.
         factor = (high / low) ** pad if high > low else 2.0
         return Axis(low / factor, high * factor, start, end, log=True)
     room = pad * (high - low)
-    # otherwise the rounding errors of a constant, about 1e-16, would fill the chart
+    # A nearly constant curve gets a wider axis; otherwise its rounding errors of about 1e-16 would fill the chart.
     if high - low <= 1e-9 * max(abs(low), abs(high)):
         room = 0.5 * abs(high) or 1.0  # a constant line lies in the middle
     return Axis(low - room, high + room, start, end)
 
 
 def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Return ticks (K,) and labels: powers of ten; for fewer than three, 1, 2 and 5 times these, or `_steps`."""
-    # the tolerance keeps a power of ten at the end of the axis in spite of rounding
+    """Return ticks (K,) and labels at powers of ten; if fewer than three fit, also at 2 and 5 times, else `_steps`."""
+    # The tolerance includes a power of ten at the end of the axis despite rounding.
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
     powers = range(first, last + 1, max(1, (last - first) // 5 + 1))
     if len(powers) >= 3:
@@ -295,11 +296,11 @@ def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
 
 
 def _steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Return ticks (K,) and labels: multiples of 1, 2 or 5 times a power of ten."""
-    # the smallest step of 1, 2, 5 or 10 times a power of ten that gives at most five intervals
+    """Return ticks (K,) and labels at multiples of 1, 2 or 5 times a power of ten."""
+    # The step is the smallest of 1, 2, 5 or 10 times a power of ten that gives at most five intervals.
     rough = (high - low) / 5
     fine = 10.0 ** math.floor(math.log10(rough)) * np.array([1, 2, 5, 10])
-    # the tolerance keeps a step that equals rough but for rounding
+    # The tolerance accepts a step that is smaller than `rough` only by rounding.
     step = fine[fine >= rough * (1 - 1e-9)][0]
     values = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
     return values, [f"{value:.6g}" for value in values]

@@ -1,4 +1,4 @@
-"""The page of a comparison: the result in a sentence and a table, then curves."""
+"""HTML page of a comparison: the result as a sentence and a table, then curves."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 
 @dataclass(frozen=True)
 class SimulatedCurves:
-    """Curves of the first run of each preset on a simulated arm; the curves of several seeds would overlap."""
+    """Curves of a simulated arm: of the first run of each preset only, as curves of several seeds would overlap."""
 
     losses: Chart
     prediction: list[Panel]
@@ -55,14 +55,14 @@ def write_comparison(study: Study, sections: Sequence[ArmResults]) -> Path:
 
 
 def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -> SimulatedCurves:
-    """Return the curves of one arm; truth: URDF of the simulated arm."""
+    """Return the curves of one arm. truth: URDF of the simulated arm."""
     first: dict[str, SimulatedFigures] = {}
     for result in section.results:
         if result.simulated is not None:
             first.setdefault(result.preset, result.simulated)
-    # one style per preset in all charts of the page
+    # Each preset has one style in all charts of the page.
     styles = dict(zip(first, STYLES, strict=False))
-    # Reversed, so that the first run of a preset is the one that remains.
+    # Jobs are reversed, so that the dictionary keeps the first run of each preset.
     folders = {job.preset: job.folder for job in reversed(study.jobs) if job.arm == section.name}
     arm = inputs.load().chain
     examples = {name: figures.example for name, figures in first.items() if figures.example is not None}
@@ -70,10 +70,10 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
     if examples:
         prediction = trajectory_panels(examples, styles, named_joints(arm.joint_names, arm.joint_types))
         learned = {name: figures.mass for name, figures in first.items() if figures.mass is not None}
-        # all presets have the same test logs, and therefore the same example
+        # All presets have the same test logs, so the examples have the same measured motion: any of them will do.
         along = next(iter(examples.values()))
         true = true_mass(truth, torch.from_numpy(along.q), arm.joint_names).numpy()
-        # M is symmetric: its lower triangle is enough
+        # Only the lower triangle is shown, since M is symmetric.
         rows, columns = np.tril_indices(len(arm.joint_types))
         entries = {name: m[:, rows, columns].T for name, m in {"true": true, **learned}.items()}
         mass = mass_panels(along.t, entries, {"true": "truth", **styles}, arm.joint_types, width=400)
@@ -81,11 +81,14 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
 
 
 def _losses(folders: Mapping[str, Path], styles: Mapping[str, str]) -> Chart:
-    """Return the best validation loss of each preset over the training steps; folders, styles: by preset."""
+    """Return the chart of the best validation loss of each preset over the training steps.
+
+    folders: preset -> run folder. styles: preset -> CSS class.
+    """
     lines = []
     for name, style in styles.items():
         records = RunFolder(folders[name]).read_metrics()
-        # a preset whose run failed has no metrics
+        # A preset whose run failed has no metrics.
         if records:
             steps, losses = array([(record["step"], record["best"]) for record in records]).T
             lines.append(Line(name, steps, losses, style))

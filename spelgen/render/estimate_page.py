@@ -1,4 +1,4 @@
-"""The page of `spelgen estimate`: payload, external torques and friction drift over time."""
+"""HTML page of `spelgen estimate`: payload, external torques and friction drift over time."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ from spelgen.templates import render_page
 
 
 def write_estimate(fit: Fit, levels: NoiseLevels, results: Sequence[LogEstimate], path: Path) -> Path:
-    """Write the page; return its path."""
+    """Write the page about the estimates along logs; return the path of the page."""
     sections = [
         (result, payload_sentence(result.payload), mass_chart(result), joint_panels(fit, result))
         for result in results
@@ -26,14 +26,14 @@ def write_estimate(fit: Fit, levels: NoiseLevels, results: Sequence[LogEstimate]
 
 
 def mass_chart(result: LogEstimate) -> Chart | None:
-    """Return the mass of the payload with its interval over time; None if no payload was found."""
+    """Return the chart of payload mass over time, with its interval; None if no payload was found."""
     mass = np.array([state.payload.mass for state in result.states])
-    # a chart of zeros would suggest a measurement
+    # Without a payload there is no chart, since a line of zeros would suggest a measured mass.
     if not mass.any():
         return None
     low, high = np.array([state.payload.mass_interval for state in result.states]).T
     t = _times(result)
-    # a band has a corner for each sample: only where the payload changes, twice
+    # The estimate is constant between changes: the band needs only two points at each change of the payload.
     corners = np.flatnonzero(np.diff(mass, prepend=np.nan) != 0)
     rows = np.unique(np.concatenate([corners, np.maximum(corners - 1, 0), [len(t) - 1]]))
     marks: list[Mark] = [
@@ -44,7 +44,7 @@ def mass_chart(result: LogEstimate) -> Chart | None:
 
 
 def joint_panels(fit: Fit, result: LogEstimate) -> list[Panel]:
-    """Return external torque with its thresholds, and friction relative to the model, per joint."""
+    """Return two charts per joint: external torque with its thresholds, and friction relative to the model."""
     contacts = [state.contact for state in result.states]
     threshold = np.array([contact.threshold for contact in contacts])
     torque = [
@@ -52,7 +52,7 @@ def joint_panels(fit: Fit, result: LogEstimate) -> list[Panel]:
         ("threshold of contact", threshold, "hold"),
         ("threshold, other direction", -threshold, "hold"),
     ]
-    # as a change in per cent: a drift of some per cent is not visible on an axis from zero
+    # Friction is shown as change in percent: a drift of a few percent is not visible on an axis that starts at zero.
     scale = 100 * (np.array([state.friction_scale for state in result.states]) - 1)
     rows = [
         JointRow("external torque", "external torque", "torque", torque),

@@ -34,7 +34,7 @@ DETERMINED = ("firm", "fair")
 
 @dataclass(frozen=True)
 class ParameterTable(Listing):
-    """A table with a name in the first column. folded: rows that a page shows on request."""
+    """A table with a name in the first column. folded: rows that are hidden on a page until the reader opens them."""
 
     folded: Rows = ()
     folded_title: str = ""
@@ -47,9 +47,9 @@ def parameter_tables(
 
     Args:
         model: the trained model.
-        arm: None if the URDF is unknown.
+        arm: arm of the URDF; None if the URDF is unknown.
         identified: result of least squares on the same logs.
-        posterior: of the model, with its 95 % intervals; None for a model without any.
+        posterior: posterior of the model, with 95 % intervals; None for a model without a posterior.
     """
     tables: list[Listing] = []
     if arm is not None and identified and "base_parameters" in identified:
@@ -72,22 +72,22 @@ def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
 def base_table(
     model: ArmModel | None, arm: Arm, identified: Content, posterior: Posterior | None = None
 ) -> ParameterTable:
-    """Return the base parameters by least squares, from the URDF and of a rigid-body model, with 95 % intervals."""
+    """Return the table of base parameters: from the URDF, and with intervals from least squares and the model."""
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
-    # derived again instead of stored: the combinations belong to the URDF and the friction model, not to the logs
+    # The base parameters are derived again here, because they depend on the URDF and friction model only, not on logs.
     base = base_parameters(arm.chain, friction, arm.actuation.drives().speeds)
     parameters = identified["base_parameters"]
     names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
     nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
-    # no URDF has friction and drives in this form, and some have no inertials
+    # A URDF has no friction and drive parameters of this form, and may have no inertials: these cells are empty.
     nominal[base.bodies :] = np.nan
     if not arm.chain.inertials_complete:
         nominal[:] = np.nan
     columns = {"parameter": names, "URDF": list(map(_number, nominal))}
     note = "Intervals are of 95 % [kg, m, s]"
     if posterior is not None:
-        # friction models differ: only base parameters of bodies and armatures are common
+        # Only base parameters of bodies and armatures are compared, as the friction models differ.
         estimates = {x.name: x for x in posterior.base_parameters}
         columns["model, 95 %"] = [estimates[name].text if name in estimates else "" for name in names]
         pairs = zip(names, determined, strict=True)
@@ -97,7 +97,7 @@ def base_table(
             "squares has no column for"
         )
     elif isinstance(model, RigidBodyDynamics):
-        # the first columns of every friction model are bodies and armatures, which the model has as well
+        # For every friction model the first columns are bodies and armatures, which the trained model has too.
         common = np.concatenate([body_parameters(model).ravel(), model.armature.detach().numpy()])
         learned = base.combination[:, : len(common)] @ common
         for k in range(base.bodies, len(names)):
@@ -106,7 +106,7 @@ def base_table(
         columns["model"] = list(map(_number, learned))
     columns["least squares, 95 %"] = list(map(_interval, parameters))
     columns["determined"] = determined
-    # a parameter of one body is its own formula
+    # The formula is omitted if it equals the name: the parameter is then not combined with others.
     columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
     rows = list(zip(*columns.values(), strict=True))
     sure = tuple(row for row in rows if row[-2] in DETERMINED)
@@ -129,7 +129,7 @@ def _interval(parameter: Content) -> str:
 
 
 def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None) -> Listing:
-    """Return mass, centre of mass and principal moments of each body; values: (bodies, 10)."""
+    """Return the table of mass, centre of mass and principal moments. values: inertial parameters (bodies, 10)."""
     alone = ""
     if posterior is not None:
         alone = ", ".join(f"{x.name} = {x.text} {x.unit}" for x in posterior.bodies)
@@ -141,7 +141,7 @@ def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None
         if arm.chain.inertials_complete:
             nominal = urdf_parameters(arm.chain).reshape(-1, 10)
     rows = []
-    # the URDF's values below the model's values of the same body, so that a column shows their difference
+    # The values of the URDF are below the model's values of the same body, so that they are easy to compare.
     for k, name in enumerate(names):
         rows.append((name, "model", *_about_center(values[k])))
         if nominal is not None:
@@ -156,8 +156,8 @@ def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None
 
 
 def _about_center(body: np.ndarray) -> tuple[str, str, str]:
-    """Return mass, centre of mass and principal moments about it, as text; body: inertial parameters, (10,)."""
-    # without mass there is no centre of mass; the URDF may have such bodies
+    """Return mass, centre of mass and principal moments about the centre as text. body: inertial parameters (10,)."""
+    # A body in a URDF may have no mass, and then has no centre of mass.
     if body[0] <= 0:
         return f"{body[0]:.4g}", "", ""
     mass, center, tensor = about_center(body)
@@ -169,14 +169,14 @@ def _listed(values: np.ndarray) -> str:
 
 
 def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) -> Listing:
-    """Return armature, friction and torque offset of each joint of a rigid-body model, with 95 % intervals."""
+    """Return the table of armature, friction and torque offset of each joint of a model, with 95 % intervals."""
     units = [UNITS[joint_type] for joint_type in model.joint_types]
     torques = [unit.torque for unit in units]
     dampings = [f"{unit.torque} s/{unit.position}" for unit in units]
     columns = {"joint": list(model.joint_names)}
     note = "Viscous and Coulomb friction are fitted to the model's friction law."
     if posterior is not None:
-        # numbers with their intervals: they replace the nearest friction, which has none
+        # The posterior has intervals. Without a posterior, the table has the nearest friction model, without intervals.
         columns |= posterior.drive_columns
         note += " Intervals are of 95 %."
     else:
@@ -186,7 +186,7 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
         joints = arm.chain.coordinates
         if posterior is None:
             friction = nearest_friction(arm.chain, model, sampled_positions(arm.chain))
-            # the damping of a servo's controller contains the viscous friction of its joint
+            # The damping gain of a position servo includes the viscous friction of the joint.
             if not parameters_of_kind(model, "damping"):
                 columns["viscous"] = _with_units(friction.viscous, dampings)
             columns["coulomb"] = _with_units(friction.coulomb, torques)
@@ -200,11 +200,11 @@ def _with_units(values: Sequence[float] | np.ndarray, units: Sequence[str]) -> l
 
 
 def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]) -> Listing:
-    """Return the learned constants of M with the entries that contain them."""
+    """Return the table of the learned constants of M, with the entries of M that contain each constant."""
     count = len(mass.raw_constants)
-    # dM / d constant, (constants, n, n): M is linear in its functions and constants
+    # dM / d constant (constants, n, n) does not depend on q, because M is linear in its functions and constants.
     functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
-    # unit vectors of the constants give the basis of each one
+    # M for a unit vector of constants is the basis matrix of that constant.
     zeros = torch.zeros(functions, count, dtype=torch.float64)
     units = torch.eye(count, dtype=torch.float64)
     rows = []
@@ -212,7 +212,7 @@ def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]
     for basis, value in zip(bases, mass.constants().tolist(), strict=True):
         indices = basis.tril().nonzero().tolist()
         terms = [f"{basis[row, column].item():+.4g} {entry_name(row, column)}" for row, column in indices]
-        # a constant that occurs in entries of different units has the unit of the first one
+        # A constant in entries of different units is shown with the unit of the first entry.
         first, second = (UNITS[joint_types[k]].inertia for k in indices[0])
         unit = first if first == second else "kg m"
         entries = " ".join(terms).replace("+1 ", "+ ").removeprefix("+ ")

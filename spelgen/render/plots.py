@@ -1,4 +1,4 @@
-"""Panels of charts that several pages show: quantities per joint, prediction errors, entries of M."""
+"""Groups of charts that several pages show: quantities per joint, prediction errors, entries of M."""
 
 from collections import defaultdict
 from collections.abc import Callable, Container, Mapping, Sequence
@@ -34,7 +34,7 @@ STYLES = defaultdict(
         observed(MODEL): "going-on",
     },
 )
-"""CSS class of the lines of each predictor."""
+"""Predictor -> CSS class of its lines."""
 MEASURES: tuple[tuple[str, str, Callable[[Growth], Mapping[str, Quantiles]]], ...] = (
     ("Relative error", "error / motion", lambda growth: growth.relative),
     ("Tip error", "tip error [mm]", lambda growth: growth.tip_mm),
@@ -43,7 +43,7 @@ MEASURES: tuple[tuple[str, str, Callable[[Growth], Mapping[str, Quantiles]]], ..
 
 @dataclass(frozen=True)
 class Panel:
-    """The charts of one joint, of one entry of M or of one error."""
+    """A group of charts with a title: of one joint, of one entry of M or of one error."""
 
     name: str
     charts: tuple[Chart, ...]
@@ -51,10 +51,11 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class JointRow:
-    """One chart per joint.
+    """A row of charts, one per joint.
 
     axis: label of the y axis. quantity: position, velocity or torque, for the unit of the y axis; "": no unit.
-    columns: label, values (T, n) and style of each curve. height: without the numbers of the time axis [pixels].
+    columns: label, values (T, n) and style of each curve. height: height of a chart [pixels], without the numbers of
+    the time axis.
     """
 
     title: str
@@ -80,7 +81,7 @@ def stacks(
         charts = []
         for row in rows:
             lines = [Line(label, t, values[:, k], style) for label, values, style in row.columns]
-            # one time axis per column; the plot areas of all its charts have the same height
+            # Only the last chart of a column has a time axis. It is higher, so that all plot areas are equally high.
             time, height = "", row.height
             if row is rows[-1]:
                 time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare
@@ -94,11 +95,11 @@ def stacks(
 def growth_panels(
     growths: Mapping[str, tuple[Growth, str]], styles: Mapping[str, str], banded: Container[str]
 ) -> list[Panel]:
-    """Return the relative error and the tip error over the prediction horizon.
+    """Return the charts of relative error and tip error over the prediction horizon.
 
     Args:
-        growths: By the name of a line, the errors of an evaluation and the predictor whose errors the line shows.
-        styles: CSS classes, by the names of the lines.
+        growths: Name of a line -> errors of an evaluation, and the predictor whose errors the line shows.
+        styles: Name of a line -> CSS class.
         banded: Names of the lines with a band from the 10 % to the 90 % quantile.
     """
     panels = []
@@ -123,13 +124,13 @@ def growth_panels(
 
 
 def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None:
-    """Return the range of the medians and of the model's band without outlying baselines; None without a model."""
-    # a page of several runs has no baselines
+    """Return the range of all medians and the model's band, without outlying baselines; None if there is no model."""
+    # A page of several runs has one line per run and no baselines, so its axis is not limited.
     if MODEL not in errors:
         return None
     model_errors = np.concatenate([errors[MODEL].low, errors[MODEL].high])
     values = np.concatenate([model_errors, *(error.median for error in errors.values())])
-    # A logarithmic axis has no zero; a baseline that diverged would compress all other lines.
+    # Zeros are excluded from the logarithmic axis. Diverged baselines are excluded, as they would compress all lines.
     values = values[(values > 0) & (values <= TUNING.outlier * np.nanmax(model_errors))]
     if not values.size:
         return None
@@ -142,16 +143,16 @@ def trajectory_panels(
     joints: Sequence[NamedJoint],
     motion: str = "",
 ) -> list[Panel]:
-    """Return per joint the position and its errors and, if logged, the velocity and its errors.
+    """Return the charts of each joint: position and position error and, if logged, velocity and velocity error.
 
     Args:
-        predictions: Predictions of the same motion, by the names of the lines.
-        styles: CSS classes, by the names of the lines.
+        predictions: Name of a line -> prediction; all predictions are of the same motion.
+        styles: Name of a line -> CSS class.
         joints: Names and units of the joints.
         motion: See `line_chart`.
     """
     measured = next(iter(predictions.values()))
-    # a replayed log of position servos has no velocities
+    # A replayed log of position servos has no velocities.
     positions = {name: x.predicted_q for name, x in predictions.items()}
     velocities = {name: x.predicted_qd for name, x in predictions.items() if x.predicted_qd is not None}
     rows = []
@@ -160,14 +161,14 @@ def trajectory_panels(
         if values is None:
             continue
         lines, errors = [("measured", values, "truth")], []
-        # first, so that the measured curve is drawn above it
+        # The command is the first curve, so that the measured curve is drawn above it.
         if measured.u is not None:
             lines.insert(0, ("commanded", measured.u, "hold"))
         for name, curve in predicted.items():
             lines.append((name, curve, styles[name]))
             errors.append((name, curve - values, styles[name]))
         rows.append(JointRow(quantity, quantity, quantity, lines))
-        # a chart of its own: next to the motion the error would be a flat line
+        # Errors have their own chart: on the scale of the motion they would be a flat line.
         rows.append(JointRow(f"Error of the {quantity}", "error", quantity, errors, 100))
     return stacks(measured.t, rows, joints, motion)
 
@@ -183,19 +184,19 @@ def mass_panels(
 
     Args:
         t: Times, (T,) [s].
-        masses: Lower triangles of M in row-major order, (entries, T) [kg m^2, kg m, kg], by the names of the lines.
-        styles: CSS classes, by the names of the lines.
+        masses: Name of a line -> lower triangle of M in row-major order, (entries, T) [kg m^2, kg m, kg].
+        styles: Name of a line -> CSS class.
         joint_types: Types of the joints, for the units of the entries.
         width: Width of each chart [pixels].
     """
     panels = []
-    # rounding errors of entries that are always zero are below this bound
+    # Entries below this bound are zero except for rounding.
     zero = TUNING.zero * max(np.nanmax(np.abs(mass)) for mass in masses.values())
     for number, (i, j) in enumerate(np.argwhere(np.tri(len(joint_types))).tolist()):
         lines = [Line(label, t, mass[number], styles[label]) for label, mass in masses.items()]
         if np.nanmax(np.abs([line.heights for line in lines])) > zero:
             name = entry_name(i, j)
-            # an entry of a revolute and a prismatic joint is a first moment
+            # An entry between a revolute and a prismatic joint has the unit of a first moment.
             unit = UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
             chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=width)
             panels.append(Panel(name, (chart,)))

@@ -1,4 +1,4 @@
-"""The charts of a run's report, from the traces of its evaluation, its metrics and the coverage of its logs."""
+"""Charts of the report on a run: from the curves of its evaluation, the losses and the coverage of the logs."""
 
 from collections.abc import Sequence
 
@@ -18,21 +18,21 @@ from spelgen.spec import ModelSpec
 
 
 def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
-    """Return the charts of each section of the report; None, or no charts, for a section without traces."""
+    """Return section of the report -> charts; a section without curves has None or an empty list."""
     joints = named_joints(spec.joint_names, spec.joint_types)
-    # the template tests for None, and an undefined name would be an error in it
+    # Every section has a value, None by default, because an undefined name is an error in the template.
     drawn: dict[str, object] = dict.fromkeys(("growth", "mass", "friction", "energy"))
     growth, mass = traces.growth, traces.mass
     if growth is not None:
         growths = {name: (growth, name) for name in growth.relative}
-        # the bands of all predictors would overlap
+        # Only these two have bands, since the bands of all predictors would overlap.
         drawn["growth"] = plots.growth_panels(growths, plots.STYLES, (MODEL, LEAST_SQUARES))
     if mass is not None and mass.by:
         entries = {name: curves.entries for name, curves in mass.by.items()}
         drawn["mass"] = plots.mass_panels(mass.t, entries, plots.STYLES, spec.joint_types)
     if traces.friction is not None:
         drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
-    if traces.torques:  # one trajectory shows the shares of the energy
+    if traces.torques:  # the energy terms of one trajectory are sufficient
         drawn["energy"] = energy_chart(traces.torques[0])
     torques, trajectories = {}, {}
     for trace in traces.torques:
@@ -45,7 +45,7 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
 
 
 def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
-    """Return the title of a predicted motion, or of a replayed log, with its error."""
+    """Return the title of a predicted motion or of a replayed log; it states the error."""
     which = example.which.capitalize()
     if example.start is None:
         distance = None if example.error is None else 1000 * example.error
@@ -56,10 +56,10 @@ def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
 
 
 def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
-    """Return training and validation loss over the epochs, with the epoch of the best model."""
+    """Return the chart of training and validation loss over the epochs, with a line at the epoch of the best model."""
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
     epochs, *losses = array(columns).T
-    # a vertical line over the whole range; the axis is logarithmic, so it cannot start at 0
+    # The line ends at the smallest and largest loss: zero does not exist on a logarithmic axis.
     ends = (np.nanmin(losses), np.nanmax(losses))
     lines = [
         Line("training loss", epochs, losses[0], "train"),
@@ -70,13 +70,13 @@ def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
 
 
 def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Panel]:
-    """Return per joint measured and predicted torque, their difference, and the components of the prediction."""
+    """Return the charts of each joint: measured and predicted torque, residual, and terms of the predicted torque."""
     measured, predicted = trace.measured, trace.predicted[MODEL]
     curves = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]
     components = [(name, torque, name.lower()) for name, torque in trace.parts.items()]
     rows = [
         JointRow("Torque", "torque", "torque", curves, 160),
-        # residual and components have their own scales: the residual is small if the model is good
+        # The residual has its own scale, since it is small for a good model.
         JointRow("Residual", "residual", "torque", [("residual", measured - predicted, "model")], 100),
         JointRow("Components of the torque", "components", "torque", components, 162),
     ]
@@ -86,10 +86,10 @@ def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Pane
 def friction_panels(
     friction: FrictionTrace, torques: Sequence[TorqueTrace], joints: Sequence[NamedJoint]
 ) -> list[Panel]:
-    """Return per joint friction over velocity: curves at constant velocity, and loops along measured motion.
+    """Return a chart per joint of friction over velocity: curves at constant velocity, loops along measured motion.
 
-    Measured friction is the measured torque minus the model's rigid-body torque. The loops are caused by hysteresis,
-    and in a model without a friction state only by friction that depends on the load.
+    Measured friction is the measured torque minus the model's rigid-body torque. Loops show hysteresis; in a model
+    without a friction state, loops show only friction that depends on the load.
     """
     panels = []
     for k, joint in enumerate(joints):
@@ -98,11 +98,11 @@ def friction_panels(
         values = [curve]
         for trace in torques:
             qd, modelled = trace.qd[:, k], trace.parts["friction"][:, k]
-            # measured friction = measured torque - (model torque - model friction)
+            # Measured friction = measured torque - (model torque - model friction).
             measured = modelled + trace.measured[:, k] - trace.predicted[MODEL][:, k]
             values.append(measured)
             marks.append(Dots("measured", qd, measured, "truth"))
-            # one trajectory only: the loops of two would overlap
+            # Loops of one trajectory only, as the loops of two would overlap.
             if trace is torques[0]:
                 marks.append(Line("measured, over time", qd, measured, "loop"))
                 marks.append(Line("model, over time", qd, modelled, "loop model"))
@@ -116,11 +116,11 @@ def friction_panels(
 
 
 def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
-    """Return the limits of the y axis, which contain the values (K,) except outliers, and the model's curve."""
+    """Return limits of the y axis that contain the model's curve and the values (K,) [Nm, N] except outliers."""
     values = values[np.isfinite(values)]
     if not values.size:
         return None
-    # the outliers are samples at reversals, if a filter or a delay shifts the measured friction
+    # Outliers occur at reversals of motion, if a filter or a delay shifts the measured friction.
     low, high = np.quantile(values, [1 - TUNING.bulk, TUNING.bulk])
     room = 0.15 * (high - low) or 1.0
     return float(np.fmin(low, np.nanmin(curve)) - room), float(np.fmax(high, np.nanmax(curve)) + room)
@@ -129,7 +129,7 @@ def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, floa
 def coverage_panels(
     traces: Traces, identified: Content | None, joints: Sequence[NamedJoint], limits: Limits
 ) -> list[Panel]:
-    """Return per joint the histograms of position and velocity in training and test logs, with the position limits."""
+    """Return charts per joint: histograms of position and velocity in training and test logs, and position limits."""
     logs: dict[str, Content | None] = {"training": (identified or {}).get("coverage")}
     logs["test"] = traces.coverage
     panels = []
@@ -137,7 +137,7 @@ def coverage_panels(
         charts = []
         for key, quantity in (("q", "position"), ("qd", "velocity")):
             bands = [_histogram(name, covered[key][k]) for name, covered in logs.items() if covered]
-            if not bands:  # the logs of a run have a coverage for all joints or for none
+            if not bands:  # without a coverage of the logs, no joint has a histogram
                 return []
             marks: list[Mark] = list(bands)
             top = max(float(np.max(band.high)) for band in bands)
@@ -151,9 +151,9 @@ def coverage_panels(
 
 
 def _histogram(name: str, histogram: Content) -> Band:
-    """Return the outline of a histogram; the heights of the bars sum to one."""
+    """Return the outline of a histogram, scaled so that the heights of its bars sum to one."""
     counts = array(histogram["counts"])
-    # two points per bar make the steps of the outline
+    # Each bar has two points, which form the steps of the outline.
     edges = np.linspace(histogram["low"], histogram["high"], len(counts) + 1)
     heights = np.repeat(counts / max(counts.sum(), 1.0), 2)
     style = "train" if name == "training" else "model"
@@ -161,7 +161,7 @@ def _histogram(name: str, histogram: Content) -> Band:
 
 
 def energy_chart(trace: TorqueTrace) -> Chart:
-    """Return the terms of the energy balance along a trajectory."""
+    """Return the chart of the terms of the energy balance along a trajectory."""
     styles = ("truth", "urdf", "friction", "model")
     terms = zip(trace.energy.items(), styles, strict=True)
     lines = [Line(name, trace.t, energy, style) for (name, energy), style in terms]

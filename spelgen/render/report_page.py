@@ -1,4 +1,4 @@
-"""The pages of a run and of several runs. Files that a run folder does not have are named on the page."""
+"""HTML pages about one run and about several runs. A page names the files that are absent in the run folder."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -27,13 +27,13 @@ from spelgen.structure.structure import derive
 from spelgen.templates import render_page
 
 SCHEMA = 1
-"""Version of the JSON form of a report."""
+"""Version of the JSON format of a report."""
 
 
 def write_report(
     folder: Path | str, output: Path | str | None = None, robot: Path | str | None = None
 ) -> Path:
-    """Write the page about a run; return its path.
+    """Write the page about a run; return the path of the page.
 
     Args:
         folder: Run folder.
@@ -45,7 +45,7 @@ def write_report(
     """
     folder = Path(folder)
     path = Path(output or folder / "report.html")
-    # the suffix decides, so that a script needs no further option
+    # The suffix of the file selects the format, so that no further option is needed.
     if path.suffix == ".json":
         return write_json(path, report_data(folder))
     return write_text(path, render_report(folder, robot))
@@ -68,12 +68,12 @@ def report_data(folder: Path | str) -> Content:
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
-    """Return the page about a run as HTML, deterministically. robot: see ``write_report``."""
+    """Return the page about a run as HTML; the same run gives the same text. robot: see ``write_report``."""
     folder = Path(folder)
     if not RunFolder(folder).path.is_dir():
         expected = "a folder with spec.json"
         raise RunError("no run", file=folder, expected=expected, do="make one with `spelgen train`")
-    # the files of a run folder are untrusted: each of them may have any content
+    # Files of a run folder are untrusted and may have any content, so exceptions of any type are reported as errors.
     try:
         return _rendered(open_run(folder), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
@@ -83,7 +83,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
     spec, record = run.spec, run.config
-    # the page of a run that is not evaluated has the same sections, which state that they are empty
+    # The page of a run without evaluation has the same sections, each with a note that it is empty.
     traces, tables = Traces({}), []
     if run.results is not None:
         traces, tables = run.results.traces, result_tables(run.results)
@@ -124,17 +124,17 @@ STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
 
 
 def write_runs(folders: Sequence[Path], output: Path) -> Path:
-    """Write the page; return its path. Raises RunError for a folder that is not a run, or a run without evaluation."""
+    """Write the page about several runs; return its path. Raises RunError for a folder without an evaluated run."""
     return write_text(output, render_runs(folders))
 
 
 def render_runs(folders: Sequence[Path]) -> str:
-    """Return the page as HTML."""
-    # all runs are read before anything is written: an error names the run
+    """Return the page about several runs as HTML."""
+    # All runs are read before the page is written, so that an unreadable run does not result in an incomplete page.
     runs: dict[str, Run] = {}
     results: dict[str, Results] = {}
     for name, folder in zip(_names(folders), folders, strict=True):
-        RunFolder(folder).read_record()  # raises an error if there is no run
+        RunFolder(folder).read_record()  # raises an error if the folder is not a run
         run = open_run(folder)
         if run.results is None:
             raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
@@ -146,14 +146,14 @@ def render_runs(folders: Sequence[Path]) -> str:
         verdict=_verdict(results),
         robots=sorted({run.spec.robot for run in runs.values()}),
         tables=joined(results),
-        # more runs than styles repeat the styles
+        # Styles are repeated if there are more runs than styles.
         growth=growth_panels(growths, dict(zip(runs, STYLES * len(runs), strict=False)), runs),
     )
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the shortest distinct ends of the folders' paths; complete paths would disclose home folders."""
-    # resolved: `.` has no name, and two links to one folder are the same run
+    """Return the shortest distinct ends of the folders' paths; whole paths would disclose home folders."""
+    # Paths are resolved, because `.` has no name, and two links to one folder are the same run.
     paths = list(map(Path.resolve, folders))
     names: list[str] = []
     for count in range(1, max(len(path.parts) for path in paths) + 1):
@@ -164,8 +164,8 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 
 def _verdict(runs: Mapping[str, Results]) -> str:
-    """Return a sentence that states, for each figure that all runs have, the run with the smallest error."""
-    # the first element decides which run is the smallest
+    """Return a sentence that states the run with the smallest error, for each figure that all runs have."""
+    # Figure -> (value, run, text) of each run; `min` compares the values first.
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():
         for figure in figures(results):
@@ -176,7 +176,7 @@ def _verdict(runs: Mapping[str, Results]) -> str:
         if len(of_runs) == len(runs):
             _, name, text = min(of_runs)
             smallest.setdefault(name, []).append(text)
-    # runs with other horizons or logs cannot be ranked
+    # Runs without a common figure, for example with other horizons, cannot be ranked.
     if not smallest:
         return "These runs have no common horizons or logs."
     sentences = [f"{name} has the smallest {listed(labels)}." for name, labels in smallest.items()]

@@ -1,4 +1,4 @@
-"""Facts about a run: its most important figures, its training, its options, and the commands that reproduce it."""
+"""Facts about a run: most important figures, training, options, and the commands that reproduce the run."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Run:
-    """The content of a run folder; None for files that it does not have.
+    """The content of a run folder; a field is None if its file is absent.
 
-    config: the record of the fit. baselines: content of least_squares.json, {} without one. arm: None also if its URDF
-    cannot be read: the page is written without it.
+    config: record of the fit. baselines: content of least_squares.json, {} if the file is absent. arm: arm of the URDF;
+    None also if the URDF cannot be read, in which case the page has no picture of the arm.
     """
 
     folder: RunFolder
@@ -52,24 +52,24 @@ class Run:
 
     @property
     def limits(self) -> Limits:
-        """Position limits of the joints [rad, m]; None for a joint without limits."""
+        """Lower and upper position limit of each joint [rad, m]; None for a joint without limits."""
         if self.arm is None:
             return [None] * len(self.spec.joints)
         return [joint.limits for joint in self.arm.chain.coordinates]
 
     @property
     def verdict(self) -> Verdict | None:
-        """Assessment of the model; None before its evaluation."""
+        """Assessment of the model; None if the run is not evaluated."""
         return None if self.results is None else self.results.assessment
 
     @cached_property
     def metrics(self) -> list[Content]:
-        """Records of the epochs; empty for a fit without epochs."""
+        """Losses of each training epoch; empty for a fit without epochs."""
         return self.folder.read_metrics()
 
     @cached_property
     def model(self) -> ArmModel | None:
-        """The trained model; None of a run without weights."""
+        """The trained model; None for a run without weights."""
         if not self.folder.weights.is_file():
             return None
         return fitted_model(self.folder).requires_grad_(False).eval()
@@ -80,7 +80,7 @@ class Run:
         if self.model is None or self.config is None or not self.folder.checkpoint.is_file():
             return None
         content = self.folder.load_checkpoint().posterior
-        # the delay is a parameter of the posterior: it shifts the torques of the fit
+        # The posterior depends on the torque delay, which shifts the torques of the fit.
         delay = self.config.preprocessing.torque_delay or 0.0
         return None if content is None else posterior_of(self.model, content, delay, self.folder.checkpoint)
 
@@ -92,7 +92,7 @@ def open_run(path: Path | str) -> Run:
     if folder.evaluation.is_file():
         results = Results.from_dict(folder.read_json(folder.evaluation))
     if folder.urdf.exists():
-        # a page without the picture of the arm is better than none: the results do not depend on the URDF
+        # An unreadable URDF is no error: results do not depend on it, only the picture of the arm is omitted.
         with suppress(SpelgenError):
             arm = arm_of_spec(spec, folder.urdf)
     record = folder.read_record() if folder.config.is_file() else None
@@ -100,14 +100,14 @@ def open_run(path: Path | str) -> Run:
 
 
 def head_numbers(run: Run) -> list[tuple[str, str]]:
-    """Return the most important figures with their labels."""
+    """Return the most important figures of a run, each as its text and label."""
     numbers = []
     if run.results is not None:
         numbers = [(figure.text(), figure.label) for figure in figures(run.results)]
     summary = None if run.config is None else servo_summary(run.config.servo)
     if summary is not None:
         numbers.append(summary.headline)
-    # parameters that the fit switched off are not counted: the number states the size of the model in use
+    # Parameters that the fit switched off are not counted: the number is the size of the model in use.
     elif run.model is not None:
         numbers.append((f"{used_parameter_count(run.model):,}", "trained parameters"))
     for last in run.metrics[-1:]:
@@ -116,7 +116,7 @@ def head_numbers(run: Run) -> list[tuple[str, str]]:
 
 
 def outlier_note(results: Results) -> str:
-    """Return a sentence on a root mean square that few starts dominate: far from the median; "" otherwise."""
+    """Return a sentence if few predictions dominate the RMS error, which is then far above the median; else ""."""
     growth = results.traces.growth
     if growth is None or MODEL not in growth.relative or not results.horizons:
         return ""
@@ -129,14 +129,14 @@ def outlier_note(results: Results) -> str:
 
 
 def best_epoch(metrics: Sequence[Content]) -> int:
-    """Return the epoch of the best model; 0: no epoch was better than the initial model."""
-    # the last record has the smallest validation loss, which is the initial loss if no epoch improved it
+    """Return the epoch of the best model; 0 if no epoch was better than the initial model."""
+    # The last record contains the smallest validation loss, which is the initial loss if no epoch was better.
     best = metrics[-1]["best"]
     return next((epoch["epoch"] for epoch in metrics if epoch["validation"] == best), 0)
 
 
 def training_facts(run: Run, record: Record) -> dict[str, str]:
-    """Return the logs, the preprocessing and the length of a fit as text, by label."""
+    """Return label -> text about the logs, the preprocessing and the duration of a fit."""
     preprocessing = record.preprocessing
     facts = {
         "objective": record.objective,
@@ -145,13 +145,13 @@ def training_facts(run: Run, record: Record) -> dict[str, str]:
         "windows": f"{record.training_windows:,} for training, {record.validation_windows:,} for validation",
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
-    # least squares needs accelerations, and so fewer samples than the model
+    # Least squares uses only samples with accelerations, so their number may be smaller than for the model.
     if "samples" in run.baselines:
         count = f"{run.baselines['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
     if isinstance(run.model, ResidualDynamics):
         facts["residual terms"] = "; ".join(terms_in_use(run.model)) or "none selected"
-    # fits to torques have no epochs
+    # Only fits with epochs have metrics; fits to torques have none.
     if run.metrics:
         last, best = run.metrics[-1], best_epoch(run.metrics)
         origin = f"epoch {best}" if best else "the start: no epoch was better"
@@ -168,7 +168,7 @@ def training_facts(run: Run, record: Record) -> dict[str, str]:
 
 
 def settings(record: Record) -> dict[str, str]:
-    """Return the options of the fit as text, by label."""
+    """Return label -> text of the options of a fit."""
     options = record.options.items()
     return {key.replace("_", " "): str(value) for key, value in options if value is not None}
 
@@ -179,7 +179,7 @@ def _names(trajectories: Sequence[str]) -> str:
 
 
 def _duration(seconds: float) -> str:
-    # three digits at most: times of training vary by more
+    # Times have at most three digits, since training times vary by more than that.
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = seconds / 60
@@ -187,12 +187,12 @@ def _duration(seconds: float) -> str:
 
 
 def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str]:
-    """Return the commands that reproduce a run, with LOGS in place of the logs, whose paths are not recorded."""
-    # only options that differ from their defaults: the command remains short enough to be read
+    """Return the commands that reproduce a run; LOGS represents the paths of the logs, which are not recorded."""
+    # Options with default values are omitted, to keep the command short.
     options = asdict(spec.options)
-    if spec.options.design is not None:  # the run folder has no copy of the YAML file
+    if spec.options.design is not None:  # the YAML file of the design is not in the run folder
         options["preset"] += ".yaml"
-    # without its folder, which may be one of another machine
+    # The folder of the URDF is omitted, as it may be a folder of another machine.
     robot, option = shlex.quote(Path(spec.urdf).name), ""
     if run.urdf.exists():
         robot, option = f"RUN/{run.urdf.name}", f" --robot RUN/{run.urdf.name}"
@@ -210,7 +210,7 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
         options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
-        # the mapping on the command line replaces the settings of the robot
+        # A mapping from the command line, stored in the run folder, has replaced the mapping of the robot's settings.
         if run.mapping.exists():
             train += f" --mapping RUN/{run.mapping.name}"
         lines.append(train)
@@ -218,7 +218,7 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
 
 
 def _changed(options: Mapping[str, object], defaults: Mapping[str, object]) -> dict[str, object]:
-    """Return the options that differ from their defaults; groups of options are omitted."""
+    """Return the options that differ from their defaults, without nested groups of options."""
     changed = {}
     for key, value in options.items():
         if value is not None and value != defaults.get(key) and not isinstance(value, Mapping):

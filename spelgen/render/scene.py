@@ -1,7 +1,7 @@
 """The kinematic tree and the triangles of an arm, for the animated picture on a page.
 
-The triangles are the simplified visual shapes of the URDF. If no shape can be read, links are drawn as tubes from joint
-to joint, and joints as drums about their axes; if some cannot be read, only their links.
+The triangles are the simplified visual shapes of the URDF. A link whose shapes cannot be read is drawn as tubes from
+joint to joint, with drums about the joint axes. If no shape can be read, all links are drawn in this way.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 class SceneLink:
     """A link and its motion relative to its parent.
 
-    rotation (3, 3) and position (3,) [m] are the pose of the joint frame in the parent's frame. In the joint frame the
-    link rotates about axis (3,), or for `slides` moves along it, by ratio * q[joint] + offset [rad, m].
-    parent, joint: indices, -1 for the root and for a fixed link.
+    rotation (3, 3) and position (3,) [m] are the pose of the joint frame in the parent's frame. The link rotates about
+    axis (3,) in the joint frame by ratio * q[joint] + offset [rad]; if `slides`, it moves along the axis by this
+    distance [m]. parent: index of the parent link, -1 for the root. joint: index of the joint, -1 for a fixed link.
     """
 
     name: str
@@ -49,9 +49,9 @@ class SceneLink:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Links, parents first.
+    """The links of an arm for the animated picture; parents precede their children.
 
-    extent: sum of the lengths between joints [m]. tubes: sentence on links that are drawn as tubes.
+    extent: sum of the distances between joints [m]. tubes: sentence about the links that are drawn as tubes.
     """
 
     links: tuple[SceneLink, ...]
@@ -60,18 +60,18 @@ class Scene:
 
 
 def scene(urdf: Path, joints: Sequence[str]) -> Scene:
-    """Return the scene of the arm with these moving joints. Raises the errors of ``read_urdf``."""
+    """Return the scene of the arm whose moving joints have these names. Raises the errors of ``read_urdf``."""
     robot = read_urdf(urdf)
     constraint = mimic_constraint(robot, joints)
-    # other branches of the robot (a second arm, a base with wheels) are not drawn
+    # Other branches of the robot (a second arm, a base with wheels) are not drawn.
     names = _links(robot, joints)
     visual = link_shapes(urdf, "visual", names, TUNING.faces)
     tubes = f" Drawn as tubes, since meshes were not read: {visual.unread_text}." if visual.unread else ""
     if not visual.shapes:
         tubes = " No meshes were read; links are drawn as tubes."
     lengths = [np.linalg.norm(joint.xyz) for name, joint in robot.joint_above.items() if name in names]
-    # a sum and not the largest distance: it does not depend on the configuration
-    extent = max(float(sum(lengths)), 1e-3)  # positive even if all joints lie in one point
+    # The extent is the sum of all lengths, as the distance to the tip depends on the configuration.
+    extent = max(float(sum(lengths)), 1e-3)  # the extent is positive even if all joints coincide
     links = []
     for name in names:
         if name in visual.unread or not visual.shapes:
@@ -89,7 +89,7 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
         return SceneLink(name, -1, np.eye(3), root, np.array([0.0, 0.0, 1.0]), False, -1, 0.0, 0.0, shape)
     driver, ratio, offset = -1, 0.0, 0.0
     if joint.moves:
-        # a mimic joint depends on its driving joint, a locked joint on none
+        # A mimic joint moves with its driving joint; a locked joint does not move.
         row = constraint.names.index(joint.name)
         offset = float(constraint.offset[row])
         drivers = np.flatnonzero(constraint.jacobian[row])
@@ -111,12 +111,12 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
-    """Return the links of the chain of `joints`, the links that it carries and links fixed to it, parents first."""
+    """Return the links of the chain of `joints` and all links fixed to or carried by the chain, parents first."""
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
     carried: set[str] = set()
     visible = [robot.root]
     for joint in robot.joints_from_root:
-        # the children of a carried link are carried as well
+        # All children of a carried link are carried as well.
         if joint.name in joints or joint.parent in carried:
             carried.add(joint.child)
         fixed = joint.parent in visible and not joint.moves
@@ -133,14 +133,14 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
     for carried in below:
         end = np.array(carried.xyz, dtype=float)
         meshes += tube(np.zeros(3), end, radius)
-        if carried.type == "prismatic":  # a thin tube along its travel
+        if carried.type == "prismatic":  # a thin tube along the travel of the prismatic joint
             travel = max(abs(carried.lower or 0.0), abs(carried.upper or 0.0))
             meshes += tube(end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius)
-    # a last link without children would not be visible otherwise
+    # A last link without child joints gets a tube to its centre of mass; otherwise it would be invisible.
     if not below and inertial is not None:
         meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
-        # a square block for a prismatic joint, a drum for a revolute joint; radius and half length in tube radii
+        # A prismatic joint is drawn as a square block, a revolute joint as a drum. Width and half length in tube radii.
         sides, width, half = (4, 1.8, 2.4) if joint.type == "prismatic" else (10, 1.5, 1.725)
         ends = half * radius * _axis(joint)
         meshes += tube(-ends, ends, width * radius, sides)
@@ -148,19 +148,19 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
 
 
 def _axis(joint: UrdfJoint) -> np.ndarray:
-    """Return the unit vector of the axis, (3,)."""
+    """Return the unit vector of the joint axis (3,), in the joint frame."""
     axis = np.array(joint.axis, dtype=float)
     return np.asarray(axis / (np.linalg.norm(axis) or 1.0))
 
 
 def _rotation(joint: UrdfJoint) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of roll, pitch and yaw about fixed axes."""
+    """Return the rotation matrix (3, 3) of the joint frame from roll, pitch and yaw about fixed axes [rad]."""
     return np.asarray(Rotation.from_euler("xyz", joint.rpy).as_matrix())
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Vertices (V, 3) [m] in the link frame; triangles as vertex indices (F, 3), counterclockwise from outside."""
+    """Triangle mesh: vertices (V, 3) [m] in the link frame, vertex indices (F, 3) counterclockwise from outside."""
 
     vertices: Curve
     faces: Annotated[np.ndarray, PlainValidator(np.array), PlainSerializer(np.ndarray.tolist)]
@@ -177,7 +177,7 @@ def joined(meshes: Sequence[Trimesh]) -> Shape:
 
 
 def tube(start: np.ndarray, end: np.ndarray, radius: float, sides: int = 10) -> list[Trimesh]:
-    """Return a closed prism, or nothing if it would be shorter than half its radius.
+    """Return a closed prism as a list of one mesh; an empty list if the prism is shorter than half its radius.
 
     Args:
         start: First end of the axis, (3,) [m].
@@ -187,7 +187,7 @@ def tube(start: np.ndarray, end: np.ndarray, radius: float, sides: int = 10) -> 
     """
     import trimesh
 
-    # axes that nearly intersect would give discs in place of tubes
+    # Between joints at nearly the same place a tube would be a disc, so it is omitted.
     if np.linalg.norm(end - start) <= radius / 2:
         return []
     return [trimesh.creation.cylinder(radius, segment=[start, end], sections=sides)]
@@ -197,7 +197,7 @@ def triangles(shape: LinkShape) -> Trimesh:
     """Return the triangles of a shape in the frame of its link."""
     from trimesh import Trimesh, creation
 
-    # 12 sides and 8 x 10 faces: coarse, since pages must remain small and edges are not visible at this size
+    # Cylinders have 12 sides and spheres 8 x 10 faces: pages must remain small, and edges are not visible.
     if shape.mesh is not None:
         mesh = Trimesh(*shape.mesh, process=False)
     elif shape.kind == "box":

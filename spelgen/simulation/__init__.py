@@ -1,1 +1,1 @@
-"""Simulated logs of an arm: motion, drives, friction, encoders; and arms that differ from their URDF."""
+"""Simulated logs of an arm: motion, drives, friction, encoders; and simulated arms that differ from their URDF."""

@@ -1,7 +1,7 @@
-"""The arm as it was built: a robot that differs from its URDF as real robots do, random with a seed.
+"""The arm as built: a random robot with realistic differences from its URDF.
 
 Inertials are perturbed; the drives have armature, viscous friction, Coulomb friction that depends on the direction, and
-presliding hysteresis. The result is a URDF with a settings file: the ground truth of simulated logs.
+presliding hysteresis. The result is a URDF with a settings file, which is the ground truth of simulated logs.
 """
 
 from pathlib import Path
@@ -29,7 +29,7 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
     inertial, or if a joint has no room between its limits.
 
     Args:
-        arm: The arm by its URDF.
+        arm: Nominal arm, as specified by its URDF.
         seed: Seed of all random numbers; the same seed gives the same files.
         path: The URDF to write; the settings go to the same name with .yaml.
     """
@@ -38,23 +38,24 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
         raise SpelgenError(
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
-    arm_dynamics(arm.chain, arm.settings)  # reports missing inertials with the name of the user's file
+    # Called only for its check: the error of a missing inertial contains the path of the user's file.
+    arm_dynamics(arm.chain, arm.settings)
     settings = _settings(arm, seed)
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
-    # magnitudes of friction and armature follow from the perturbed rigid bodies, without drives
+    # Friction and armature are scaled by the torques and M of the perturbed bodies, computed without drives.
     bodies = _with_settings(path, settings, arm)
     settings["joints"] = _drives(arm, bodies, np.random.default_rng([seed, 1]))
     return _with_settings(path, settings, arm)
 
 
 def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
-    """Return the arm of a URDF after writing its settings, with the angles rounded as for ``arm``."""
+    """Write the settings of a URDF and return its arm, with angles rounded by the tolerance of ``arm``."""
     write_text(path.with_suffix(".yaml"), yaml.safe_dump(settings, sort_keys=False, allow_unicode=True))
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
 
 
 def _settings(arm: Arm, seed: int) -> dict[str, object]:
-    """Return the settings of the arm as built, without drives: gravity, inputs, couplings and simulated motion."""
+    """Return the settings of the arm as built except the drives: gravity, inputs, couplings and simulated motion."""
     nominal = arm.settings
     carried = nominal.model_dump(
         mode="json",
@@ -63,7 +64,7 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
     )
     names = list(arm.chain.joint_names)
     settings: dict[str, object] = {"about": ABOUT.format(seed), "moving_joints": names} | carried
-    # a joint without a motor cannot be moved along a path: such an arm is driven as its own settings state
+    # Position servos and passive joints cannot be moved along a given path: such arms keep their own protocol.
     if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
         settings["simulation"] = carried.get("simulation", {}) | {"seed": seed}
         return settings
@@ -92,8 +93,8 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
     a fraction of the mean diagonal entry of M.
 
     Args:
-        arm: The arm by its URDF, whose gears and servo gains are kept.
-        bodies: The arm as built, without drives.
+        arm: Nominal arm, whose gear ratios and servo gains are kept.
+        bodies: Arm as built, without drives.
         rng: Source of the random numbers.
     """
     joints = bodies.chain.coordinates
@@ -102,7 +103,7 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
     dynamics = arm_dynamics(bodies.chain, bodies.settings)
     inertia = np.einsum("tii->i", dynamics.mass_matrix(q)) / len(q)
     speed = np.array([min(joint.velocity or np.inf, SPEEDS[joint.joint_type]) for joint in joints])
-    # Gravity and inertia torques are independent: their mean squares add up.
+    # The mean squares of gravity and inertia torques are added, since the two are independent.
     torque = np.hypot(
         np.sqrt(np.square(dynamics.gravity(q)).mean(axis=0)), AS_BUILT.acceleration * speed * inertia
     )
@@ -140,7 +141,7 @@ def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
         error: Relative standard deviation: 0.3 is 30 %.
         seed: Seed of the random factors; the same seed gives the same bytes.
     """
-    # without entities and network: a malicious URDF cannot include other files
+    # Entities and network access are off, so that a malicious URDF cannot include other files.
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     tree = etree.ElementTree(etree.fromstring(urdf_bytes(robot), parser))
     for element in list(tree.iter("dynamics", "visual", "collision")):
@@ -170,7 +171,7 @@ def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np
         trace = sum(float(tensor.get(name, "0")) for name in ("ixx", "iyy", "izz"))
         for name, value in tensor.attrib.items():
             tensor.set(name, repr(mass_factor * inertia_factor * float(value)))
-    # trace(I) / 2 is the second moment of mass about the centre, m r^2.
+    # The radius of gyration r satisfies m r^2 = trace(I) / 2, the second moment of mass about the centre.
     gyration_radius = np.sqrt(max(trace, 0.0) / 2 / kilograms)
     origin = inertial.find("origin")
     if origin is None:
@@ -180,7 +181,7 @@ def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np
 
 
 def _make_consistent(tensor: etree._Element) -> None:
-    """Replace an inertia tensor that violates the triangle inequality: clip its second moments of mass.
+    """Make an inertia tensor satisfy the triangle inequality: clip its negative second moments of mass.
 
     The second moments are S = trace(I)/2 1 - I; a body has S >= 0 (Wensing, Kim, Slotine, IEEE RA-L 3:60, 2018).
     """

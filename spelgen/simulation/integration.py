@@ -1,6 +1,6 @@
 """Integration of the equation of motion under piecewise constant torques, to the accuracy of floating-point numbers.
 
-    M(q) qdd + nonlinear_effects(q, qd) = tau - friction(qd)        tau constant between samples
+    M(q) qdd + nonlinear_effects(q, qd) = tau - friction(qd)        with tau constant between samples
 
 Joint limits are not enforced: there are no end stops.
 """
@@ -40,7 +40,7 @@ def rollout(
     tolerances = {"rtol": TUNING.rtol * tolerance_factor, "atol": TUNING.atol * tolerance_factor}
     states = np.empty((t.size, 2 * n))
     states[0] = initial
-    # A multistep method has no valid history across a jump of tau.
+    # LSODA is a multistep method, whose history of derivatives is invalid after a jump of tau: it is restarted.
     changes = np.flatnonzero((tau[1:-1] != tau[:-2]).any(axis=1)) + 1
     for first, last in pairwise([0, *changes.tolist(), t.size - 1]):
         torque = tau[first]
@@ -67,6 +67,6 @@ def rollout(
 
 
 def _stuck(t: float, failure: str) -> RunError:
-    """Return the error of an integration that fails at t [s]."""
+    """Return the error for an integration that failed at time t [s]."""
     cure = "check the inertials; make simulation.duration smaller or simulation.coulomb_smoothing_velocity larger"
     return RunError(f"the motion cannot be integrated beyond t = {t:g} s: {failure}", do=cure)

@@ -1,7 +1,7 @@
 """Simulate recordings of motions that the arm performs exactly: torques by inverse dynamics, with friction hysteresis.
 
-Prescribed motion needs no controller and no integration, so dry friction may have presliding hysteresis, whose stiff
-bristles an integrator would resolve by microseconds.
+Prescribed motion needs no controller and no integration. Dry friction may therefore have presliding hysteresis, whose
+stiff bristles would require steps of microseconds in an integrator.
 """
 
 from collections.abc import Sequence
@@ -71,14 +71,14 @@ def prescribed(
 ) -> SimulatedLogs:
     """Return one recording per motion; the last `test_fraction` of them are for testing.
 
-    Logged are positions from the encoders after a zero-phase low-pass, velocities by central differences of these, and
-    motor torques with white noise. Raises SettingsError for an arm with a passive joint.
+    A recording contains encoder positions after a zero-phase low-pass filter, velocities by central differences of the
+    filtered positions, and motor torques with white noise. Raises SettingsError for an arm with a passive joint.
 
     Args:
         arm: The arm.
         settings: `simulation` and `tracking` are used.
         drives: Input matrix and couplings of motors; None: each motor moves its own joint.
-        motions: Positions with two derivatives, (T, n) each; none: as `tracking.paths` specifies.
+        motions: Positions with two derivatives, (T, n) each; if empty, the motions of `tracking.paths`.
         progress: Called with (recordings done, all) after each recording.
     """
     protocol = settings.simulation
@@ -95,12 +95,12 @@ def prescribed(
         motions = paths(arm, settings, sample_times(protocol))
     logs = []
     for number, motion in enumerate(motions):
-        # A generator per motion: a motion has the same noise in any set of motions.
+        # Each motion has its own generator, so that its noise does not depend on the other motions.
         rng = np.random.default_rng([protocol.seed, number])
         torque = dynamics.inverse_dynamics(motion.q, motion.qd, motion.qdd)
         torque = torque + friction_along(friction, arm, motion, protocol.presliding)
         tau = torque @ to_motors.T
-        # Noise relative to the variation of each motor's torque, as of current sensors that fit their motors.
+        # The noise is relative to the standard deviation of each motor's torque: sensors are chosen for their motors.
         tau = tau + protocol.torque_noise * tau.std(axis=0) * rng.standard_normal(tau.shape)
         states = np.concatenate([motion.q, motion.qd], axis=1)
         recording = Recording(motion.t, states, quantized(motion.q, settings.tracking), tau)
@@ -118,7 +118,7 @@ def friction_along(friction: DriveFriction, arm: Chain, motion: Motion, preslidi
 
     Args:
         friction: Coefficients of the drives.
-        arm: Its joint types set the scale of displacements.
+        arm: Arm, whose joint types set the scale of displacements.
         motion: Positions and velocities, (T, n) each.
         presliding: Largest breakaway displacement [rad]; a tenth of it [m] for prismatic joints. 0: no hysteresis.
     """

@@ -18,11 +18,11 @@ from spelgen.settings.simulation import SimulationSettings
 from spelgen.simulation.tuning import TUNING as SIMULATION
 
 Progress = Callable[[int, int], None]
-"""Is called with (trajectories done, all) after each trajectory."""
+"""Function that is called after each trajectory with the number of finished trajectories and of all."""
 
 
 def silent(done: int, total: int) -> None:
-    """Show no progress."""
+    """Do nothing: the default if no progress is shown."""
 
 
 class SimulatedLogs(list[Trajectory]):
@@ -34,7 +34,7 @@ class SimulatedLogs(list[Trajectory]):
 
     @classmethod
     def split(cls, logs: Sequence[Trajectory], test_fraction: float) -> SimulatedLogs:
-        """Return the logs, the last of which are for testing; at least one remains for training."""
+        """Return the logs with the last `test_fraction` of them for testing; at least one remains for training."""
         trained = len(logs) - min(round(test_fraction * len(logs)), len(logs) - 1)
         return cls(logs[:trained], logs[trained:])
 
@@ -51,13 +51,13 @@ def sample_times(simulation: SimulationSettings) -> np.ndarray:
 
 
 def make_friction(arm: Chain, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
-    """Return the friction of the drives: from a joint's settings if it has any, else from its URDF's <dynamics>.
+    """Return the friction of the drives, from the settings of a joint if present, else from <dynamics> in its URDF.
 
     Args:
         arm: The arm.
         settings: `joints` and the smoothing velocity of `simulation` are used.
-        speeds: C (n, n): the drives' speeds are C qd. None: each drive moves its own joint. Friction belongs to the
-            drives, as in the models.
+        speeds: C (n, n), which gives the speeds C qd of the drives. None: each drive moves its own joint. Friction
+            acts on the drives, as in the models.
     """
     width = settings.simulation.coulomb_smoothing_velocity
     return joint_friction(arm.coordinates, settings.joints, width, speeds)
@@ -69,7 +69,7 @@ def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarra
     ranges, errors = [], []
     for joint in arm.coordinates:
         limits = (-np.pi, np.pi) if joint.continuous else joint.limits
-        # exporters write 0 to 0 for an unknown range
+        # Exporters of URDFs write the limits 0 and 0 for an unknown range.
         if joint.name not in positions and (limits is None or limits[0] >= limits[1]):
             message = "the joint has no range: give its lowest and highest initial position"
             errors.append(SettingsError(message, element=f"simulation.positions.{joint.name}"))
@@ -91,11 +91,11 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
         t: Times (T,) [s].
     """
     count = settings.simulation.trajectories
-    # Independent generators: the first trajectories are the same for any number of them.
+    # Each trajectory has its own generator, so that the first trajectories do not depend on their number.
     randoms = np.random.default_rng(settings.simulation.seed).spawn(count)
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
-        # moderate: the middle of the ranges at moderate speeds, as for the first motion of an unknown arm
+        # Default motion: the middle part of each range at moderate speed, as for the first motion of an unknown arm.
         middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
         speeds = [
             min(SIMULATION.used_range * (x.velocity or np.inf), SPEEDS[x.joint_type]) for x in arm.coordinates
@@ -106,7 +106,7 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
     middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
     drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]
     if settings.tracking.paths == "same":
-        # The same path with equally spaced phases.
+        # All trajectories follow the path of the first one, with equally spaced phases.
         drawn = [drawn[0] + 2 * np.pi * number / count for number in range(count)]
     return [sines(middle, amplitude, settings.tracking.frequency, phase, t) for phase in drawn]
 
@@ -130,7 +130,7 @@ def sines(
 
 
 def _amplitude(arm: Chain, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the amplitudes (n,) [rad; m] of sines within low..high, (n,) each; SettingsError if they exceed these."""
+    """Return the amplitudes (n,) [rad; m] of sines within low..high, (n,) each. Raises SettingsError beyond these."""
     amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()
     if "amplitude" not in settings.tracking.model_fields_set:
         amplitude = np.minimum(amplitude, SIMULATION.used_range * (high - low) / 2)

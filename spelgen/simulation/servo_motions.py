@@ -1,4 +1,4 @@
-"""Simulated logs of an arm under position servos: commands with sines, holds and steps; positions of encoders."""
+"""Simulated logs of an arm under position servos: commands of sines, holds and steps, and encoder positions."""
 
 import numpy as np
 
@@ -23,7 +23,7 @@ def servo_motions(
 ) -> SimulatedLogs:
     """Return trajectories under random commands; the same settings give the same logs.
 
-    Arguments and errors: see `random_inputs`.
+    `random_inputs` documents the arguments and errors.
     """
     protocol = settings.simulation
     lowest, highest = initial_range(arm, settings)
@@ -44,7 +44,7 @@ def servo_motions(
 
 
 def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
-    """Return random commands (T, n) in [-1, 1] at times t (T,) [s]: the mean of sines and of random levels."""
+    """Return random commands (T, n) in [-1, 1] at times t (T,) [s]: the mean of sines and a random step signal."""
     low, high = np.log(TUNING.min_command_frequency), np.log(TUNING.max_command_frequency)
     frequencies = np.exp(random.uniform(low, high, (3, n)))
     phases = random.uniform(0, 2 * np.pi, (3, n))
@@ -54,7 +54,7 @@ def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
 
 
 def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return positions (T, n) [rad; m] from rest at the first command.
+    """Return simulated positions (T, n) [rad; m]; the arm starts at rest at the first command.
 
     Method: semi-implicit Euler with dry friction as impulses. The impulse of a joint's dry friction stops it, within
     the bounds of Coulomb friction (projected Gauss-Seidel, as in physics engines: Catto, Iterative Dynamics with
@@ -98,7 +98,7 @@ def _after_dry_friction(
         qd: Velocity (n,) without dry friction.
         inverse: Inverse of the mass matrix, (n, n).
         lower: Smallest impulses (n,) [Nm s; N s].
-        upper: Largest impulses (n,).
+        upper: Largest impulses (n,) [Nm s; N s].
     """
     impulse = np.zeros_like(qd)
     for _ in range(TUNING.friction_sweeps):

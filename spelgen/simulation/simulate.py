@@ -1,4 +1,4 @@
-"""Simulated logs of an arm in memory, by the protocol that its settings name, for example random torques."""
+"""Simulated logs of an arm, in memory. The settings of the arm name the protocol, for example random torques."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,7 +42,8 @@ def random_inputs(
     Args:
         arm: The arm.
         settings: `simulation` and `joints` are used.
-        drives: Matrices of coupled motors: inputs are motor torques, joints get G tau, friction is the motors'.
+        drives: Matrices of coupled motors: inputs are motor torques tau, the joint torques are G tau, and friction acts
+            on the motors. None: each motor moves its own joint.
         progress: Called with (trajectories done, all) after each trajectory.
     """
     protocol = settings.simulation
@@ -54,7 +55,7 @@ def random_inputs(
         is_driven = joint.actuated and not coordinate.passive
         torques.append(np.array(joint.inputs or protocol.inputs) if is_driven else np.zeros(1))
     t = sample_times(protocol)
-    # one generator per trajectory: the first trajectories do not depend on their number
+    # Each trajectory has its own generator, so that the first trajectories do not depend on their number.
     split, *randoms = np.random.default_rng(protocol.seed).spawn(protocol.trajectories + 1)
     trajectories = []
     for number, random in enumerate(randoms):
@@ -65,7 +66,7 @@ def random_inputs(
         q, qd = np.split(states, 2, axis=1)
         trajectories.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}"))
         progress(number + 1, protocol.trajectories)
-    # at least one trajectory remains for training
+    # At least one trajectory remains for training.
     count = protocol.trajectories
     order = split.permutation(count)
     tests = min(round(protocol.test_fraction * count), count - 1)
@@ -124,9 +125,9 @@ def simulate(
 
 
 def _controlled(settings: Settings) -> Settings:
-    """Return the settings with the defaults of a controlled arm if no protocol and no inputs are set.
+    """Return the settings; if they set no protocol and no inputs, with the protocol of a controlled arm.
 
-    Under random torques that are not tuned for an arm, the arm would fall.
+    Under random torques that are not tuned for the arm, the arm would fall.
     """
     simulation, tracking = settings.simulation, settings.tracking
     if settings.input == "position":

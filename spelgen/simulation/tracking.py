@@ -1,6 +1,6 @@
 """Simulated logs of a controlled arm: feedback control along paths, encoder positions, velocities by differences.
 
-It replaces the recordings of the real arm in the paper (Wang, Chen, Ding, Sci Rep 15:33179, 2025), which are not
+These logs replace the recordings of the real arm of Wang, Chen and Ding (Sci Rep 15:33179, 2025), which are not
 public. Values that the paper does not state are chosen here: gains, phases, encoders and the cutoff of the filter.
 """
 
@@ -26,7 +26,7 @@ from spelgen.simulation.tuning import TUNING
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Gains of PID controllers, (n,) each: torque per position error, per its integral, and per velocity error."""
+    """Gains of PID controllers, (n,) each: torque per position error, per integrated error and per velocity error."""
 
     proportional: np.ndarray
     integral: np.ndarray
@@ -53,9 +53,9 @@ def track(
     """Return logs of the arm under feedback control along paths.
 
     Each recording has its own gains, and its own phases or initial position. The last `test_fraction` of each recording
-    is for testing. Logged are positions from the encoders after a zero-phase low-pass, velocities by central
-    differences, and motor torques. Arguments and errors: see `random_inputs`; `settings.tracking` is
-    used as well.
+    is for testing. A log contains encoder positions after a zero-phase low-pass filter, velocities by central
+    differences of the filtered positions, and motor torques. `random_inputs` documents the arguments and errors;
+    `settings.tracking` is used in addition.
     """
     protocol = settings.simulation
     friction = make_friction(arm, settings, drives and drives.speeds)
@@ -68,7 +68,7 @@ def track(
     train, test = [], []
     for number, path in enumerate(paths(arm, settings, ticks)):
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
-        # inertia of each joint if all others move freely
+        # 1 / (M^-1)_jj is the inertia at joint j while all other joints move freely.
         inertia = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))
         gains = tuned_gains(inertia, bandwidth)
         recording = record(dynamics, friction, inputs, path, gains, settings, 2 * np.pi * bandwidth)
@@ -89,7 +89,7 @@ def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
         bandwidth: Bandwidth of the position loop [Hz].
     """
     omega = 2 * np.pi * bandwidth
-    # inertia (s^2 + 2 omega s + omega^2) = 0: a double pole, without overshoot.
+    # Without the integral term the poles solve s^2 + 2 omega s + omega^2 = 0: a double pole, without overshoot.
     return Gains(inertia * omega**2, TUNING.integral_gain * inertia * omega**3, 2 * inertia * omega)
 
 
@@ -105,10 +105,10 @@ def computed_torque(
 
         M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
 
-    If viscous friction makes a joint slower than omega, a stiffness viscous * omega is added for it.
+    For a joint that viscous friction makes slower than omega, a stiffness viscous * omega is added.
 
     Args:
-        dynamics: The arm, whose parameters the controller knows.
+        dynamics: The simulated arm; the controller uses its true parameters.
         friction: Friction of the drives.
         motion: Measured q, desired qd* and qdd*, (n,) each.
         error: Position error e (n,) [rad; m].
@@ -117,7 +117,7 @@ def computed_torque(
     """
     q, qd, qdd = motion
     mass = dynamics.mass_matrix(q)
-    # Such a joint follows viscous qd = k e: its time constant is 1 / omega for k = viscous omega.
+    # With dominant viscous friction, viscous qd = k e: k = viscous omega gives the time constant 1 / omega.
     slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
     torque = mass @ (qdd + 2 * omega * velocity_error + omega**2 * error) + slow * error
     return np.asarray(torque + dynamics.nonlinear_effects(q, qd) + friction(qd))
@@ -132,14 +132,14 @@ def record(
     settings: Settings,
     omega: float = 0.0,
 ) -> Recording:
-    """Return a motion along a path: the controller measures the encoders, its torques are constant between its ticks.
+    """Return the recording of a controlled motion along a path. The arm starts at rest, in equilibrium with gravity.
 
-    The arm starts at rest at the first position of the path, in equilibrium with gravity.
+    The controller reads the encoders at each tick; its torques are constant between ticks.
 
     Args:
         dynamics: The arm, with friction.
-        friction: The same friction, for the controller.
-        inputs: G (n, n).
+        friction: Friction of the arm, as used by the controller.
+        inputs: Input matrix G (n, n): joint torques divided by motor torques.
         path: Desired motion at the ticks of the controller.
         gains: Gains of the PID controllers.
         settings: `simulation` and `tracking` are used.
@@ -147,17 +147,17 @@ def record(
     """
     tracking, n = settings.tracking, path.q.shape[1]
     tick, samples = 1.0 / tracking.control_rate, _samples_of_a_tick(settings)
-    # passive joints have no motor: the pseudo-inverse gives them no torque
+    # Passive joints have no motor, so G is singular: the pseudo-inverse ignores the desired torque at these joints.
     to_motors = np.linalg.pinv(inputs)
     state = np.concatenate([path.q[0], np.zeros(n)])
-    # the integral starts at the gravity torque, as after a brake's release; from zero the arm would fall at first
+    # The integral term starts at the gravity torque, as when a brake is released. From zero the arm would fall.
     integral = dynamics.nonlinear_effects(*np.split(state, 2))
     previous = encoders = quantized(state[:n], tracking)
     states, torques = [], []
     within = np.arange(samples + 1) / settings.simulation.sample_rate
     for k, (q, qd, qdd) in enumerate(zip(path.q, path.qd, path.qdd, strict=True)):
         previous, encoders = encoders, quantized(state[:n], tracking)
-        # Velocities by differences of encoder steps, as a servo drive measures them.
+        # The measured velocity is the difference of encoder positions divided by the tick, as in a servo drive.
         error, velocity_error = q - encoders, qd - (encoders - previous) / tick
         integral = integral + tick * gains.integral * error
         effort = gains.proportional * error + gains.derivative * velocity_error + integral
@@ -186,7 +186,7 @@ def quantized(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
 
 
 def _samples_of_a_tick(settings: Settings) -> int:
-    """Return the number of samples per tick of the controller; SettingsError if it is not an integer."""
+    """Return the number of samples per tick of the controller. Raises SettingsError if the ratio is no integer."""
     sample_rate, control_rate = settings.simulation.sample_rate, settings.tracking.control_rate
     count = round(sample_rate / control_rate)
     if count < 1 or abs(count * control_rate - sample_rate) > 1e-9 * sample_rate:
