@@ -1,1 +1,1 @@
-"""Least squares on logs: friction, base parameters, physically consistent fits."""
+"""Linear least squares on logs: base parameters, torque delay, couplings of motors, tests of a log's geometry."""

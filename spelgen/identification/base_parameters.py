@@ -1,8 +1,9 @@
 """Base parameters: the combinations of inertial, friction and drive parameters that determine the torque.
 
-The combinations of inertial parameters are the exact ones of `structure.base_parameters`, with the same names and order
-in every command. Combinations with friction and drives are numerical, from the regressor at random states: a column in
-the span of the columns before it is regrouped into these (Gautier and Khalil, IEEE T-RA 6:368, 1990).
+The combinations of inertial parameters are computed exactly by `structure.base_parameters`, so that their names and
+order are the same in every command. The combinations with friction and drives are computed numerically from the
+regressor at random states: a column in the span of the preceding columns is regrouped into these (Gautier and Khalil,
+IEEE T-RA 6:368, 1990).
 """
 
 from dataclasses import dataclass
@@ -18,12 +19,15 @@ from spelgen.structure.base_parameters import base_parameters as body_base_param
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """r base parameters of K parameters: ten per body, then friction and drives.
+    """The r base parameters of a model with K parameters: ten per body, then friction and drives.
 
-    names: of the r base parameters. columns: (r,), index of the independent column of the regressor per base
-    parameter.
-    combination: (r, K), base parameters = combination @ parameters, with a one in column `columns[k]` of row k.
-    parameters: K names. bodies: number of base parameters of bodies, the first ones.
+    Attributes:
+        names: names of the r base parameters.
+        columns: (r,) index of the regressor's column that belongs to each base parameter; these columns are
+            independent.
+        combination: (r, K) matrix with base parameters = combination @ parameters; row k is 1 in column `columns[k]`.
+        parameters: names of the K parameters.
+        bodies: number of base parameters of bodies; they precede the base parameters of friction and drives.
     """
 
     names: tuple[str, ...]
@@ -41,7 +45,7 @@ class BaseParameters:
         return tuple(_sum(row, column, self.parameters) for row, column in rows)
 
     def identifiability(self) -> dict[str, str]:
-        """Return the identifiability of each parameter: ``alone``, ``in combination`` or ``never``."""
+        """Return the identifiability of each parameter: ``alone``, ``in combination`` with others, or ``never``."""
         used = self.combination != 0
         alone = set(self.columns[used.sum(axis=1) == 1].tolist())
         result = dict.fromkeys(self.parameters, "never")
@@ -54,9 +58,9 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
     """Return the base parameters of an arm with friction.
 
     Args:
-        arm: n joints.
+        arm: arm with n joints.
         friction: friction model of the drives.
-        motors: (n, n), speeds of the drives per speed of the joints; None: identity.
+        motors: (n, n) matrix from joint speeds to drive speeds; None: identity.
     """
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     exact = body_base_parameters(arm)
@@ -65,7 +69,7 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
         names += [f"{effect}{joint + 1}" for joint in range(n)]
     columns = _columns(arm, friction, motors, len(names))
     candidates = np.array([parameter.index for parameter in exact] + list(range(inertial, len(names))))
-    # norm of each column after projection onto the complement of all columns before it
+    # norm of each column's residual after projection onto all preceding columns; near zero for a dependent column
     remainder = np.abs(np.diag(np.linalg.qr(columns[:, candidates], mode="r")))
     length = np.maximum(np.linalg.norm(columns[:, candidates], axis=0), 1.0)
     chosen = candidates[remainder > 1e-9 * length]
@@ -74,14 +78,14 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
         for k, weight in parameter.weights:
             combination[row, k] = float(weight)
     drives = np.linalg.lstsq(columns[:, chosen], columns[:, inertial:], rcond=None)[0]
-    drives[np.abs(drives) < 1e-8 * np.abs(drives).max(initial=1.0)] = 0.0  # rounding
+    drives[np.abs(drives) < 1e-8 * np.abs(drives).max(initial=1.0)] = 0.0  # rounding errors
     combination[:, inertial:] = drives
     base_names = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :].tolist()]
     return BaseParameters(tuple(base_names), chosen, combination, tuple(names), len(exact))
 
 
 def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
-    """Return the regressor of all parameters at random states, (rows, count)."""
+    """Return the regressor (rows, count) of all parameters at random states; count: number of parameters."""
     n = len(arm.coordinates)
     shape = (2 * count // n + 1, n)  # twice as many equations as parameters
     q, qd, qdd = np.random.default_rng(0).uniform(-3.0, 3.0, (3, *shape))
@@ -91,7 +95,10 @@ def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, cou
 
 
 def _sum(row: np.ndarray, first: int, names: tuple[str, ...]) -> str:
-    """Return the text of the sum of parameters with coefficients (K,), beginning with the parameter `first`."""
+    """Return the formula of a base parameter, such as ``Izz1 + m2 + 0.1 hx2``.
+
+    row: (K,) coefficients of the parameters. first: index of the first term, whose coefficient is 1.
+    """
     text = names[first]
     for k in np.flatnonzero(row):
         if k != first:

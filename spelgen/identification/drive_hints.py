@@ -1,7 +1,8 @@
-"""Detection of undeclared couplings of motors, by least squares with rate-only friction on a subset of all samples.
+"""Detection of couplings of motors that the settings do not declare, by least squares on a subset of the samples.
 
-The Gram matrices of the regressor are computed once; a candidate changes the columns of two joints only. The best
-candidate is accepted if it lowers the torque residual on held-out blocks of time.
+The friction model depends on the velocity only. The Gram matrices of the regressor are computed once, since a candidate
+for a coupling changes the columns of two joints only. The best candidate is accepted if it lowers the torque residual
+on held-out blocks of time.
 """
 
 from __future__ import annotations
@@ -39,14 +40,15 @@ from spelgen.runtime.body_chain import BodyChain
 
 FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
 STEPS = max(HINTS.shifts)
-SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
+SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s] time shifts of the torque that are compared
 
 
 class DriveSamples(NamedTuple):
-    """S samples of moving joints with their torques.
+    """S samples of a moving arm with n joints, and time-shifted torques.
 
-    q, qd, qdd: (S, n) [rad, m, s]. bent: (S, n, K), bristle deflection divided by the break-away displacement.
-    direction: (S, n), see `DynamicsSamples`. torques: (S, n, D) [Nm, N], shifted by each of the D `SHIFTS`.
+    q, qd, qdd: (S, n) [rad, m, s]. bent: (S, n, K) bristle deflections, divided by the break-away displacements.
+    direction: (S, n) direction of dry friction, see `DynamicsSamples`. torques: (S, n, D) [Nm, N] joint torques,
+    shifted in time by each of the D `SHIFTS`.
     """
 
     q: np.ndarray
@@ -58,27 +60,28 @@ class DriveSamples(NamedTuple):
 
     @property
     def tau(self) -> np.ndarray:
-        """Return the torques without shift, (S, n) [Nm, N]."""
+        """Joint torques without time shift, (S, n) [Nm, N]."""
         return self.torques[..., STEPS]
 
     def thinned(self, stride: int) -> DriveSamples:
-        """Return every `stride`-th sample."""
+        """Return a subset that contains every `stride`-th sample."""
         return DriveSamples(*(column[::stride] for column in self))
 
 
 class DriveLog:
-    """Collector of samples of successive trajectories, evenly subsampled to at most twice `DriveHintTuning.samples`.
+    """Collector of the samples of successive trajectories, which keeps at most twice `DriveHintTuning.samples`.
 
-    Of many trajectories only every second, fourth, ... is used, since filtering all of a long log takes minutes.
+    If there are more samples, every second one is removed. If there are many trajectories, only every second, fourth,
+    ... trajectory is used, since filtering all of a long log takes minutes.
     """
 
     def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
         """Create a collector without samples.
 
         Args:
-            joint_types: of the n joints.
-            drives: inputs and speeds of the drives.
-            preprocessing: its filter and gap are used.
+            joint_types: "revolute" or "prismatic" for each of the n joints.
+            drives: input matrix and speeds of the drives.
+            preprocessing: filter and gap of the samples; its torque delay is ignored.
         """
         self._inputs, self._preprocessing = drives.inputs, replace(preprocessing, torque_delay=0.0)
         smoothing = np.full(len(joint_types), FrictionModel().coulomb_smoothing_velocity)
@@ -88,15 +91,15 @@ class DriveLog:
         self._number = 0
 
     def add(self, trajectory: Trajectory) -> None:
-        """Add the samples of a trajectory that is dense and long enough for accelerations."""
-        # most of ten thousand short motions are skipped before they are filtered
+        """Add the samples of a trajectory; nothing is added if it is too short, or its sample rate is too low."""
+        # tested before filtering, which would take too long for a log of ten thousand short motions
         if trajectory.duration < SHORTEST:
             return
         self._number += 1
         if self._number % self._step:
             return
         for piece in long_pieces(trajectory, self._preprocessing.gap):
-            # pauses included: at a constant rate a filtered torque is shifted by whole samples
+            # with pauses, so that the samples are evenly spaced, and a time shift is a shift by whole samples
             samples = dynamics_samples(
                 [piece], pauses=True, preprocessing=self._preprocessing, reach=self._reach
             )
@@ -110,7 +113,7 @@ class DriveLog:
                 self._every *= 2
 
     def _shifted(self, samples: DynamicsSamples) -> DriveSamples:
-        """Return the moving samples at a constant rate, without the ends, which have no shifted torques."""
+        """Return the samples of the moving arm with all time-shifted torques, which do not exist at both ends."""
         inner = samples[STEPS:-STEPS]
         assert inner.z is not None and inner.direction is not None
         torques = sliding_window_view(samples.tau @ self._inputs.T, len(SHIFTS), axis=0)
@@ -123,7 +126,7 @@ class DriveLog:
         return sum(len(x.q) for x in self._samples)
 
     def samples(self) -> DriveSamples | None:
-        """Return all samples, or None if no joint moves."""
+        """Return the collected samples, at most `DriveHintTuning.samples`; None if there are none."""
         if not self._count:
             return None
         columns = zip(*self._samples, strict=True)
@@ -132,10 +135,10 @@ class DriveLog:
 
 @dataclass(frozen=True)
 class Coupling:
-    """Coupling of two joints: the motor of `joint` rotates with its own joint and, `ratio` times as fast, with
-    `moved_by`.
+    """Coupling of two joints: the motor of `joint` also rotates when the joint `moved_by` moves.
 
-    logged_at: whether logged torques act at the joints, or at the motors (in the units of the joints).
+    The speed of the motor, in units of the joint's speed, is qd[joint] + ratio * qd[moved_by]. logged_at: "joints" if
+    the logged torques are joint torques, "motors" if they are motor torques in the units of the joints.
     """
 
     joint: int
@@ -145,23 +148,25 @@ class Coupling:
 
     @property
     def pair(self) -> list[int]:
-        """Return both joints."""
+        """Indices of both joints: `joint`, `moved_by`."""
         return [self.joint, self.moved_by]
 
 
 def drive_rows(
     chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, speeds: np.ndarray
 ) -> np.ndarray:
-    """Return the regressor (S, n, K): columns of the bodies, then of each friction effect for all drives.
+    """Return the regressor (S, n, K) of the joint torques.
 
-    q, qd, qdd: (S, n) [rad, m], per s, per s^2. speeds: C, (n, n), of the motors with the declared couplings.
+    The columns belong to the inertial parameters of the bodies, then to each friction effect of all drives. q, qd, qdd:
+    (S, n) [rad, m], per s, per s^2. speeds: matrix C (n, n) from joint speeds to motor speeds, with the declared
+    couplings.
     """
     bodies = chain_regressor(chain, q, qd, qdd)
     return np.concatenate([bodies, FRICTION.columns(qd, qdd, None, speeds)], axis=2)
 
 
 def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> DriveProblem:
-    """Return the least-squares problem of the joint torques of samples."""
+    """Return the least-squares problem for the joint torques of samples without time shift."""
     regressors = drive_rows(chain, samples.q, samples.qd, samples.qdd, drives.speeds)
     rows = np.concatenate([regressors, samples.tau[..., None]], axis=2)
     products = block_products(rows, HINTS.blocks)
@@ -172,9 +177,12 @@ def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> Dr
 class DriveProblem:
     """Least-squares problem of the torques of n joints with K parameters, in B blocks of time.
 
-    speeds: C, (n, n), of the motors with the declared couplings. rows: (S, n, K + 1), regressor and torque of each
-    joint.
-    products: (n, B, K + 1, K + 1), their Gram matrices. size: (n,), sums of the squared torques.
+    Attributes:
+        samples: the S samples.
+        speeds: matrix C (n, n) from joint speeds to motor speeds, with the declared couplings.
+        rows: (S, n, K + 1) regressor and torque of each joint.
+        products: (n, B, K + 1, K + 1) Gram matrices of the rows, per joint and block.
+        size: (n,) mean over the blocks of the sum of squared torques in a block.
     """
 
     samples: DriveSamples
@@ -185,31 +193,31 @@ class DriveProblem:
 
     @property
     def bodies(self) -> np.ndarray:
-        """Return the columns of the bodies' parameters, (S, n, 10 bodies)."""
+        """Columns of the regressor that belong to the inertial parameters, (S, n, 10 bodies)."""
         return self.rows[..., : -len(FRICTION.effects) * len(self.size) - 1]
 
     @property
     def free(self) -> list[int]:
-        """Return the joints without a declared coupling whose torques vary."""
+        """Indices of the joints that have no declared coupling and a torque that is not constant."""
         joins = self.speeds != 0
         return np.flatnonzero(varying(self.rows[..., -1]) & ((joins | joins.T).sum(axis=0) == 1)).tolist()
 
     def of_torques(self, tau: np.ndarray) -> DriveProblem:
-        """Return the problem with other torques (S, n)."""
+        """Return the problem with the torques replaced by tau (S, n)."""
         rows = np.concatenate([self.rows[..., :-1], tau[..., None]], axis=2)
         return replace(self, rows=rows, products=block_products(rows, self.products.shape[1]))
 
     def in_one_block(self, stride: int) -> DriveProblem:
-        """Return the problem on every `stride`-th sample, in one block, on which it is fitted and evaluated."""
+        """Return the problem on every `stride`-th sample, in a single block: without held-out samples."""
         rows = self.rows[::stride]
         samples = self.samples.thinned(stride)
         return replace(self, samples=samples, rows=rows, products=block_products(rows, 1))
 
     @cached_property
     def errors(self) -> np.ndarray:
-        """Return the squared residual (B, n) of each torque in each block, divided by the squared torque.
+        """Squared torque residual (B, n) of each joint in each block, divided by the mean squared torque of a block.
 
-        The parameters are fitted to all other blocks; a single block is fitted itself.
+        The parameters are fitted to all other blocks; with a single block, they are fitted to this block.
         """
         products = self.products / np.where(self.size > 0, self.size, 1.0)[:, None, None, None]
         fitted = products.sum(axis=0)
@@ -222,12 +230,12 @@ class DriveProblem:
         return np.asarray(np.maximum(errors[..., 0, 0].T, TUNING.negligible))
 
     def cost(self, coupling: Coupling) -> float:
-        """Return the squared residual of both joints with a coupling, divided by the one without it."""
+        """Return the squared torque residual of both joints with a coupling, divided by the residual without it."""
         errors = self.coupled(coupling).errors[:, coupling.pair].mean()
         return float(errors / self.errors[:, coupling.pair].mean())
 
     def coupled(self, coupling: Coupling) -> DriveProblem:
-        """Return the problem with an additional coupling."""
+        """Return the problem with the Gram matrices of a model with an additional coupling; `rows` is unchanged."""
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
         motion = np.stack([self.samples.qd, self.samples.qdd])
         qd, qdd = motion[..., [joint]] + ratio * motion[..., [moved_by]]
@@ -245,18 +253,18 @@ class DriveProblem:
 
 
 def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
-    """Return the coupling of two neighbouring joints with the smallest residual, and its error ratio; None if no
-    coupling is significant.
+    """Return the coupling of two neighbouring joints that lowers the torque residual most; None if none is significant.
 
-    Joints with a declared coupling are not searched.
+    The second value is the squared residual of both joints with the coupling, divided by the residual without it.
+    Joints with a declared coupling are omitted.
     """
-    # all pairs on few samples: an approximate ratio suffices to detect a coupling
+    # all pairs are compared on every fourth sample with three ratios, which suffices to find the best pair
     coarse = problem.in_one_block(4)
     candidates: list[Coupling] = []
     for joint, moved_by in permutations(problem.free, 2):
         if abs(joint - moved_by) > 1:
-            continue  # shafts and belts run along the arm; farther pairs explain springs
-        # each initial ratio covers half to twice its value
+            continue  # shafts and belts couple neighbours; fits of other pairs explain other effects, such as springs
+        # the ratio is refined later, within half to twice each of these values
         for ratio, sign in product((0.4, 1.0, 2.5), (1.0, -1.0)):
             candidates.append(Coupling(joint, moved_by, sign * ratio, "joints"))
             candidates.append(Coupling(joint, moved_by, sign * ratio, "motors"))
@@ -266,7 +274,8 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     best = _with_best_ratio(nearest, problem.in_one_block(1).cost)
     logged = problem.errors[:, best.pair].mean(axis=1)
     coupled = problem.coupled(best).errors[:, best.pair].mean(axis=1)
-    # no evidence if the coupled model has a large error in any block: then neither model explains the torques
+    # If the model with the coupling has a large error in any block, neither model explains the torques, and the
+    # comparison is no evidence.
     explained = coupled.max() < HINTS.coupling_gain
     if not (explained and _is_sure(logged, coupled, HINTS.coupling_gain, len(candidates))):
         return None
@@ -274,7 +283,10 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
 
 
 def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coupling:
-    """Return a coupling with the ratio of minimum cost, or with a close ratio of small integers at about this cost."""
+    """Return a coupling with the ratio of minimum cost.
+
+    A fraction of small integers near the minimum is preferred if its cost is at most 2 % higher.
+    """
     bounds = sorted((start.ratio / 2, start.ratio * 2))
     best = minimize_scalar(
         lambda ratio: cost(replace(start, ratio=ratio)),
@@ -287,13 +299,17 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
 
 
 def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
-    """Return True if errors per block (B,) fell below the fraction `gain`, significantly for the best candidate."""
+    """Return True if a candidate lowers the errors per block (B,) significantly, and below the fraction `gain`.
+
+    logged: (B,) errors without the candidate. mended: (B,) errors with it. candidates: number of candidates of which
+    this is the best.
+    """
     if mended.mean() >= gain * logged.mean():
         return False
-    # between -1 and 1, so that no single block dominates
+    # relative differences are between -1 and 1, so that no single block dominates their mean
     gains = (logged - mended) / (logged + mended)
     standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
-    # Of hundreds of couplings one is always better by chance: 1 in 400 for all candidates, as for terms of a fit
-    # (Bonferroni's bound).
+    # The best of hundreds of candidates is always better by chance. The significance level of 1/400 is therefore
+    # divided by the number of candidates (Bonferroni correction).
     needed = -float(stdtrit(len(gains) - 1, 1 / 400 / candidates))
     return bool(gains.mean() > needed * standard_error)

@@ -1,5 +1,8 @@
-"""Search for the hypothesis about the columns of a log with the best fit to its torques: single changes, orders of
-joints, combinations."""
+"""Search for the hypothesis about the columns of a log that fits the torques best.
+
+A hypothesis consists of changes such as the opposite sign of a joint, exchanged joints, a zero offset, another unit or
+another direction of gravity. Single changes, orders of all joints, and combinations of changes are tried.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,11 +17,12 @@ from spelgen.identification.tuning import GEOMETRY
 from spelgen.settings.log_mapping import SCALES
 
 RIGHT_ANGLE = np.pi / 2
-# penalties of changes that are rarer than a wrong sense or order, which explain as much
+# Numbers of penalties `GEOMETRY.rare` that are added to the cost of changes which are rarer than a wrong sign or order.
+# They decide between changes that explain the torques equally well.
 RARE = {"gravity": 1, "joint-zero": 2, "torque-unit": 2, "joint-unit": 2, "gravity-compensated": 3}
 
 
-# columns that another order of joints affects
+# fields of `Hypothesis` that a change of the order of joints permutes
 ORDERS = {
     "joint-order": ("motion_source", "torque_source"),
     "torque-order": ("torque_source",),
@@ -27,7 +31,10 @@ ORDERS = {
 
 
 class Scaling(NamedTuple):
-    """Factors (n,) of the motion and of the torques of joints, if their columns are in another unit."""
+    """Candidate for wrong units: factors that convert the motion (n,) and the torques (n,) of the joints.
+
+    code: code of the finding, "joint-unit" or "torque-unit".
+    """
 
     code: str
     motion: np.ndarray
@@ -38,7 +45,7 @@ ANGLES = {SCALES[unit]: unit for unit in ("turns", "deg")}
 
 
 def angle_scalings(arm: Chain) -> list[Scaling]:
-    """Return the candidates for angles and their rates in revolutions, and in degrees, of all revolute joints."""
+    """Return the candidates for angles of all revolute joints in revolutions, and in degrees; [] if there are none."""
     turning = np.array([x.joint_type == "revolute" for x in arm.coordinates])
     ones = np.ones(len(turning))
     return [Scaling("joint-unit", np.where(turning, size, ones), ones) for size in ANGLES if turning.any()]
@@ -46,7 +53,11 @@ def angle_scalings(arm: Chain) -> list[Scaling]:
 
 @dataclass(frozen=True, eq=False)
 class HypothesisComparison:
-    """Hypotheses that fit a log about equally well, and significantly better than the unchanged log; best first."""
+    """Result of the search for better hypotheses about a log.
+
+    unchanged: fit of the unchanged log. better: fits that are significantly better than it, and about equally good; the
+    best is first.
+    """
 
     unchanged: HypothesisFit
     better: tuple[HypothesisFit, ...]
@@ -60,12 +71,14 @@ class HypothesisComparison:
 def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ()) -> HypothesisComparison:
     """Return the hypotheses that fit a log significantly better than the unchanged log.
 
-    scalings: candidates for other units.
+    scalings: candidates for wrong units.
     """
-    coarse = problem.thinned(200)  # all hypotheses are compared on few samples
+    # the many hypotheses are compared on few samples, and the best ones below on more
+    coarse = problem.thinned(200)
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
-    # three changes at most, an order of joints as one: more explain any log
+    # At most three changes are combined, where an order of all joints is one change: more changes could explain any
+    # log.
     for _ in range(3):
         best = min(fits, key=_rank)
         tried = single_changes(coarse, best, scalings)
@@ -79,13 +92,16 @@ def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ())
         return HypothesisComparison(unchanged, _rescaled(coarse, unchanged, scalings))
     finer = problem.thinned(GEOMETRY.confirming_samples)
     unchanged = finer.fit(problem.unchanged)
-    # a message names three readings at most
+    # only three, since a message lists three hypotheses at most
     confirmed = [finer.fit(fit.hypothesis) for fit in likely[:3]]
     return HypothesisComparison(unchanged, _likely(unchanged, confirmed))
 
 
 def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[HypothesisFit, ...]:
-    """Return the fits about as good as the best one, if it is significantly better than the unchanged log."""
+    """Return the best fit and all fits of about the same cost; () if the best is not significantly better.
+
+    unchanged: fit of the unchanged log, with which the best fit is compared.
+    """
     best = min(fit.cost for fit in fits)
     if best > unchanged.cost - GEOMETRY.needed:
         return ()
@@ -95,9 +111,10 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
 def _rescaled(
     problem: GeometryProblem, unchanged: HypothesisFit, scalings: Sequence[Scaling]
 ) -> tuple[HypothesisFit, ...]:
-    """Return the fit with the best factor on the torques, if its cost is lower.
+    """Return a tuple with the fit of the best torque unit if its cost is below the unchanged log's cost, else ().
 
-    A low cost is no evidence for a factor, since light bodies can explain small torques; the evidence is from gravity.
+    No significant cost decrease is required: light bodies can explain torques that are too small, so that the cost
+    shows little. The evidence for the factor is the magnitude of gravity, from which the candidates were computed.
     """
     fits = [problem.fit(x) for x in _scaled(problem.unchanged, scalings) if "torque-unit" in x.codes]
     best = min(fits, key=_rank, default=unchanged)
@@ -105,14 +122,14 @@ def _rescaled(
 
 
 def _rank(fit: HypothesisFit) -> float:
-    """Return the cost plus a penalty for rare changes, so that common ones of about the same cost come first."""
+    """Return the cost plus penalties for rare changes, so that common changes of about the same cost are preferred."""
     return fit.cost + GEOMETRY.rare * sum(RARE.get(code, 0) for code in fit.hypothesis.codes)
 
 
 def single_changes(
     problem: GeometryProblem, base: HypothesisFit, scalings: Sequence[Scaling]
 ) -> list[HypothesisFit]:
-    """Return the fits with one change in addition to the changes of the base."""
+    """Return the fits of all hypotheses with one change in addition to the changes of `base`."""
     reading = base.hypothesis
     changed = [*_senses(reading), *_swapped(reading), *_scaled(reading, scalings)]
     fits = [problem.fit(hypothesis) for hypothesis in changed]
@@ -127,12 +144,12 @@ def _changed(base: Hypothesis, code: str, **changes: object) -> Hypothesis:
 
 
 def _senses(base: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield the readings with the opposite sense of a joint: of its position, its torque or both; of all torques."""
+    """Yield the hypotheses with opposite signs: of all torques, and of one joint's torque, motion, or both."""
     yield _changed(base, "torque-sense", torque_scale=-base.torque_scale)
     for sign in 1.0 - 2.0 * np.eye(len(base.offset)):
         torque = {"torque_scale": sign * base.torque_scale}
         yield _changed(base, "torque-sense", **torque)
-        # an offset of the mapping may have been determined in either sense
+        # the offset in the mapping may have been measured with the right or with the wrong sign
         offsets = {x.tobytes(): x for x in (base.offset, sign * base.offset + 0.0)}
         for offset in offsets.values():
             motion = {"motion_scale": sign * base.motion_scale, "offset": offset}
@@ -141,7 +158,10 @@ def _senses(base: Hypothesis) -> Iterator[Hypothesis]:
 
 
 def _swapped(base: Hypothesis, codes: Iterable[str] = tuple(ORDERS)) -> Iterator[Hypothesis]:
-    """Yield the hypotheses with the columns of two joints exchanged."""
+    """Yield the hypotheses with the columns of two joints exchanged, for all pairs.
+
+    codes: whether motion, torques or both are exchanged, see `ORDERS`.
+    """
     for pair in combinations(range(len(base.offset)), 2):
         order = np.arange(len(base.offset))
         order[list(pair)] = pair[::-1]
@@ -158,9 +178,10 @@ def _scaled(base: Hypothesis, scalings: Sequence[Scaling]) -> Iterator[Hypothesi
 
 
 def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[HypothesisFit]:
-    """Return the best orders of all columns, of the torques and of the motion, by exchanging two joints at a time.
+    """Return the fits of the best orders of joints, for all columns, for the torques and for the motion.
 
-    Long arms have local minima: the search starts at random orders, too.
+    An order is improved by exchanging two joints at a time. The search also starts at random orders, since the cost has
+    local minima for arms with many joints.
     """
     joints = problem.arm.joint_names
     starts = [np.arange(len(joints)), np.arange(len(joints))[::-1]]
@@ -169,7 +190,7 @@ def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[Hypoth
     rng = np.random.default_rng(0)
     starts += [rng.permutation(len(joints)) for _ in range(6)]
     fits = {}
-    # few orders of only the motion: such logs are rare, and each order needs another regressor
+    # fewer starts for orders of only the motion: such logs are rare, and each order requires a new regressor
     motion, both = ("motion-order",), ("joint-order", "torque-order")
     for code, start in [*product(both, starts), *product(motion, starts[:3])]:
         fit = problem.fit(_changed(unchanged.hypothesis, code, **dict.fromkeys(ORDERS[code], start)))
@@ -190,10 +211,11 @@ def _refined(
     jacobian: Callable[[HypothesisFit], np.ndarray],
     moved: Callable[[HypothesisFit, np.ndarray], Hypothesis | None],
 ) -> HypothesisFit:
-    """Return the fit after Gauss-Newton steps of D quantities of its hypothesis, while they lower the cost.
+    """Return the fit after at most four Gauss-Newton steps of D continuous quantities of its hypothesis.
 
-    jacobian: derivative of the torques at a fit, (S, n, D). moved: the hypothesis after a step (D,); None if the step
-    is negligible.
+    The iteration ends when a step does not lower the cost, or is negligible. jacobian: function of a fit that returns
+    the derivative of the torques with respect to the quantities, (S, n, D). moved: function of a fit and a step (D,)
+    that returns the changed hypothesis, or None if the step is negligible.
     """
     for _ in range(4):
         hypothesis = moved(fit, problem.step(fit, jacobian(fit)))
@@ -209,7 +231,11 @@ def _refined(
 def _with_offset(
     problem: GeometryProblem, base: HypothesisFit, joint: int, revolute: bool
 ) -> list[HypothesisFit]:
-    """Return [fit], with the best zero offset of a joint; [] if the offset is as small as calibration errors."""
+    """Return a list with the fit for the best zero offset of a joint.
+
+    It is empty if the offset is as small as calibration errors, or if it hardly improves the fit to the torques.
+    revolute: True for a revolute joint, for which multiples of 90 degrees are preferred.
+    """
     reading = base.hypothesis
     unit = np.eye(len(reading.offset))[joint]
     smallest = GEOMETRY.min_angle if revolute else GEOMETRY.min_shift
@@ -242,14 +268,18 @@ def _with_offset(
         is_right_angle = bool(right) and exact.cost < best.cost + GEOMETRY.right_angle
         if is_right_angle:
             best, offset = exact, right
-    # if other masses have the same effect as the offset, its value is as uncertain as the masses of the URDF
+    # Without a decrease of the misfit the offset has the same effect as other masses, and is as uncertain as the masses
+    # of the URDF.
     if abs(offset) < smallest or best.misfit > base.misfit - GEOMETRY.needed / 2:
         return []
     return [best if is_right_angle else problem.fit(shifted(round(offset, 4)))]
 
 
 def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[HypothesisFit]:
-    """Return the fits with the best direction of gravity, and with the fraction of gravity in compensated torques."""
+    """Return the fits for the best direction of gravity, and for torques without the gravity that a controller adds.
+
+    The directions along the axes of the root link are preferred. Changes below calibration errors are omitted.
+    """
     present = np.array(base.hypothesis.gravity)
     size = float(np.linalg.norm(present))
     standard = size or 9.81  # m/s^2
@@ -260,7 +290,8 @@ def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[Hypothe
         new *= standard / max(float(np.linalg.norm(new)), 1e-9)
         return None if np.linalg.norm(new - gravity) < 0.01 * standard else _falling(base, new)
 
-    # upright first: a vertical prismatic joint does not determine the sign of gravity
+    # gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as with a
+    # vertical prismatic joint
     starts = [problem.fit(_falling(base, standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
     lowest = min(fit.cost for fit in starts)
     starts = [next(fit for fit in starts if fit.cost < lowest + GEOMETRY.rare), *([base] if size else [])]
@@ -278,23 +309,26 @@ def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[Hypothe
 
 
 def _falling(base: HypothesisFit, gravity: np.ndarray, code: str = "gravity") -> Hypothesis:
-    """Return the hypothesis of a fit with another gravity."""
+    """Return the hypothesis of a fit with another vector of gravity (3,) [m/s^2]. code: code of this change."""
     x, y, z = (float(value) + 0.0 for value in gravity)
     return _changed(base.hypothesis, code, gravity=(x, y, z))
 
 
 def _gravity_jacobian(problem: GeometryProblem, fit: HypothesisFit) -> np.ndarray:
-    """Return the derivative of the torques with respect to the vector of gravity, (S, n, 3)."""
+    """Return the derivative (S, n, 3) of the torques of a fit with respect to the vector of gravity."""
     without = problem.torque(_falling(fit, np.zeros(3)), fit.parameters)
     torques = [problem.torque(_falling(fit, unit), fit.parameters) - without for unit in np.eye(3)]
     return np.stack(torques, axis=2)
 
 
 def _with_compensation(problem: GeometryProblem, base: HypothesisFit) -> HypothesisFit:
-    """Return the fit with the fraction of gravity in torques that do not include a controller's compensation."""
+    """Return the fit for torques from which a controller's gravity compensation is missing, entirely or in part.
+
+    Gravity is multiplied by a fraction of at most a half, or by zero if this fits about equally well.
+    """
     present, code = np.array(base.hypothesis.gravity), "gravity-compensated"
     without = problem.fit(_falling(base, np.zeros(3), code))
     part = problem.step(without, (_gravity_jacobian(problem, without) @ present)[..., None])
-    # with more than half of gravity in all joints, other masses are the reason
+    # a fraction of more than a half in all joints is ascribed to wrong masses of the URDF, not to a compensation
     some = problem.fit(_falling(base, (np.clip(part, -0.5, 0.5) * present).round(3), code))
     return some if some.cost < without.cost - GEOMETRY.ambiguous else without

@@ -1,4 +1,4 @@
-"""Method and result of a linear identification: base parameters with standard deviations."""
+"""Options and result of a linear identification: base parameters with standard deviations."""
 
 import textwrap
 from collections import Counter
@@ -31,11 +31,11 @@ _WEIGHTED = {
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Method of a linear identification.
+    """Options of a linear identification.
 
-    weights: of the squared errors of the joints: ``equal``, ``range`` (divided by the variance of a joint's torque) or
-    ``noise`` (divided by the variance of its residual, in a few iterations). friction: columns of friction;
-    ``FrictionModel(memory=True)``: dry friction with hysteresis.
+    weights: weights of the joints' squared torque residuals: ``equal``, ``range`` (inverse variance of a joint's
+    torque) or ``noise`` (inverse variance of a joint's residual, in a few iterations). friction: friction model;
+    ``FrictionModel(memory=True)`` has dry friction with hysteresis.
     """
 
     weights: Literal["equal", "range", "noise"] = "noise"
@@ -44,14 +44,24 @@ class LeastSquares:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification:
-    """Result of least squares for an arm with n joints and K parameters, r of them base parameters.
+    """Result of linear least squares for an arm with n joints, K parameters and r base parameters.
 
-    parameters: (K,), zero for parameters that are no base parameters. values, deviations: (r,), the base parameters and
-    their standard deviations. condition: condition number of the regressor (columns of length one, joints weighted).
-    unseen: number of directions in the space of base parameters that these logs do not excite. residual: (n,) root
-    mean square [Nm, N]. nmse: (n,), mean squared residual divided by the variance of the torque. drives: map of logged
-    torques to joint torques.
-    torque_delay: by which logged torques were shifted [s].
+    Attributes:
+        arm: the arm with its URDF parameters.
+        method: options of the identification.
+        base: base parameters of the arm.
+        parameters: (K,) fitted parameters; parameters outside the base columns are zero.
+        values: (r,) values of the base parameters.
+        deviations: (r,) standard deviations of the base parameters.
+        condition: condition number of the regressor, with columns of length one and weighted joints.
+        unseen: number of directions in the space of base parameters that the logs do not excite.
+        residual: (n,) root mean square of the torque residual [Nm, N].
+        nmse: (n,) mean squared torque residual divided by the variance of the torque.
+        trajectories: names of the trajectories.
+        samples: number of samples.
+        drives: map of logged torques to joint torques.
+        diagnostics: remarks and warnings about the logs.
+        torque_delay: estimated or given delay by which the logged torques were shifted back.
     """
 
     arm: Chain
@@ -72,7 +82,7 @@ class Identification:
 
     @cached_property
     def dynamics(self) -> RegressorDynamics:
-        """Dynamics of the identified arm, e.g. as a baseline of `evaluate`."""
+        """Dynamics of the arm with the identified parameters, e.g. as a baseline for `evaluate`."""
         return identified_dynamics(self.arm, self.method.friction, self.parameters, self.drives)
 
     def torque(
@@ -81,8 +91,8 @@ class Identification:
         """Return the joint torques (T, n) [Nm, N] of the identified arm.
 
         Args:
-            q, qd, qdd: (T, n) [rad, m, s].
-            z: (T, n, K) [rad, m], bristle states of a friction model with hysteresis.
+            q, qd, qdd: (T, n) positions, velocities and accelerations [rad, m, s].
+            z: (T, n, K) [rad, m] bristle states of a friction model with hysteresis; None for other friction models.
         """
         past = None if z is None else torch.from_numpy(z)
         position, velocity, acceleration = map(torch.from_numpy, (q, qd, qdd))
@@ -90,12 +100,12 @@ class Identification:
 
     @cached_property
     def intervals(self) -> tuple[Interval, ...]:
-        """The base parameters with 95 % intervals."""
+        """Base parameters with their 95 % intervals."""
         estimates = zip(self.base.names, self.values.tolist(), self.deviations.tolist(), strict=True)
         return tuple(Interval(name, value, std, base_unit(name)) for name, value, std in estimates)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the result in its JSON form, a public contract."""
+        """Return the result in JSON form; the form is a public contract with the version `SCHEMA`."""
         joints = list(self.arm.joint_names)
         friction = self.method.friction
         records = []
@@ -139,7 +149,7 @@ class Identification:
         ])  # fmt: skip
 
     def listings(self) -> tuple[Listing, Listing]:
-        """Return two tables: the torque residual per joint, and the base parameters."""
+        """Return the table of the torque residual per joint, and the table of the base parameters."""
         joints: list[tuple[str, ...]] = []
         for x, rms, nmse in zip(self.arm.coordinates, self.residual, self.nmse, strict=True):
             joints.append((x.name, f"{rms:.4g}", UNITS[x.joint_type].torque, f"{nmse:.3g}"))
@@ -157,7 +167,7 @@ class Identification:
         return "".join(listing.html() for listing in self.listings())
 
     def heading(self) -> str:
-        """Return the numbers of parameters and samples, and the weights."""
+        """Return a sentence with the numbers of parameters and samples, and the weights of the joints."""
         drives = len(self.base) - self.base.bodies
         weighted = _WEIGHTED[self.method.weights]
         return (
@@ -166,14 +176,14 @@ class Identification:
         )
 
     def quality(self) -> str:
-        """Return a text: the condition number, and the number of parameters per class of precision (firm, ...)."""
+        """Return two sentences: the condition number, and the number of parameters in each class of precision."""
         conditioned = f"Condition number {self.condition:.3g} (columns of length one): "
         if self.unseen:
             conditioned = (
                 f"The logs do not excite {counted(self.unseen, 'direction')} of the base parameters: those values are "
                 "arbitrary; excite the arm more, or train the preset closed-form, which has a prior at the URDF."
             )
-        elif self.condition < 30.0:  # errors are not amplified noticeably
+        elif self.condition < 30.0:  # torque errors are not amplified noticeably
             conditioned += "well posed."
         elif self.condition < 300.0:
             conditioned += "acceptable."
@@ -187,7 +197,7 @@ class Identification:
 def identified_dynamics(
     arm: Chain, friction: FrictionModel, parameters: np.ndarray, drives: Drives
 ) -> RegressorDynamics:
-    """Return the dynamics of an arm with these parameters, (K,): bodies, friction, drives."""
+    """Return the dynamics of an arm with these parameters (K,): bodies, then friction and rotor inertias."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)
     reach = reach_of(arm.joint_types).values if friction.memory else None
@@ -200,5 +210,5 @@ def identified_dynamics(
 
 
 def _finite(value: float) -> float | None:
-    """Return a float for JSON, which has no infinity."""
+    """Return a float for JSON: None if it is infinite or NaN, which JSON does not have."""
     return float(value) if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Identification of an arm from logs: base parameters, friction and drives by linear least squares."""
+"""Identification of base parameters, friction and rotor inertias of an arm from logs, by linear least squares."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -34,13 +34,13 @@ def identify(
     *,
     preprocessing: Preprocessing | None = None,
 ) -> Identification:
-    """Fit base parameters, friction and armature of an arm to the torques of logs.
+    """Fit the base parameters, friction and rotor inertias (armatures) of an arm to the torques of logs.
 
     Args:
-        arm: from `load_arm`, or the path of a URDF. Its input matrix maps motor torques to joint torques.
-        logs: with torques.
-        method: friction model and weights of the joints.
-        preprocessing: its filter, gap and torque delay are used.
+        arm: result of `load_arm`, or the path of a URDF. The arm's input matrix maps motor torques to joint torques.
+        logs: one or several trajectories with torques.
+        method: friction model and weights of the joints; None: the defaults.
+        preprocessing: filter, gap and torque delay of the logs; None: the defaults.
 
     Raises:
         LogError: for logs without torques or without motion.
@@ -57,7 +57,7 @@ def identify_by(
     methods: Sequence[LeastSquares],
     preprocessing: Preprocessing,
 ) -> list[Identification]:
-    """Return the result of each method for the same logs, which are filtered once; see `identify`."""
+    """Return one result per method for the same logs, which are filtered only once; see `identify`."""
     joints, joint_types = arm.chain.joint_names, arm.chain.joint_types
     for trajectory in logs:
         require_joints(trajectory, joints)
@@ -77,7 +77,7 @@ def identify_by(
     if unused:
         message = f"sampled too slowly or too short for accelerations: {', '.join(unused)}"
         notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
-    # the rows of the regressor are joint torques
+    # logged motor torques are converted to joint torques, which the regressor describes
     equations = _Equations(arm.chain, [replace(x, tau=x.tau @ drives.inputs.T) for x in samples], drives)
     return [replace(equations.solved(x), diagnostics=tuple(notes), torque_delay=delay) for x in methods]
 
@@ -88,28 +88,31 @@ def least_squares(
     method: LeastSquares | None = None,
     drives: Drives | None = None,
 ) -> Identification:
-    """Fit an arm to samples of joint torques.
+    """Fit base parameters, friction and rotor inertias of an arm to samples of joint torques.
 
     Args:
-        arm: n joints.
-        samples: motion and joint torques, (T, n).
-        method: friction model and weights of the joints.
-        drives: with friction and armature; None: one drive per joint.
+        arm: arm with n joints.
+        samples: motion and joint torques (T, n) of each trajectory.
+        method: friction model and weights of the joints; None: the defaults.
+        drives: drives, in which friction and rotor inertias act; None: one drive per joint.
 
     Raises:
-        LogError: without samples.
+        LogError: if there are no samples.
     """
     identity = np.eye(len(arm.coordinates))
     return _Equations(arm, samples, drives or Drives(identity, identity)).solved(method or LeastSquares())
 
 
-# Smallest number of samples of a jackknife block, 2 s: without a prior, some parameters may be excited in one short
-# block only.
+# [1] Smallest number of samples of a jackknife block, 2 s. Without a prior, a fit without one block fails if only this
+# block excites some parameter, which is likely for short blocks.
 MIN_BLOCK = 200
 
 
 class _Equations:
-    """Linear equations of samples, one block at a time; the columns of the bodies are common to all friction models."""
+    """Linear equations of the torques in samples, computed for one block of samples at a time.
+
+    The regressor of the bodies is common to all friction models, and is kept if it fits into memory.
+    """
 
     def __init__(self, arm: Chain, samples: Sequence[DynamicsSamples], drives: Drives) -> None:
         self.arm, self.samples, self.drives = arm, samples, drives
@@ -117,13 +120,13 @@ class _Equations:
         for x in samples:
             self._blocks += [x[start : start + TUNING.block] for start in range(0, len(x.q), TUNING.block)]
         self._regressors: list[np.ndarray] = []
-        # computed once if they fit into memory
+        # regressors are kept if they are small enough, otherwise they are recomputed for each pass over the samples
         size = 8 * sum(x.q.size for x in samples) * 10 * len(arm.bodies)
         if size <= TUNING.regressor_bytes:
             self._regressors = list(map(self._regressor, self._blocks))
 
     def _regressor(self, block: DynamicsSamples) -> np.ndarray:
-        """Return the regressor of the bodies, (T, n, 10 bodies)."""
+        """Return the regressor (T, n, 10 bodies) of the inertial parameters for a block of samples."""
         return regressor(self.arm, block.q, block.qd, block.qdd)
 
     def _rows(self, friction: FrictionModel) -> Iterator[Columns]:
@@ -135,16 +138,17 @@ class _Equations:
             yield np.concatenate([bodies, columns], axis=2), block.tau
 
     def _noise(self, friction: FrictionModel, solution: Solution) -> np.ndarray:
-        """Return the standard deviations (n,) [Nm, N] of the residual, scaled as if its errors were independent."""
+        """Return the standard deviations (n,) [Nm, N] of the torque residual, see `deviations`."""
         residuals = [rows @ solution.parameters - tau for rows, tau in self._rows(friction)]
         return deviations(residuals, solution.rank)
 
     def _jackknife(
         self, friction: FrictionModel, solution: Solution, weights: np.ndarray, combination: np.ndarray
     ) -> np.ndarray:
-        """Return standard deviations (r,) of combinations (r, k) of the k fitted parameters (`jackknife_covariance`).
+        """Return the standard deviations (r,) of linear combinations of the fitted parameters by a block jackknife.
 
-        weights: (n,) of the joints.
+        weights: (n,) weights of the joints. combination: (r, k) coefficients of the k fitted parameters in each of
+        the r combinations. See `jackknife_covariance`.
         """
         columns, count = solution.columns, sum(len(block.q) for block in self._blocks)
         group = np.arange(count) * BLOCKS // count  # contiguous blocks of samples
@@ -160,7 +164,8 @@ class _Equations:
                 curvature[number] += jacobian.T @ jacobian
                 descent[number] += residual[samples].ravel() @ jacobian
             first += len(tau)
-        length = np.sqrt(curvature.sum(axis=0).diagonal())  # columns have different units
+        # columns are scaled to length one, since they have different units
+        length = np.sqrt(curvature.sum(axis=0).diagonal())
         curvature /= np.outer(length, length)
         ridge = TUNING.negligible * np.eye(len(columns))
         _, covariance = jackknife_covariance(*map(torch.from_numpy, (curvature, descent / length, ridge)))
@@ -168,7 +173,7 @@ class _Equations:
         return np.asarray(np.sqrt(np.einsum("rk,kl,rl->r", root, covariance.numpy(), root)))
 
     def solved(self, method: LeastSquares) -> Identification:
-        """Return the result of a method. Raises LogError without samples."""
+        """Return the result for a method. Raises LogError if there are no samples."""
         if not self._blocks:
             raise LogError(
                 "no samples to identify from",
@@ -176,19 +181,19 @@ class _Equations:
             )
         base = base_parameters(self.arm, method.friction, self.drives.speeds)
         triangles = reduce(self._rows(method.friction))
-        # a joint of constant torque must not have an infinite weight
+        # bounded from below, since a joint with a constant torque would have an infinite weight
         torque_range = np.maximum(triangles.deviation, 1e-3 * triangles.deviation.max())
         weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
-        # weights "noise": iteratively reweighted by the residual of each joint
+        # with the weights "noise", joints are reweighted by their residuals in each iteration
         for _ in range(1 + TUNING.rounds * (method.weights == "noise")):
-            # parameters that are not base parameters are zero
+            # only the base columns are fitted; the other parameters remain zero
             solution = solve(triangles, weights, base.columns)
             noise = np.maximum(self._noise(method.friction, solution), TUNING.least_noise * torque_range)
             used, weights = weights, 1.0 / noise
         squares = triangles.squares(solution.parameters) / triangles.count
         combination = base.combination[:, base.columns]
         std = solution.deviations(triangles, used**2 * noise, combination)
-        # parameters that the samples do not determine at all are omitted
+        # no jackknife if some parameters are undetermined: fits without a block would be singular
         if solution.rank == len(base) and triangles.count >= BLOCKS * MIN_BLOCK:
             std = np.maximum(
                 std, student_scale(BLOCKS) * self._jackknife(method.friction, solution, used, combination)

@@ -1,4 +1,4 @@
-"""95 % intervals of estimates, and the covariance of estimates whose errors are correlated."""
+"""95 % intervals of estimated parameters, and their covariance if the errors of samples are correlated."""
 
 import math
 from collections.abc import Sequence
@@ -11,18 +11,21 @@ from torch import Tensor
 from spelgen.listing import Listing
 
 QUANTILE = 1.96
-"""Half of a 95 % interval of a normal distribution, in standard deviations."""
-# Number of contiguous blocks of samples of a jackknife. More blocks would be shorter than the correlation time of the
-# errors, and fewer would not determine a covariance.
+"""Half the width of the 95 % interval of a normal distribution, in standard deviations."""
+# Number of contiguous blocks of samples in a jackknife. More blocks would be shorter than the correlation time of the
+# errors, and fewer blocks would not determine a covariance.
 BLOCKS = 10
-# Smallest number of samples of a block: half a second.
+# [1] Smallest number of samples of a jackknife block, half a second, for fits with a prior.
 MIN_BLOCK = 25
 DETERMINED = ("firm", "fair", "weak", "may be zero")
 
 
 @dataclass(frozen=True)
 class Interval:
-    """Estimate of a quantity with its standard deviation; the interval of a positive quantity is cut at zero."""
+    """Estimate of a quantity, with its standard deviation and its 95 % interval.
+
+    positive: True for a quantity that cannot be negative, whose interval is cut at zero.
+    """
 
     name: str
     value: float
@@ -48,7 +51,10 @@ class Interval:
 
     @property
     def determined(self) -> str:
-        """Precision, the standard deviation relative to the value: ``firm``, ``fair``, ``weak`` or ``may be zero``."""
+        """Class of precision, ``firm``, ``fair``, ``weak`` or ``may be zero``.
+
+        The bounds of the first three classes are standard deviations of 5 %, 20 % and 100 % of the value.
+        """
         for word, limit in zip(DETERMINED, (0.05, 0.2, 1.0), strict=False):
             if self.std <= limit * abs(self.value):
                 return word
@@ -56,7 +62,7 @@ class Interval:
 
     @property
     def text(self) -> str:
-        """Value and half interval, as in ``1.234 ± 0.056``."""
+        """Value and half the width of the 95 % interval, as in ``1.234 ± 0.056``."""
         return f"{self.value:.4g} ± {self.half:.2g}"
 
     def to_dict(self) -> dict[str, object]:
@@ -69,46 +75,56 @@ class Interval:
 
 
 def base_unit(name: str) -> str:
-    """Return the unit of a base parameter of bodies, by the letter of its first parameter; "" for others."""
+    """Return the unit of a base parameter from the first letters of its name; "" for friction parameters.
+
+    Masses begin with m, first moments with h, inertias with I, rotor inertias with "armature".
+    """
     return {"m": "kg", "h": "kg m", "I": "kg m²"}.get(name[0], "kg m²" if name.startswith("armature") else "")
 
 
 def interval_listing(title: str, intervals: Sequence[Interval], note: str = "") -> Listing:
-    """Return a table of estimates with half of their 95 % intervals."""
+    """Return a table of estimates with half the widths of their 95 % intervals. note: text below the table."""
     rows = [(x.name, f"{x.value:.5g}", f"{x.half:.2g}", x.determined) for x in intervals]
     return Listing(title, ("parameter", "value", "+-", "determined"), tuple(rows), note, left=(0, 3))
 
 
 def student_scale(blocks: int) -> float:
-    """Return the factor on standard deviations from a few blocks: 1.96 results are Student's 95 % interval."""
+    """Return the factor for standard deviations from few blocks that corrects 95 % intervals.
+
+    After multiplication by this factor, 1.96 standard deviations are half of Student's 95 % interval.
+    """
     return float(stdtrit(blocks - 1, 0.975)) / QUANTILE
 
 
 def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the Newton steps of a MAP estimate without each block, (B, k), and the covariance J + S^-1 P S^-1 (k, k).
+    """Return the block-jackknife covariance of a MAP estimate of k parameters, and the jackknife's steps.
 
-    J is the jackknife covariance of these steps, S the Hessian of all blocks and of the prior. Errors may be correlated
-    within blocks, and may differ between them (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
+    The first value (B, k) has the Newton step of the estimate for the removal of each of the B blocks. The second value
+    (k, k) is the covariance J + S^-1 P S^-1, with the jackknife covariance J of these steps and the Hessian S of all
+    blocks and the prior. Errors of samples may be correlated within blocks, and their variance may differ between
+    blocks (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
 
     Args:
-        curvature, descent: normal equations of B blocks, (B, k, k) and (B, k); descent and the gradient of the prior
-            add up to zero.
-        prior: precision P of the prior, (k, k).
+        curvature: (B, k, k) Gauss-Newton Hessian of each block.
+        descent: (B, k) negative gradient of each block at the estimate; the sum over blocks is the gradient of the
+            prior's negative log density.
+        prior: (k, k) precision P of the prior.
     """
     count, hessian = len(curvature), curvature.sum(dim=0) + prior
-    # the gradient without a block is minus the gradient of the block
+    # the total gradient is zero at the estimate, so that the gradient without a block is minus the block's gradient
     steps = torch.linalg.solve(hessian - curvature, -descent.unsqueeze(-1)).squeeze(-1)
     centred, inverse = steps - steps.mean(dim=0), torch.linalg.inv(hessian)
     return steps, (count - 1) / count * centred.mT @ centred + inverse @ prior @ inverse
 
 
 def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
-    """Return a covariance (k, k) that is at least `lower_bound` (k, k), positive definite, in every direction.
+    """Return the covariance (k, k), enlarged so that its variance in each direction is not below `lower_bound`.
 
-    In coordinates in which the bound is the identity, eigenvalues of the covariance below one become one.
+    In coordinates in which the lower bound is the identity, eigenvalues of the covariance below one become one. The
+    lower bound must be positive definite.
     """
-    scale = lower_bound.diagonal().sqrt()  # parameters have different units
-    # the bound of samples without noise is singular to rounding
+    scale = lower_bound.diagonal().sqrt()  # scaled to a unit diagonal, since parameters have different units
+    # for samples without noise the lower bound is singular except for rounding errors: its eigenvalues are clamped
     variances, axes = torch.linalg.eigh(lower_bound / scale.outer(scale))
     deviations = variances.clamp(min=1e-12).sqrt()
     root, inverse = scale.unsqueeze(-1) * axes * deviations, (axes / deviations / scale.unsqueeze(-1)).mT

@@ -1,4 +1,7 @@
-"""Linear least squares on torques, from one triangular factor per joint, independent of the weights of joints."""
+"""Linear least squares on torques from one triangular factor per joint.
+
+The factors do not depend on the weights of the joints, so that fits with several weights need one pass over the logs.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,15 +12,15 @@ from scipy.linalg import pinv
 from spelgen.identification.tuning import TUNING
 
 Columns = tuple[np.ndarray, np.ndarray]
-"""Regressor (T, n, K) and torque (T, n) [Nm, N] of T samples."""
+"""Regressor (T, n, K) and joint torques (T, n) [Nm, N] of T samples."""
 
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """Triangular QR factors of the least-squares equations of each joint.
+    """Triangular QR factors of the least-squares equations of n joints with K parameters.
 
-    factors: (n, K + 1, K + 1), upper triangular, of the rows [regressor, torque]. count: number of samples. deviation:
-    (n,) standard deviation of the torque [Nm, N].
+    factors: (n, K + 1, K + 1) upper triangular factor of each joint's matrix [regressor, torque]. count: number of
+    samples. deviation: (n,) standard deviation of the torque [Nm, N].
     """
 
     factors: np.ndarray
@@ -25,12 +28,15 @@ class Triangles:
     deviation: np.ndarray
 
     def squares(self, x: np.ndarray) -> np.ndarray:
-        """Return the squared residual per joint, (n,) [Nm^2, N^2], of the parameters x (K,)."""
+        """Return the sum of squared torque residuals per joint, (n,) [Nm^2, N^2], for the parameters x (K,)."""
         return np.asarray(np.square(self.factors @ np.append(x, -1.0)).sum(axis=1))
 
 
 def reduce(blocks: Iterable[Columns]) -> Triangles:
-    """Return the factors of all blocks (T, n, K) and (T, n), one in memory at a time."""
+    """Return the triangular factors of all blocks of samples together; one block is in memory at a time.
+
+    blocks: regressor (T, n, K) and torques (T, n) of each block.
+    """
     factors: np.ndarray | None = None
     count, total, square = 0, 0.0, 0.0
     for regressor, torque in blocks:
@@ -44,14 +50,14 @@ def reduce(blocks: Iterable[Columns]) -> Triangles:
 
 
 def varying(tau: np.ndarray) -> np.ndarray:
-    """Return True if torques (S, n) vary by more than the rounding errors of a constant, (n,)."""
+    """Return a mask (n,) of the joints whose torques tau (S, n) are not constant up to rounding errors."""
     return np.asarray(tau.std(axis=0) > TUNING.negligible * np.abs(tau).max(axis=0))
 
 
 def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
-    """Return the Gram matrices (n, blocks, C, C) of the columns of rows (S, n, C), per joint and block of time.
+    """Return the Gram matrices (n, blocks, C, C) of `rows` (S, n, C), per joint and contiguous block of samples.
 
-    The last samples, which do not fill a block, are not used.
+    Samples at the end that do not fill a block are omitted.
     """
     by_joint = rows[: len(rows) // blocks * blocks].swapaxes(0, 1)
     by_joint = by_joint.reshape(rows.shape[1], blocks, -1, rows.shape[2])
@@ -59,8 +65,12 @@ def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
 
 
 def normal_solution(products: np.ndarray, targets: int) -> np.ndarray:
-    """Return the least-squares parameters (..., K, D) of D targets, from Gram matrices (..., K + D, K + D)."""
-    # columns have different units (kg, kg m^2), and the Gram matrix squares the condition number: scaled to length one
+    """Return the least-squares parameters (..., K, D) for D target columns from Gram matrices (..., K + D, K + D).
+
+    The Gram matrices belong to K regressor columns, followed by the D = `targets` target columns.
+    """
+    # Columns are scaled to length one: they have different units (kg, kg m^2), and the Gram matrix squares the
+    # condition number.
     length = np.sqrt(np.diagonal(products, axis1=-2, axis2=-1))[..., :-targets, None]
     length = np.where(length > 0, length, 1.0)
     normal = products[..., :-targets, :-targets] / (length * length.swapaxes(-1, -2))
@@ -70,10 +80,15 @@ def normal_solution(products: np.ndarray, targets: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Least-squares parameters (K,), zero except for the fitted columns (r,).
+    """Solution of weighted linear least squares for r of K parameters.
 
-    covariance: (r, r) of the fitted parameters, for weights that are the inverse standard deviations of independent
-    errors. condition, rank: of the regressor with columns of length one.
+    Attributes:
+        parameters: (K,) all parameters; zero for parameters that are not fitted.
+        columns: (r,) indices of the fitted parameters.
+        covariance: (r, r) covariance of the fitted parameters if the errors are independent and the weights are the
+            inverse standard deviations of the errors.
+        condition: condition number of the weighted regressor with columns of length one; infinity if it is singular.
+        rank: rank of this regressor.
     """
 
     parameters: np.ndarray
@@ -83,14 +98,15 @@ class Solution:
     rank: int
 
     def deviations(self, triangles: Triangles, errors: np.ndarray, combination: np.ndarray) -> np.ndarray:
-        """Return the standard deviations (k,) of combinations of the fitted parameters, by the sandwich estimator.
+        """Return the standard deviations (k,) of k linear combinations of the fitted parameters.
 
-        The weights need not be the inverse standard deviations of the errors (White, Econometrica 48:817, 1980).
+        The sandwich estimator is valid even if the weights are not the inverse standard deviations of the errors
+        (White, Econometrica 48:817, 1980).
 
         Args:
-            triangles: of the samples.
-            errors: (n,) standard deviations of the joints' torque errors, times the squares of their weights.
-            combination: (k, r).
+            triangles: triangular factors of the samples.
+            errors: (n,) standard deviation of each joint's torque error, times the square of the joint's weight.
+            combination: (k, r) coefficients of the fitted parameters in each combination.
         """
         rows = triangles.factors[..., self.columns]
         effects = (combination @ self.covariance) @ rows.swapaxes(1, 2)
@@ -98,12 +114,12 @@ class Solution:
 
 
 def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Solution:
-    """Return the parameters that minimize the weighted squared residual; of minimum norm if it is singular.
+    """Return the parameters that minimize the weighted squared residual; the minimum-norm solution if it is singular.
 
     Args:
-        triangles: of the samples.
-        weights: (n,) of the joints.
-        columns: (r,) of the fitted parameters.
+        triangles: triangular factors of the samples.
+        weights: (n,) weight of each joint's torque residual.
+        columns: (r,) indices of the fitted parameters; the others are zero.
     """
     weighted = triangles.factors * weights[:, None, None]
     weighted = weighted.reshape(-1, weighted.shape[2])
@@ -119,13 +135,13 @@ def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Sol
 
 
 def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
-    """Return standard deviations (n,) of the torque errors [Nm, N], scaled as if the errors of samples were
-    independent.
+    """Return standard deviations (n,) of the torque errors [Nm, N] for formulas that assume independent errors.
 
-    The residual of filtered torques is correlated: its variance is multiplied by its correlation time in samples.
+    The residuals of filtered torques are correlated in time. Their variance is therefore multiplied by their
+    correlation time in samples.
 
     Args:
-        residuals: (T, n) per trajectory.
+        residuals: torque residuals (T, n) of each trajectory [Nm, N].
         parameters: number of fitted parameters.
     """
     count = sum(map(len, residuals))
@@ -135,11 +151,11 @@ def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
 
 
 def correlation_time(residuals: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the integrated autocorrelation time in samples, (n,), at least one, of residuals (T, n) per trajectory.
+    """Return the integrated autocorrelation time (n,), in samples, of the residuals (T, n) of all trajectories.
 
-    It is 1 + 2 times the sum of the autocorrelations up to the first negative one (Geyer, Stat. Sci. 7:473, 1992).
+    It is 1 plus twice the sum of the autocorrelations up to the first negative one (Geyer, Stat. Sci. 7:473, 1992).
     """
-    max_lag = min(500, max(map(len, residuals)) - 1)  # 5 s
+    max_lag = min(500, max(map(len, residuals)) - 1)  # [samples] 5 s at 100 Hz
     power = sum(np.square(x).sum(axis=0) for x in residuals)
     time: np.ndarray = np.ones_like(power)
     correlated = power > 0

@@ -1,9 +1,9 @@
-"""Evidence for hypotheses about the geometry of a log: senses and order of joints, zero offsets, gravity, units.
+"""Costs of hypotheses about the geometry of a log: signs and order of joints, zero offsets, units, gravity.
 
-A hypothesis changes the signals of a log, or the gravity of the arm, as lines of the settings would. Its cost is the
-negative log posterior of the torques, minimised over inertial parameters, friction and the noise of each joint. The
-prior at the URDF, and penalties for negative rotor inertia and for friction that drives, decide between hypotheses that
-explain the torques equally well.
+A hypothesis is a change of the log's signals or of the arm's gravity that settings can express. The cost of a
+hypothesis is the negative log posterior of the torques, minimised over inertial parameters, friction and the noise of
+each joint. Between hypotheses that explain the torques equally well, the following terms decide: the prior of the
+inertial parameters at the URDF, and penalties for negative rotor inertia and for friction that drives the motion.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Vector3 = tuple[float, float, float]
 
 
 class MotionSamples(NamedTuple):
-    """Samples of motion and joint torques, (S, n) each: q, qd, qdd [rad, s; m, s], tau [Nm; N]."""
+    """S samples of motion and joint torques of n joints: q, qd, qdd [rad, s; m, s] and tau [Nm; N], each (S, n)."""
 
     q: np.ndarray
     qd: np.ndarray
@@ -35,7 +35,7 @@ class MotionSamples(NamedTuple):
 
     @classmethod
     def joined(cls, samples: Sequence[MotionSamples]) -> MotionSamples:
-        """Return several samples together."""
+        """Return the concatenation of several sets of samples."""
         return cls(*map(np.concatenate, zip(*samples, strict=True)))
 
     def thinned(self, count: int) -> MotionSamples:
@@ -46,11 +46,13 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Hypothesis: an assignment of the columns of a log to n joints, with scales and offsets, and a vector of gravity.
+    """Hypothesis about a log: assignment of columns to n joints, scales and offsets of the joints, and gravity.
 
-    codes: of the changes, as in findings; empty for the unchanged log. q of joint k is motion_scale[k] times the
-    column of joint motion_source[k], plus offset[k] [rad, m]; its torque is torque_scale[k] times the column of joint
-    torque_source[k]. gravity: in the frame of the root link [m/s^2].
+    The position of joint k is motion_scale[k] times the logged position of joint motion_source[k], plus offset[k] [rad,
+    m]. The torque of joint k is torque_scale[k] times the logged torque of joint torque_source[k].
+
+    codes: codes of the changes, as in findings; empty for the unchanged log. gravity: vector of gravity in the frame of
+    the root link [m/s^2].
     """
 
     codes: tuple[str, ...]
@@ -70,17 +72,17 @@ class Hypothesis:
 
     @property
     def motion_key(self) -> tuple[bytes, Vector3]:
-        """Key of the regressor: motion and gravity."""
+        """Key under which the regressor is cached: it depends only on the motion and on gravity."""
         arrays = (self.motion_source, self.motion_scale, self.offset)
         return b"".join(x.tobytes() for x in arrays), self.gravity
 
     def signals(self, samples: MotionSamples) -> MotionSamples:
-        """Return the motion and torques that the logged samples represent under this hypothesis."""
+        """Return the samples of the joints, in SI units, for logged samples under this hypothesis."""
         q, qd, qdd = (x[:, self.motion_source] * self.motion_scale for x in samples[:3])
         return MotionSamples(q + self.offset, qd, qdd, samples.tau[:, self.torque_source] * self.torque_scale)
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the logged columns that represent `samples` under this hypothesis: the inverse of `signals`."""
+        """Return the logged samples for `samples` of the joints under this hypothesis: the inverse of `signals`."""
         motion, torque = np.argsort(self.motion_source), np.argsort(self.torque_source)
         q = (samples.q - self.offset) / self.motion_scale
         qd, qdd = samples.qd / self.motion_scale, samples.qdd / self.motion_scale
@@ -90,11 +92,15 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class HypothesisFit:
-    """Least squares with the prior under a hypothesis.
+    """MAP estimate of the K parameters of an arm with n joints under a hypothesis about the log.
 
-    cost: negative log posterior up to a constant. misfit: its part from the torque residual. parameters: (K,), inertial
-    parameters first. covariance: (K, K), posterior. errors: (n,) mean squared residual of each joint, relative to the
-    variance of its torque.
+    Attributes:
+        hypothesis: the hypothesis.
+        cost: negative log posterior up to a constant.
+        misfit: contribution of the torque residual to the cost.
+        parameters: (K,) inertial parameters, then friction and rotor inertias.
+        covariance: (K, K) posterior covariance of the parameters.
+        errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
     """
 
     hypothesis: Hypothesis
@@ -106,7 +112,7 @@ class HypothesisFit:
 
 
 class GeometryProblem:
-    """Least squares of the torques of a log under hypotheses about its geometry."""
+    """Least-squares problem of the torques of a log, which can be solved under several hypotheses about the log."""
 
     def __init__(
         self,
@@ -119,17 +125,18 @@ class GeometryProblem:
         """Prepare the problem of an arm with n joints.
 
         Args:
-            arm: with its gravity and the inertial parameters of its URDF.
-            samples: of its motion, with torques at the joints.
-            speeds: C (n, n) of the motors, see `Drives`.
+            arm: arm with its vector of gravity and the inertial parameters of its URDF.
+            samples: samples of the motion, with joint torques.
+            speeds: matrix C (n, n) from joint speeds to motor speeds, see `Drives`.
             seconds: duration of the logs [s], which limits the number of independent errors.
             unchanged: scales and offsets of the mapping of the logs; None: SI units and no offsets.
         """
         self.arm, self.speeds = arm, speeds
         self.unchanged = unchanged or Hypothesis.unchanged(arm)
         self.samples = self.unchanged.logged(samples)
-        # Residuals of recorded arms are correlated for about 0.2 s: samples within it count as one independent error.
-        # At most 150 errors per joint count: errors of a rigid model do not average out in long logs.
+        # Number of independent errors per joint. Torque residuals of recorded arms are correlated for about 0.2 s,
+        # so that each 0.2 s count as one error. The number is at most 150, since the errors of a rigid model are
+        # systematic and do not average out in long logs.
         self._count = float(np.clip(seconds / 0.2, 1.0, 150.0))
         mean, precision = inertial_prior(arm)
         self._bodies = len(mean)
@@ -146,13 +153,16 @@ class GeometryProblem:
         return fewer
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
-        """Return the problem with only some torques. counted: mask (S, n) for the columns of the unchanged log."""
+        """Return the problem that is fitted only to some torques.
+
+        counted: mask (S, n) of these torques in the unchanged log.
+        """
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
         return fewer
 
     def without_gravity(self, joint: int) -> GeometryProblem:
-        """Return the problem of the unchanged log in which one joint's torque contains no gravity."""
+        """Return the problem of the unchanged log with a model in which one joint's torque contains no gravity."""
         weightless = replace(self.unchanged, gravity=(0.0, 0.0, 0.0))
         rows = self.equations(self.unchanged)[0].copy()
         rows[:, joint] = self.equations(weightless)[0][:, joint]
@@ -161,38 +171,40 @@ class GeometryProblem:
         return other
 
     def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
-        """Return the standard deviation of the torques of a fit, (S, n) [Nm, N], from its parameters' covariance."""
+        """Return the standard deviation (S, n) [Nm, N] of the model's torques due to the parameters' covariance."""
         rows, _ = self.equations(fit.hypothesis)
         return np.asarray(np.sqrt(np.einsum("snk,kl,snl->sn", rows, fit.covariance, rows, optimize=True)))
 
     def drive_parameters(self, fit: HypothesisFit) -> np.ndarray:
-        """Return the parameters of the drives in a fit, (effects, n), in the order of `drive_rows`."""
+        """Return the friction parameters and rotor inertias of a fit, (effects, n), in the order of `FRICTION`."""
         return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
     def torque(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
-        """Return the torques (S, n) of parameters (K,) under a hypothesis."""
+        """Return the model's torques (S, n) [Nm, N] with the parameters (K,) under a hypothesis."""
         return np.asarray(self.equations(hypothesis)[0] @ parameters)
 
     def equations(self, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
-        """Return the regressor Y (S, n, K) under a hypothesis, and Y^T Y per joint, (n, K, K); the last ones are kept.
+        """Return the regressor Y (S, n, K) under a hypothesis, and Y^T Y of each joint, (n, K, K).
 
-        The columns are the inertial parameters of the bodies, then friction and rotor inertias.
+        The columns belong to the inertial parameters of the bodies, then to friction and rotor inertias. The 30 latest
+        results are cached.
         """
         key = hypothesis.motion_key
         if key not in self._equations:
             q, qd, qdd, _ = hypothesis.signals(self.samples)
             rows = drive_rows(body_chain(self.arm, hypothesis.gravity), q, qd, qdd, self.speeds)
             rows = rows if self._counted is None else rows * self._counted
-            if len(self._equations) >= 30:  # of about 1 MB each
+            if len(self._equations) >= 30:  # bounds the memory of the cache: an entry has about 1 MB
                 self._equations.pop(next(iter(self._equations)))
             self._equations[key] = rows, block_products(rows, 1)[:, 0]
         return self._equations[key]
 
     def fit(self, hypothesis: Hypothesis) -> HypothesisFit:
-        """Return the fit that minimises the cost.
+        """Return the fit that minimises the cost under a hypothesis, by iteratively reweighted least squares.
 
-        The noise of a joint is marginalised: its log likelihood is -N / 2 log(residual sum of squares), minimised by
-        reweighting. The prior is a Student t: `scale` is its weight of iteratively reweighted least squares.
+        The noise variance of each joint is marginalised: the joint's negative log likelihood is N / 2 log(sum of
+        squared residuals). The prior of the inertial parameters is a Student t distribution: `scale` is its weight in
+        an iteration.
         """
         rows, normal = self.equations(hypothesis)
         tau = hypothesis.signals(self.samples).tau
@@ -201,10 +213,10 @@ class GeometryProblem:
         variance = len(tau) * _variance(tau)
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         errors, scale = np.full(len(normal), 0.1), 0.1
-        for _ in range(6):  # the costs change by less than 0.1 after
+        for _ in range(6):  # further iterations change the cost by less than 0.1
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
             matrix = np.tensordot(weights, normal, 1)
-            # the friction of a joint at rest is not identifiable
+            # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable
             ridge = 1e-9 * np.diag(matrix) + 1e-9
             ridge[: self._bodies] = 0.0
             covariance = inverse(matrix + scale * precision + np.diag(ridge))
@@ -220,7 +232,10 @@ class GeometryProblem:
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
-        """Return the Gauss-Newton step (D,) of parameters with the torque Jacobian `columns` (S, n, D)."""
+        """Return the Gauss-Newton step (D,) of additional quantities, fitted together with the parameters of a fit.
+
+        columns: (S, n, D) derivative of the torques with respect to these quantities.
+        """
         rows, _ = self.equations(fit.hypothesis)
         tau, known = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
         weights = self._count / (len(tau) * (fit.errors + GEOMETRY.error_floor) * _variance(tau))
@@ -233,17 +248,23 @@ class GeometryProblem:
         return np.asarray((inverse(matrix) @ vector)[known:])
 
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
-        """Return the penalty of negative rotor inertias, and of friction whose mean power over the log is positive.
+        """Return the penalty for negative rotor inertias, and for friction that drives the motion on average.
 
-        Each adds half of its squared standard score, up to a bound: drives may compensate friction, and errors of the
-        friction model may resemble inertia. Recorded arms have friction of positive power (shanghai, joint 6) or
-        negative rotor inertia (airbot), not both.
+        A violation adds half of its squared standard score to the cost, up to a bound. The bound is needed since a
+        drive may compensate friction, and since errors of the friction model may resemble inertia: fits of recorded
+        arms have friction that drives the motion (shanghai, joint 6) or a negative rotor inertia (airbot), but not
+        both.
+
+        Args:
+            x: (K,) parameters.
+            covariance: (K, K) covariance of the parameters.
+            normal: (n, K, K) Gram matrices of the regressor per joint.
         """
         drives, n = np.arange(len(normal)), len(normal)
         armature, viscous, coulomb = (self._bodies + n * effect + drives for effect in range(3))
         functionals = np.zeros((2 * n, len(x)))
         functionals[drives, armature] = 1.0
-        # friction power: qd (viscous qd + Coulomb sign qd), summed over the samples
+        # power that friction takes from the motion, qd (viscous qd + Coulomb sign qd), summed over the samples
         functionals[n + drives, viscous] = normal[drives, viscous, viscous]
         functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
         negative = np.minimum(functionals @ x, 0.0)
@@ -253,9 +274,10 @@ class GeometryProblem:
 
 
 def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean (10 B,) and the precision (10 B, 10 B) of the inertial parameters of B bodies, by the URDF.
+    """Return the prior of the inertial parameters of B bodies: mean (10 B,) and precision (10 B, 10 B).
 
-    Errors of masses, centres of mass and tensors are independent; a body without an inertial has a wide prior about 0.
+    The mean has the values of the URDF. Errors of masses, centres of mass and inertia tensors are independent. The
+    prior of a body without <inertial> in the URDF has mean 0 and is wide.
     """
     masses = [float(body.inertia[0]) for body in arm.bodies if body.inertia and body.inertia[0] > 0]
     typical = float(np.median(masses)) if masses else 1.0
@@ -269,21 +291,23 @@ def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
-    """Return R (10, 10), with R R^T the prior covariance of the inertial parameters (m, m c, I) of a body.
+    """Return a root R (10, 10) of the prior covariance R R^T of the inertial parameters (m, m c, I) of a body.
 
-    The columns are the derivatives with respect to the mass at a fixed shape, the centre of mass and the tensor about
-    the centre, times their standard deviations. own: (10,) inertial parameters of the URDF. length: largest distance
-    to a joint it carries [m]. typical: mass assumed for a body without an inertial [kg].
+    The columns of R are the derivatives of the inertial parameters with respect to the mass (at a fixed shape), the
+    centre of mass, and the inertia tensor about the centre of mass, each times a standard deviation.
+
+    own: (10,) inertial parameters of the body in the URDF. length: largest distance from the body's origin to a joint
+    that the body carries [m]. typical: mass assumed for a body without <inertial> [kg].
     """
     if own[0] <= 0:
-        # wide: an extent of half a metre, a standard deviation of 20 times the mass of another body
+        # a wide prior: standard deviations of 20 times the typical mass, with an extent of at least half a metre
         extent = max(length, 0.5)
         return 20.0 * typical * np.diag(np.repeat([1.0, extent, extent**2], (1, 3, 6)))
     mass = own[0]
     center, moments = own[1:4] / mass, own[[4, 7, 9]]
     gyration = np.sqrt(max(float(moments.sum() / 2 / mass - center @ center), 0.0))
     extent = max(float(np.linalg.norm(center)), gyration, length / 2, 0.03)
-    radius = max(gyration, 0.3 * extent)  # URDFs state point masses, too
+    radius = max(gyration, 0.3 * extent)  # bounded from below, since some URDFs contain point masses
     root = np.zeros((10, 10))
     root[:, 0] = own
     for axis, unit in enumerate(np.eye(3)):
@@ -292,17 +316,17 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         root[1:4, 1 + axis] = mass * extent * unit
         root[4:, 1 + axis] = mass * extent * tensor[np.triu_indices(3)]
     root[4:, 4:] = mass * radius**2 * np.eye(6)
-    # URDFs are wrong by half: their masses, their centres of mass relative to the extent, their tensors
+    # standard deviations of 50 %: of masses, of centres of mass relative to the extent of the body, and of tensors
     return 0.5 * root
 
 
 def _variance(tau: np.ndarray) -> np.ndarray:
-    """Return the variance (n,) of torques (S, n); infinite for a constant torque, which has no information."""
+    """Return the variance (n,) of torques (S, n); infinity for a constant torque, which then has the weight zero."""
     return np.asarray(np.where(varying(tau), tau.var(axis=0), np.inf))
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric positive matrix, scaled to a unit diagonal."""
+    """Return the inverse of a symmetric positive definite matrix; it is scaled to a unit diagonal before inversion."""
     length = np.sqrt(np.diag(matrix))
     length = np.where(length > 0, length, 1.0)
     scaled = matrix / np.outer(length, length) + 1e-12 * np.eye(len(matrix))

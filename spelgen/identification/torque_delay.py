@@ -1,4 +1,4 @@
-"""Estimate the delay of torques relative to positions in logs, by least squares on torques shifted in time."""
+"""Estimation of the delay of torques relative to positions in logs, by least squares on time-shifted torques."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,10 +30,11 @@ FRICTION = FrictionModel(memory=True)
 
 @dataclass(frozen=True)
 class TorqueDelay:
-    """Delay of logged torques relative to positions, and half of its 99 % interval [s]; both zero if none is
-    significant.
+    """Delay of logged torques relative to positions.
 
-    coupling: of motors, see `find_coupling`. If one is found, no delay is estimated, since it would be biased.
+    delay: [s], positive if torques are logged later than positions; 0 if no delay is significant. interval: half the
+    width of the delay's 99 % interval [s]. coupling: coupling of motors and its error ratio, see `find_coupling`. If a
+    coupling is found, no delay is estimated, since the estimate would be biased.
     """
 
     delay: float = 0.0
@@ -42,7 +43,7 @@ class TorqueDelay:
 
     @property
     def notes(self) -> list[Diagnostic]:
-        """Return the message about the delay, or about a coupling that prevents its estimation; [] without either."""
+        """Message about the delay, or about a coupling that prevents the estimation of a delay; [] if none is found."""
         if self.coupling is not None:
             joint, other = (number + 1 for number in self.coupling[0].pair)
             message = (
@@ -77,7 +78,11 @@ def find_torque_delay(
     chain: BodyChain,
     preprocessing: Preprocessing,
 ) -> TorqueDelay:
-    """Return the delay of the torques in logs, see `delay_of`. kinds: types of the joints. chain: of the bodies."""
+    """Return the delay of the torques in logs, see `delay_of`.
+
+    kinds: "revolute" or "prismatic" for each joint. drives: input matrix and speeds of the drives. chain: chain of the
+    arm's bodies. preprocessing: filter and gap of the samples.
+    """
     collected = DriveLog(kinds, drives, preprocessing)
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
         collected.add(log)
@@ -86,11 +91,12 @@ def find_torque_delay(
 
 
 def delay_of(problem: DriveProblem) -> TorqueDelay:
-    """Return the delay of the torques, or, if a coupling of motors explains the logs better, this coupling."""
+    """Return the delay of the torques or, if a coupling of motors explains the logs better, the coupling instead."""
     late, coupling = _likely_delay(problem), find_coupling(problem)
     if coupling is None:
         return late
-    # a delay may be confounded with a coupling: it is removed first
+    # A delay may look like a coupling. If no coupling is found after removal of the delay, the delay is the
+    # explanation.
     moved = problem.of_torques(problem.samples.torques @ _spline(late.delay))
     if late.delay and find_coupling(moved) is None:
         return late
@@ -98,29 +104,30 @@ def delay_of(problem: DriveProblem) -> TorqueDelay:
 
 
 def _likely_delay(problem: DriveProblem) -> TorqueDelay:
-    """Return the delay if it is significant without a friction state and, if this model fits, with one; zero
-    otherwise.
+    """Return the delay if it is significant with two friction models; no delay otherwise.
 
-    Its value is from the friction model with the smaller residual.
+    Dry friction has a state (hysteresis) in one model, and depends only on the velocity in the other. A model with a
+    state that fits badly is ignored. The returned value is from the model with the smaller residual.
     """
     samples = problem.samples
     tau = samples.torques
     if not varying(problem.rows[..., -1]).any():
         return NO_DELAY
     estimates = []
-    # dry friction with and without a state, filtered like the torques: a delay that only one form shows is an error of
-    # this form
+    # Dry friction with and without a state, with the same filter as the torques. A delay that only one of both models
+    # shows is an error of this model.
     for dry in (samples.bent, samples.direction[..., None]):
         friction = FRICTION.columns(samples.qd, samples.qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
-    # errors of a friction state resemble a delay; errors of friction without a state do not, since they are symmetric
+    # The model without a state is always used: its errors are symmetric and do not resemble a delay.
+    # Errors of a friction state do.
     memory, direct = estimates
     likely = [direct]
-    # on recorded arms its squared residual is 0.3 to 0.8 of the other form's
+    # on recorded arms the squared residual with a friction state is 0.3 to 0.8 times the squared residual without
     if memory.squares <= 2.0 * direct.squares:
         likely.append(memory)
     best = min(likely, key=lambda x: x.squares)
-    # an interval of 99 %: a log without delay must not get one
+    # a 99 % interval, so that a delay is rarely found in logs without one
     quantile = -stdtrit(HINTS.blocks - 1, 0.01 / 2)
     deviations = np.array([x.delay / x.standard_error for x in likely])
     if not ((deviations > quantile).all() or (deviations < -quantile).all()):
@@ -129,10 +136,10 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
 
 
 def _estimate(rows: np.ndarray) -> _Estimate:
-    """Return the delay with the smallest residual; rows: (S, n, K + D), regressor and torques shifted by each of
-    `SHIFTS`.
+    """Return the delay with the smallest torque residual, with its standard error.
 
-    The standard error is from a jackknife over blocks of time: model errors are correlated over seconds.
+    The standard error is from a jackknife over blocks of time, since model errors are correlated over seconds. rows:
+    (S, n, K + D) regressor, and torques shifted in time by each of the D `SHIFTS`.
     """
     products = block_products(rows, HINTS.blocks)
     deviation = rows[..., -len(SHIFTS) :].std(axis=(0, 2))
@@ -145,17 +152,19 @@ def _estimate(rows: np.ndarray) -> _Estimate:
         squares = unexplained @ products.sum(axis=1) @ unexplained
         noise = np.sqrt(np.maximum(squares / len(rows), np.square(TUNING.least_noise * least)))
     spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
-    # at the last shift the delay is unknown; a residual of zero means too few samples
+    # The delay is unknown if it is near the largest shift, where the minimum may be outside. Equal estimates
+    # without each block mean too few samples.
     unknown = abs(delay) > SHIFTS[-2] or spread == 0
     standard_error = np.inf if unknown else float(np.sqrt(spread))
     return _Estimate(delay, standard_error, float((squares / least**2).sum()))
 
 
 def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the delay of the smallest residual for Gram matrices (K + D, K + D), and the residual's coefficients, (K
-    + D,).
+    """Return the delay [s] with the smallest residual, and the coefficients (K + D,) of the residual.
 
-    Between shifts a torque is a cubic in the shift: filtered torques are smooth over one step.
+    products: (K + D, K + D) Gram matrix of the regressor and of the D shifted torques. The residual is the sum of these
+    columns times the coefficients. A torque with a shift between two of `SHIFTS` is interpolated by a cubic spline,
+    since filtered torques are smooth over one step.
     """
     moved = len(SHIFTS)
     parameters = normal_solution(products, moved)
@@ -176,5 +185,5 @@ _cardinal = CubicSpline(SHIFTS, np.eye(len(SHIFTS)))
 
 
 def _spline(delay: float) -> np.ndarray:
-    """Return the weights (D,) of the shifted torques in a torque shifted by a delay."""
+    """Return weights (D,): the weighted sum of the D shifted torques is the torque shifted by `delay` [s]."""
     return np.asarray(_cardinal(delay))

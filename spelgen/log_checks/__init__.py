@@ -1,1 +1,1 @@
-"""Checks of logs against their arm, for `spelgen logs`."""
+"""Checks of logs against the arm that they were recorded on, for `spelgen logs`."""

@@ -1,4 +1,4 @@
-"""Report of the content of the logs of a robot, with findings about them."""
+"""Report on the logs of a robot: ranges, noise and sample times, and the findings of all checks."""
 
 from __future__ import annotations
 
@@ -23,12 +23,17 @@ ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, CURRENT, WRONG_LINK, *G
 
 
 def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None = None) -> LogReport:
-    """Return the report about the logs of an arm, which are read once. Faults of the logs are reported, not raised.
+    """Return the report on the logs of an arm. Faults of the logs are not raised, but are `errors` of the report.
 
-    The report's `errors` prevent training. mapping: of the logs, by default from the arm's settings; units that
-    it declares and errors that it accepts are not checked. The arm's input matrix converts logged torques to joint
-    torques. Raises LogError without any trajectory, for another number of joints, and without commands if the
-    arm's settings have 'input: position'.
+    Args:
+        logs: trajectories; an iterator is consumed once, one trajectory at a time.
+        arm: the arm. Its input matrix converts logged torques to joint torques.
+        mapping: mapping of the logs; None: the mapping in the arm's settings. Units that it declares are not checked,
+            and checks that it accepts are omitted.
+
+    Raises:
+        LogError: if there is no trajectory, for a trajectory with another number of joints, and for a trajectory
+            without commands if the arm's settings contain 'input: position'.
     """
     joints = arm.chain.joint_names
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
@@ -47,7 +52,7 @@ def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None 
         checked.add(trajectory)
         log_checks.add(trajectory)
         measured.append(statistics(trajectory))
-        if len(examples) < 2:  # which a page draws
+        if len(examples) < 2:  # the HTML page of the report plots two trajectories
             examples.append(trajectory)
     if not measured:
         raise LogError("no trajectory", expected="at least one")
@@ -70,9 +75,9 @@ def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None 
 def require_sound_logs(
     logs: Sequence[Trajectory], arm: Arm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
-    """Return the findings of `check_logs` about an arm and its logs; raise LogError if they cannot be trained on."""
-    # the same checks as the command: a fit and `spelgen logs` refuse the same logs
+    """Return the findings about logs that concern the arm; raise LogError if the logs cannot be trained on."""
+    # the checks of `spelgen logs`, so that training and this command reject the same logs
     report = check_logs(logs, arm, mapping)
     collect(report.errors)
-    # a fit itself reports checks that need no arm, and finds the delay of torques
+    # other findings are omitted: a fit itself runs the checks that need no arm, and estimates the delay of torques
     return [note for note in report.findings if note.code in ABOUT_ARM]

@@ -1,4 +1,4 @@
-"""Check logs of commanded positions: contents, tracking of the commands, and anomalies."""
+"""Checks of logs of commanded positions: ranges of the signals, tracking of the commands, wrong commands."""
 
 from __future__ import annotations
 
@@ -23,19 +23,28 @@ if TYPE_CHECKING:
     from spelgen.settings.log_mapping import LogMapping
 
 MOVING = SAMPLES.moving
-# Delays of positions after commands [s]: negative ones mean shifted rows; cheap servos have less than 0.2 s.
+# [s] Candidates for the delay of positions after commands. Negative delays show that rows of the log are shifted; the
+# delays of low-cost servos are below 0.2 s.
 DELAYS = np.linspace(-0.1, 0.4, 51).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
-FILTER_SAMPLES = 12  # shortest piece that the polynomial of the derivative fits into
+FILTER_SAMPLES = 12  # [1] fewest samples of a gap-free piece, which the smoothing polynomial needs
 FOLLOWS = SIGNALS.agreement
-# Positions of bus servos are words of 10 to 14 bits per turn: in degrees, all joints have steps of 360/2**k (LeRobot:
-# 360/(2**k - 1)), and LeRobot's normalised positions steps of 200 divided by the counts of a joint's calibrated range.
-NORMALISED_RANGE, NORMALISED_STEPS = 100.001, (0.04, 0.25)  # 800 to 5000 counts
-SAME_STEP, ENCODER_STEP = 1e-3, 4e-3  # relative differences
+# Encoders of bus servos have 2**k counts per turn, with k from 10 to 14. Positions in degrees therefore have the same
+# quantisation step at all joints: 360/2**k, or 360/(2**k - 1) with LeRobot. LeRobot's normalised positions have another
+# step at each joint: 200 divided by the counts of the joint's calibrated range.
+# NORMALISED_RANGE: largest magnitude of a normalised position. NORMALISED_STEPS: smallest and largest quantisation step
+# of normalised positions, for calibrated ranges of 800 to 5000 counts.
+NORMALISED_RANGE, NORMALISED_STEPS = 100.001, (0.04, 0.25)
+# SAME_STEP: relative difference below which the steps of all joints count as equal. ENCODER_STEP: relative difference
+# below which a step counts as a step of an encoder.
+SAME_STEP, ENCODER_STEP = 1e-3, 4e-3
 
 
 def find_normalised(joints: Sequence[JointReport]) -> str | None:
-    """Find LeRobot's normalised positions that were declared as degrees, by the quantisation steps of the joints."""
+    """Find normalised positions of LeRobot that the mapping declares as degrees.
+
+    Normalised positions have another quantisation step at each joint, positions in degrees have the encoder's step.
+    """
     if max(joint.largest("q") for joint in joints) > np.radians(NORMALISED_RANGE):
         return None
     found = {joint.name: float(np.degrees(joint.steps["q"])) for joint in joints if joint.steps["q"]}
@@ -61,9 +70,13 @@ NORMALISED = Check(
 class Following(NamedTuple):
     """Tracking of the commands of n joints.
 
-    moves: (n,) whether the command moves. correlation: (n, n) of the command of joint i (row) with the position of
-    joint j (column), at the delay (n, n) [s] at which its magnitude is largest. gain: (n,) amplitude of a joint's
-    motion divided by the amplitude of its command. joints: measurements per joint.
+    Attributes:
+        moves: (n,) True for joints whose command changes.
+        delay: (n, n) [s] delay at which the magnitude of the correlation is largest.
+        correlation: (n, n) correlation of the command of joint i (row) with the position of joint j (column), at this
+            delay.
+        gain: (n,) amplitude of a joint's motion divided by the amplitude of the joint's command.
+        joints: tracking errors and lag of each joint.
     """
 
     moves: np.ndarray
@@ -74,9 +87,10 @@ class Following(NamedTuple):
 
 
 def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Following | None:
-    """Return the tracking of n joints over all recordings; None if no recording is long enough.
+    """Return the tracking of the commands of n joints over all recordings; None if no recording is long enough.
 
-    saturation: (n,) distances from the command at which the torque is at its limit; infinite if unknown.
+    saturation: (n,) [rad, m] distance of a position from its command at which the servo's torque is at its limit;
+    infinity if the limit is unknown.
     """
     pieces: list[Trajectory] = []
     for log in logs:
@@ -89,13 +103,13 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
     correlations, tracking_rms = [], []
     for delay in DELAYS.tolist():
         u = np.concatenate([delayed_commands(x, slice(0, len(x)), delay, 1)[:, 0] for x in pieces])
-        # without means, which differ by the static error
+        # means are subtracted, since the static error of a servo shifts them
         covariance = (u - u.mean(axis=0)).T @ (q - q.mean(axis=0)) / len(u)
         correlations.append(covariance / np.maximum(np.outer(u.std(axis=0), q_std), 1e-6))
         tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))
     best = np.abs(correlations).argmax(axis=0)
     correlation = np.take_along_axis(np.array(correlations), best[None], axis=0)[0]
-    moves = u_std > 0.01  # rad, m: less is noise of a constant command
+    moves = u_std > 0.01  # [rad, m] a command with a smaller standard deviation is constant with noise
     saturated = np.mean(np.abs(commands - q) > saturation, axis=0)
     joints = []
     for k, error in enumerate(_steady_state_errors(pieces)):
@@ -108,12 +122,15 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
 
 
 def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
-    """Return the 90th percentile, per joint, of the distances from the command at rest; None if it never rests."""
+    """Return the steady-state error of each joint [rad, m]; None for a joint that never rests.
+
+    It is the 90th percentile of |u - q| at samples at which the command is constant and the joint rests.
+    """
     distances, rests = [], []
     for piece in pieces:
         u = require_commands(piece)[:-1]
         velocity = np.gradient(derivative(piece.q, piece.sample_rate, 0), piece.t, axis=0)[1:]
-        # an SO-101 is at rest 0.25 s after its command
+        # the command must have been constant for 0.25 s: after this time an SO-101 is at rest
         span = max(1, round(0.25 * piece.sample_rate))
         resting = (u == np.roll(u, span, axis=0)) & (np.abs(velocity) < MOVING)
         resting[:span] = False
@@ -121,32 +138,32 @@ def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
         distances.append(np.abs(u - _midpoints(piece.q)))
     errors: list[float | None] = []
     for distance, resting in zip(np.concatenate(distances).T, np.concatenate(rests).T, strict=True):
-        # not the largest one, which is arbitrary if the arm was in contact with an obstacle
+        # the 90th percentile, since the largest error may be due to contact with an obstacle
         errors.append(float(np.quantile(distance[resting], 0.9)) if resting.any() else None)
     return errors
 
 
 def _midpoints(x: np.ndarray) -> np.ndarray:
-    """Return the values halfway between samples, at which delayed commands are evaluated."""
+    """Return the means (T - 1, ...) of neighbouring samples of x (T, ...), to match commands averaged over steps."""
     return np.asarray((x[1:] + x[:-1]) / 2)
 
 
 class ServoLogs:
-    """Check logs of commanded positions against their arm."""
+    """Checks of logs of commanded positions against the arm, over all trajectories."""
 
     def __init__(self, arm: Arm) -> None:
         self._arm = arm
         self._logs: list[Trajectory] = []
 
     def add(self, trajectory: Trajectory) -> None:
-        """Add a trajectory. Raises LogError without commands."""
+        """Add a trajectory. Raises LogError if it has no commands."""
         require_commands(trajectory)
         self._logs.append(trajectory)
 
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports with the tracking of commands, and tables; add the findings to the summary."""
+        """Return the reports of the joints completed by their tracking, and tables; add findings to the summary."""
         names = self._arm.chain.joint_names
         saturation = np.full(len(names), np.inf)
         for k, coordinate in enumerate(self._arm.chain.coordinates):
@@ -166,7 +183,7 @@ class ServoLogs:
             odd = None
             if following is not None:
                 report = replace(report, following=following.joints[k])
-                # some loggers write measured positions in place of commands
+                # True if the logger wrote measured positions in place of commands
                 is_copy = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in self._logs)
                 odd = _odd_command(k, names, report, following, is_copy, mapping)
             completed.append(report)
@@ -181,7 +198,7 @@ class ServoLogs:
             if log.sample_rate < 20.0:
                 message = f"{log.sample_rate:.3g} Hz: delays and friction need 20 Hz or more"
                 summary.notes.append(Diagnostic("warning", "sparse", f"trajectory {log.name}", None, message))
-                break  # reported once: logs of one robot have one rate
+                break  # reported for one trajectory only: logs of one robot have the same sample rate
         return completed, (*signal_tables(completed, ("q", "u")), _following_table(completed))
 
 
@@ -193,25 +210,26 @@ def _odd_command(
     is_copy: bool,
     mapping: LogMapping,
 ) -> LogError | Diagnostic | None:
-    """Return the finding about a joint's command: an error if it cannot be this joint's command; None without one.
+    """Return the finding about the command of joint k; None if there is none.
 
-    is_copy: the command is the position itself.
+    It is an error if the logged command cannot be the command of this joint. is_copy: True if the logged command
+    equals the logged position in all samples.
     """
     where = f"joint {joints[k]!r}"
-    # correlations are evaluated at the best delay, so that a slow servo is not a finding
+    # correlation and gain at the delay with the largest correlation, so that a slow servo is not reported as a fault
     correlation, gain = following.correlation[k, k], following.gain[k]
     if is_copy:
         code, message = (
             "commands-are-positions",
             "u is q, to the last bit: are the commands those that were sent?",
         )
-    # the amplitudes of command and motion are equal within a fifth, unless one of them is in degrees
+    # a ratio of amplitudes of about 57.3 or 1/57.3 shows that the command or the position is in degrees
     elif correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         units = {"q": "deg", "u": "rad"} if gain > 1 else {"q": "rad", "u": "deg"}
         do = mapping_line({"joints": {joints[k]: {"units": units}}})
         return LogError(got, element=where, expected="both in radians", do=do)
-    # a constant command does not determine the servo
+    # a constant command contains no information on the servo
     elif not following.moves[k]:
         width = report.high["u"] - report.low["u"]
         code, message = "idle-command", f"its command moves by only {width:.3g}: its servo is not determined"
@@ -219,7 +237,7 @@ def _odd_command(
         got = f"positions that move against commands (correlation {correlation:.2g})"
         return LogError(got, element=where, expected="one sense", do="check the signs of q and u")
     elif correlation < 0.5:
-        # swapped columns: another joint follows this command
+        # if another joint follows this command, the columns of the log are swapped
         for other, name in enumerate(joints):
             if following.correlation[k, other] > FOLLOWS:
                 got = f"a command that joint {name!r} follows, and this one does not"

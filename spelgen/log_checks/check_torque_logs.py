@@ -1,4 +1,4 @@
-"""Checks of logs of torques with the model of their arm: geometry, limits, drives."""
+"""Checks of logs of torques against the model of the arm: geometry, torque limits and stops, couplings of motors."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ CURRENT = "current-without-gain"
 
 
 class TorqueLogs:
-    """Checks of logs of torques with the model of their arm, on a subset of the samples of all trajectories."""
+    """Checks of logs of torques against the model of the arm, on a subset of the samples of all trajectories."""
 
     def __init__(self, arm: Arm, mapping: LogMapping) -> None:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
@@ -57,14 +57,14 @@ class TorqueLogs:
         self._seconds, self._is_bag = 0.0, False
 
     def add(self, trajectory: Trajectory) -> None:
-        """Add a trajectory. Raises LogError without torques."""
+        """Add a trajectory. Raises LogError if it has no torques."""
         require_torques([trajectory])
         inputs = self._drives.inputs.T
         samples = []
         for x in split_at_gaps(trajectory, shortest=3):
             samples.append(MotionSamples(x.q, x.qd, np.gradient(x.qd, x.t, axis=0), x.tau @ inputs))
         if samples:
-            # gravity and friction change slowly
+            # 400 samples of a trajectory suffice, since gravity and friction change slowly
             self._samples.append(MotionSamples.joined(samples).thinned(400))
         self._moving.add(trajectory)
         self._flat.append(FlatTops.of(trajectory.q, trajectory.tau @ inputs))
@@ -76,8 +76,8 @@ class TorqueLogs:
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports with the fit of gravity to the torques, and tables; add the findings to the summary."""
-        # a code is accepted if all files declare it
+        """Return the reports of the joints completed by the fit of gravity, and tables; add findings to the summary."""
+        # a check is omitted if the mapping accepts it, or if every trajectory does
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         chain, empty = self._arm.chain, np.zeros((0, len(reports)))
         motion = MotionSamples.joined([MotionSamples(*[empty] * 4), *self._samples]).thinned(6000)
@@ -86,14 +86,14 @@ class TorqueLogs:
         for coordinate, report, gravity in zip(chain.coordinates, reports, fits, strict=True):
             completed.append(replace(report, gravity=gravity))
             evidence.append(JointEvidence(coordinate, completed[-1]))
-        # wrong velocities cause wrong friction, and wrong torques cause wrong hints about drives
+        # the model is fitted only to sound logs: wrong velocities give wrong friction, and other faults wrong hints
         is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         moving = self._moving.samples()
         weightless: list[JointEvidence] = []
         if is_sound:
-            # with unknown factors on the torques another hypothesis may have a lower cost
+            # with unknown motor gains a wrong hypothesis about the log may have the lowest cost
             problem = None if unscaled else self._problem(moving, motion)
             is_right = problem is None or self._check_geometry(problem, evidence, accepted, summary)
             if problem is not None and is_right:
@@ -105,7 +105,7 @@ class TorqueLogs:
             passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
             if has_errors:  # one message per cause
                 passed.add("torque-beyond-drive")
-            if joint not in weightless:  # errors of the URDF's masses explain it
+            if joint not in weightless:  # wrong masses in the URDF may explain a torque without gravity
                 passed.add(WITHOUT_GRAVITY)
             for check, found in run_checks(CHECKS, joint, passed):
                 if check.severity == "error":
@@ -118,7 +118,10 @@ class TorqueLogs:
         return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
 
     def _unscaled_currents(self) -> list[Diagnostic]:
-        """Return a warning about motor currents with the gain 1 of a draft, unless a fit is to find their gains."""
+        """Return a warning about logged motor currents whose gain is still 1, as in a draft of a mapping; [] if none.
+
+        A gain that a fit estimates ('gain: trained') needs no warning.
+        """
         names = []
         for name in self._arm.chain.joint_names:
             is_draft = self._mapping.unit("tau", name) in CURRENTS and self._mapping.joint(name).gain == 1.0
@@ -134,13 +137,14 @@ class TorqueLogs:
         return [Diagnostic("warning", CURRENT, f"joint {', '.join(map(repr, names))}", None, message)]
 
     def _is_declared(self, joint: str) -> bool:
-        """Whether the mapping states the unit of a joint's torque."""
+        """Return True if the mapping states the unit of a joint's torque."""
         return self._mapping.unit("tau", joint) is not None
 
     def _problem(self, moving: DriveSamples | None, motion: MotionSamples) -> GeometryProblem | None:
-        """Return the least-squares problem of the log; None for too few samples, or without torques.
+        """Return the least-squares problem of the logs; None if they have too few samples or only constant torques.
 
-        moving: filtered samples; None: the logs are too slow for accelerations, and `motion` is used.
+        moving: filtered samples of the moving arm; None for logs whose sample rate is too low for accelerations.
+        motion: unfiltered samples, which are used instead in this case.
         """
         samples = motion
         if moving is not None:
@@ -157,9 +161,10 @@ class TorqueLogs:
         accepted: set[str],
         summary: Findings,
     ) -> bool:
-        """Return True if no limit and no other hypothesis explains the torques; add the finding otherwise.
+        """Return True if the torques agree with the arm's geometry, without clipping; otherwise add the finding.
 
-        Warnings are about mechanical stops, and about inertials of the URDF.
+        False is returned for clipped torques, and if a hypothesis such as other signs, orders or zeros of the joints
+        fits significantly better. Warnings about mechanical stops and about inertials of the URDF are added, too.
         """
         limits = find_limits(problem, FlatTops.joined(self._flat))
         summary.notes.extend(limits.notes)
@@ -180,7 +185,10 @@ class TorqueLogs:
         return False
 
     def _scalings(self, evidence: Sequence[JointEvidence]) -> list[Scaling]:
-        """Return other units that the mapping does not exclude: of torques by gravity, and of all angles."""
+        """Return the candidates for other units: of torques, from the magnitude of gravity, and of all angles.
+
+        Units that the mapping states are not changed.
+        """
         names, ones = self._arm.chain.joint_names, np.ones(len(evidence))
         scalings = []
         for factors in torque_factors(evidence, [not self._is_declared(name) for name in names]):
@@ -190,7 +198,7 @@ class TorqueLogs:
         return scalings
 
     def _check_drives(self, moving: DriveSamples, summary: Findings) -> None:
-        """Add a coupling of motors that the logs show, or else a delay of the torques."""
+        """Add a warning about a coupling of motors that the logs show, or else a note on a delay of the torques."""
         late = delay_of(drive_problem(body_chain(self._arm.chain), self._drives, moving))
         if late.coupling is not None:
             summary.notes.append(_coupling_hint(self._arm, *late.coupling))
@@ -199,7 +207,7 @@ class TorqueLogs:
 
 
 def _without_gravity(problem: GeometryProblem, joints: Sequence[JointEvidence]) -> list[JointEvidence]:
-    """Return the joints whose torques are explained better without gravity than with any masses near the URDF's."""
+    """Return the joints whose torques fit better without gravity than with gravity and masses near the URDF's."""
     suspicious = [k for k, joint in enumerate(joints) if find_no_gravity(joint)]
     if not suspicious:
         return []
@@ -208,16 +216,18 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointEvidence]) 
     confirmed = []
     for k in suspicious:
         cost = problem.without_gravity(k).fit(problem.unchanged).cost
-        # a torque of which a tenth remains unexplained is not the URDF's
+        # also confirmed if the residual with gravity has a tenth of the torque's variance: then the URDF's gravity is
+        # not in this torque
         if fit.errors[k] > 0.1 or cost < fit.cost:
             confirmed.append(joints[k])
     return confirmed
 
 
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
-    """Yield a warning for each link whose first moment is far from the URDF's, along the URDF's direction.
+    """Yield a warning for each link whose first moment (mass times centre of mass) differs much from the URDF's.
 
-    A body counts only if the difference is visible in the torques: small and distant bodies compensate for each other.
+    The component along the URDF's first moment is compared. A difference must be large enough to be visible in the
+    torques, since wrong parameters of small distal bodies can compensate each other.
     """
     visible = 0.5 * float(problem.samples.tau.std(axis=0).max())
     gravity = float(np.linalg.norm(fit.hypothesis.gravity))
@@ -230,7 +240,8 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
         axis = stated / length
         ratio = float(axis @ moment) / length
         deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / length
-        # errors of a CAD model are below 2.5; four standard deviations: there are many bodies
+        # CAD models are wrong by a factor of less than 2.5. Four standard deviations are required, since one of many
+        # bodies may exceed two by chance.
         if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
             continue
         message = (
@@ -241,7 +252,10 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
 
 
 def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic:
-    """Return the warning about a coupling in the logs, with the lines for the settings."""
+    """Return the warning about a coupling of motors, with the settings that declare it.
+
+    remaining: squared torque residual of both joints with the coupling, divided by the one without it.
+    """
     names = arm.chain.joint_names
     pair = [coupling.moved_by, coupling.joint]
     matrix = np.array([[1.0, coupling.ratio], [0.0, 1.0]]) * np.diag(arm.actuation.matrix())[pair]
@@ -264,7 +278,7 @@ def _physics_table(joints: Sequence[JointReport]) -> Listing:
     rows = []
     for joint in joints:
         fit = joint.gravity
-        # for a low correlation the factor is undetermined
+        # the ratio of the torque to the URDF's gravity is undetermined if their correlation is low
         is_seen = abs(fit.correlation or 0) > TUNING.seen
         velocity = number(joint.velocity_factor), number(joint.velocity_correlation)
         rows.append((joint.name, *velocity, percent(fit.explained), number(fit.factor if is_seen else None)))

@@ -1,7 +1,8 @@
 """Detection of signals at a limit: clipped torques, and positions at a mechanical stop.
 
-A constant extreme value (flat top) of a signal is no proof: torques are constant at rest and in uniform acceleration.
-It is a limit if the torque contradicts the least-squares model of all other samples.
+At a limit a signal is constant at its largest or smallest value: it has a flat top. But a flat top is no proof of a
+limit, since torques are also constant at rest and during uniform acceleration. It is a limit if, in addition, the
+torque contradicts the least-squares model of all samples outside flat tops.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ SIDES = np.array([-1.0, 1.0])
 
 
 class FlatTops(NamedTuple):
-    """Constant lowest and highest values (flat bottoms and tops) of the positions and torques of n joints.
+    """Flat bottoms and tops of the positions and torques of n joints: extreme values at which a signal is constant.
 
-    q, tau: values (2, n) [rad, m; Nm, N], NaN without a flat one. shares: (2, n), fraction of the samples at the value
-    of tau.
+    q: (2, n) lowest and highest positions [rad, m]; NaN if they are not flat. tau: (2, n) lowest and highest torques
+    [Nm, N]; NaN if they are not flat. shares: (2, n) fraction of the samples at these torques.
     """
 
     q: np.ndarray
@@ -34,12 +35,12 @@ class FlatTops(NamedTuple):
 
     @classmethod
     def of(cls, q: np.ndarray, tau: np.ndarray) -> FlatTops:
-        """Return the flat tops of one trajectory, (T, n) each."""
+        """Return the flat tops of one trajectory with positions q and torques tau, (T, n) each."""
         return cls(flat_tops(q)[0], *flat_tops(tau))
 
     @classmethod
     def joined(cls, trajectories: Sequence[FlatTops]) -> FlatTops:
-        """Return the most extreme flat tops of several trajectories."""
+        """Return the most extreme flat tops of several trajectories, and the means of their shares."""
         q, tau, shares = map(np.stack, zip(*trajectories, strict=True))
         sides = SIDES[:, None]
         return cls(
@@ -48,14 +49,15 @@ class FlatTops(NamedTuple):
 
 
 def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values (2, n) of the flat bottoms and tops of signals (T, n), NaN without one, and their shares.
+    """Return the values (2, n) of the flat bottoms and tops of signals (T, n), and their fractions of samples (2, n).
 
-    At a flat top a narrow band at the extreme value has many more samples than a band of three times the width below
-    it; at the peak of a sinusoid both have equal numbers.
+    The value of an extreme that is not flat is NaN. At a flat top, a narrow band at the extreme value contains many
+    more samples than the adjacent band, which is three times as wide; at the peak of a sinusoid both contain equally
+    many.
     """
     upright = SIDES[:, None, None] * values
     tops = upright.max(axis=1)
-    # wide enough for the noise of clipped torques: half a per cent of the range
+    # the band is half a per cent of the signal's range, which is wide enough for the noise of clipped torques
     width = 0.005 * np.ptp(values, axis=0)
     shares = (upright >= (tops - width)[:, None]).mean(axis=1)
     below = (upright >= (tops - 4 * width)[:, None]).mean(axis=1) - shares
@@ -64,14 +66,17 @@ def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
-    """Return an error per joint with clipped torques; without any, a warning per joint at a mechanical stop."""
+    """Return an error for each joint with clipped torques; if there is none, a warning for each joint at a stop.
+
+    flat: flat tops of the unchanged log.
+    """
     problem, findings = problem.thinned(GEOMETRY.confirming_samples), Findings()
     samples = problem.unchanged.signals(problem.samples)
     at_torque, at_position = (_at_levels(*x) for x in ((flat.tau, samples.tau), (flat.q, samples.q)))
     free = ~(at_torque | at_position).any(axis=0)
     if free.all():
         return findings
-    # the model is fitted to the torques that are not at a limit
+    # the model is fitted only to samples outside flat tops, which are not at a limit
     fit = problem.on_torques(free).fit(problem.unchanged)
     residual = problem.torque(problem.unchanged, fit.parameters) - samples.tau
     deviation, (_, _, friction, *_) = problem.prediction_deviation(fit), problem.drive_parameters(fit)
@@ -85,7 +90,8 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
         sides = zip(SIDES, at_torque[..., k], strict=True)
         doubt = certain * deviation[:, k]
         excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
-        # an error of friction, estimated from few free samples, is not evidence of a limit
+        # The excess must be larger than the friction: friction estimated from few samples may be wrong, and its error
+        # is no evidence of a limit.
         sure = max(certain * noise[k], 0.08 * samples.tau[:, k].std(), abs(friction[k]))
         is_clipped = excess > sure
         if is_clipped.any():
@@ -113,11 +119,14 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
 
 
 def _at_levels(levels: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return a mask (2, S, n) of the samples of filtered signals (S, n) at a level (2, n); False without a level."""
+    """Return a mask (2, S, n) of the samples at which filtered signals `values` (S, n) are at a flat bottom or top.
+
+    levels: (2, n) values of the flat bottoms and tops; the mask is False for NaN.
+    """
     distance = SIDES[:, None, None] * (levels[:, None] - values)
     return np.asarray(distance < 0.02 * np.ptp(values, axis=0))
 
 
 def _median(values: Sequence[float] | np.ndarray) -> float:
-    """Return the median; minus infinity for no values."""
+    """Return the median of values; minus infinity if there are none."""
     return float(np.median(values)) if len(values) else -np.inf

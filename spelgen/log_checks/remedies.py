@@ -1,4 +1,4 @@
-"""Lines of the settings for a better hypothesis about a log, and the finding as a message."""
+"""Messages about a hypothesis that fits a log better than its mapping, and the settings that implement it."""
 
 from dataclasses import dataclass, replace
 
@@ -21,7 +21,10 @@ RIGHT = "joints, zeros, units and gravity as the URDF and the settings state the
 
 
 def mapped_reading(arm: Chain, mapping: LogMapping, drives: Drives) -> Hypothesis:
-    """Return the hypothesis of the unchanged log: scales and offsets of its mapping, and gears of single joints."""
+    """Return the hypothesis of the unchanged log, with the scales and offsets of the mapping.
+
+    The torque scale includes the gear ratio of the drives if each motor drives one joint.
+    """
     joints = arm.joint_names
     gears = np.diag(drives.inputs) if np.count_nonzero(drives.inputs) == len(joints) else np.ones(len(joints))
     torque_scale = np.array([mapping.scale("tau", joint) for joint in joints])
@@ -35,9 +38,10 @@ def mapped_reading(arm: Chain, mapping: LogMapping, drives: Drives) -> Hypothesi
 
 @dataclass(frozen=True, eq=False)
 class Remedies:
-    """Findings about a log, and the lines of the settings that correct them.
+    """Converter of hypotheses about a log to findings with the settings that correct the log.
 
-    by_name: whether the log consists of messages with names of joints, as in bags, instead of columns.
+    unchanged: hypothesis of the log with its current mapping. by_name: True if the log consists of messages that
+    contain joint names, as in ROS bags, and not of columns.
     """
 
     unchanged: Hypothesis
@@ -46,7 +50,11 @@ class Remedies:
     by_name: bool
 
     def finding(self, comparison: HypothesisComparison) -> LogError | Diagnostic:
-        """Return the finding of a better hypothesis: an error, or a warning for small angles and moderate factors."""
+        """Return the finding about a log for which another hypothesis fits better.
+
+        It is an error, or a warning if an error of the URDF or of the mounting may be the reason: a small zero offset,
+        a small tilt, or a moderate factor on the torques.
+        """
         best, codes = comparison.better[0], comparison.codes
         changes = [self._change(code, best.hypothesis) for code in codes]
         where = " and ".join(dict.fromkeys(self._place(joints) for joints, _ in changes))
@@ -60,7 +68,7 @@ class Remedies:
         return LogError(got, element=where, expected=RIGHT, do=do)
 
     def lines(self, reading: Hypothesis) -> str:
-        """Return the lines of the settings for a hypothesis, and the files or keys in which to write them."""
+        """Return a text with the settings that implement a hypothesis, and where to write them."""
         texts = []
         keys = {name: self._joint_keys(k, reading) for k, name in enumerate(self.arm.joint_names)}
         changed = {name: changes for name, changes in keys.items() if changes}
@@ -73,7 +81,7 @@ class Remedies:
         return " and ".join(texts)
 
     def _joint_keys(self, k: int, reading: Hypothesis) -> dict[str, object]:
-        """Return the keys of joint k in a mapping whose values change."""
+        """Return the settings of joint k in the group `logs` that a hypothesis changes."""
         joints, mapping, unchanged = self.arm.joint_names, self.mapping, self.unchanged
         present = mapping.joint(joints[k])
         keys: dict[str, object] = {}
@@ -104,7 +112,10 @@ class Remedies:
         return keys
 
     def _change(self, code: str, reading: Hypothesis) -> tuple[np.ndarray, str]:
-        """Return a mask (n,) of the joints that a change affects, and a text that describes the content of the log."""
+        """Return a mask (n,) of the joints that a change affects, and a text that describes the fault of the log.
+
+        code: code of the change. reading: hypothesis that contains the change.
+        """
         unchanged, order = self.unchanged, np.arange(len(reading.offset))
         motion = reading.motion_scale / unchanged.motion_scale
         torque = reading.torque_scale / unchanged.torque_scale
@@ -133,7 +144,7 @@ class Remedies:
         return changes.get(code) or (order >= 0, self._gravity_text(code, reading))
 
     def _place(self, joints: np.ndarray) -> str:
-        """Return the text that names the joints of a mask (n,) in a finding."""
+        """Return a text that names the joints in a mask (n,), for a finding."""
         if joints.all() and len(joints) > 1:
             return "all joints"
         return f"joint {', '.join(map(repr, np.array(self.arm.joint_names)[joints].tolist()))}"
@@ -148,10 +159,10 @@ class Remedies:
         return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
     def _is_minor(self, best: Hypothesis) -> bool:
-        """Return True if the difference may be an error of the URDF or of the mounting, not of the log."""
+        """Return True if the change may be due to an error of the URDF or of the arm's mounting, not of the log."""
         if best.codes == ("torque-unit",):
             factor = np.abs(np.log(best.torque_scale / self.unchanged.torque_scale)).max()
-            return bool(factor < np.log(10.0))  # inertials of a URDF are never so wrong
+            return bool(factor < np.log(10.0))  # inertials of a URDF are never wrong by a factor of ten
         if best.codes == ("joint-zero",):
             return bool(np.abs(best.offset - self.unchanged.offset).max() < GEOMETRY.serious_angle)
         present = np.array(self.unchanged.gravity)
@@ -160,7 +171,7 @@ class Remedies:
 
 
 def _evidence(best: HypothesisFit, unchanged: HypothesisFit) -> str:
-    """Return a sentence with the squared torque residual, mean over joints, before and after."""
+    """Return a sentence that compares the squared torque residuals, averaged over joints, of two hypotheses."""
     if best.hypothesis.codes == ("torque-unit",):
         return "by the URDF's gravity"
     before, after = unchanged.errors.mean(), best.errors.mean()

@@ -20,12 +20,18 @@ MEASURES = {"q": "position", "qd": "velocity", "tau": "torque", "u": "position"}
 
 @dataclass(frozen=True)
 class GravityFit:
-    """Gravity in the torque of one joint, after removal of friction and of the inertia torque of its own acceleration.
+    """Contribution of gravity to the torque of one joint.
 
-    explained: fraction (0 to 1) of the remaining variance that gravity explains, for the best inertial parameters;
-    None if gravity never loads the joint, if the torque is constant, or for too few samples. factor: least-squares
-    ratio of the torque to the URDF's gravity torque. correlation: of these two. relative_deviation: standard deviation
-    of the URDF's gravity torque, divided by the torque's.
+    Friction and the inertia torque of the joint's own acceleration are first removed from the torque and from the
+    gravity torque by least squares.
+
+    Attributes:
+        explained: fraction (0 to 1) of the torque's variance that gravity explains, for the best inertial parameters;
+            None if gravity never loads the joint, if the torque is constant, or if there are too few samples.
+        factor: least-squares ratio of the torque to the gravity torque of the URDF.
+        correlation: correlation of the torque with the gravity torque of the URDF.
+        relative_deviation: standard deviation of the URDF's gravity torque, divided by the standard deviation of the
+            torque, both before the removal.
     """
 
     explained: float | None = None
@@ -36,11 +42,13 @@ class GravityFit:
 
 @dataclass(frozen=True)
 class JointFollowing:
-    """Tracking of a joint's command; None if it is unknown.
+    """Tracking of the command u of one joint; quantities that are unknown are None.
 
-    lag: delay of positions after commands [s]. tracking_rms: root mean square of u, delayed by the lag, minus q [rad,
-    m]. steady_state_error: 90th percentile of |u - q| at rest [rad, m]. saturated: fraction of the time in which kp (u
-    - q) exceeds the effort limit.
+    Attributes:
+        lag: delay of positions after commands [s].
+        tracking_rms: root mean square of the difference between the command, delayed by the lag, and q [rad, m].
+        steady_state_error: 90th percentile of |u - q| at rest [rad, m].
+        saturated: fraction of time in which the servo's torque kp (u - q) exceeds the effort limit.
     """
 
     lag: float | None = None
@@ -51,13 +59,21 @@ class JointFollowing:
 
 @dataclass(frozen=True)
 class JointReport:
-    """Measurements of one joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None if unknown.
+    """Statistics of one joint over all trajectories, in SI units; unknown ones are None.
 
-    low, high, noise, steps: of q, qd and tau, or of q, qd and commands u. range_fraction: of the joint's range that was
-    visited. noise: standard deviation of white noise; None for sparse logs. steps: of signals
-    that are quantised in most trajectories. velocity_factor, velocity_correlation: of qd and dq/dt, both 1 if these
-    are equal.
-    following: of a joint under a position servo.
+    The dicts have the keys "q", "qd" and "tau" or, for logs of commands, "q", "qd" and "u".
+
+    Attributes:
+        name: name of the joint.
+        kind: joint type.
+        low, high: lowest and highest value of each signal.
+        range_fraction: visited range of q, divided by the range between the position limits.
+        noise: standard deviation of the white noise on each signal; None for sparse logs.
+        steps: quantisation step of each signal; None for signals that are not quantised in most trajectories.
+        velocity_factor: ratio of dq/dt to qd, by least squares.
+        velocity_correlation: correlation of dq/dt and qd.
+        gravity: contribution of gravity to the torque.
+        following: tracking of the command of a joint under a position servo.
     """
 
     name: str
@@ -73,15 +89,22 @@ class JointReport:
     following: JointFollowing | None = None
 
     def largest(self, quantity: str) -> float:
-        """Return the largest size of "q", "qd", "tau" or "u"."""
+        """Return the largest magnitude of the signal "q", "qd", "tau" or "u"."""
         return max(abs(self.low[quantity]), abs(self.high[quantity]))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LogReport:
-    """Findings of `check_logs`. errors: reasons why the logs cannot be trained on. examples: trajectories to be drawn.
+    """Report of `check_logs` on the logs of a robot.
 
-    tables: about the joints.
+    Attributes:
+        robot: name of the robot.
+        trajectories: sample times of each trajectory.
+        joints: statistics of each joint.
+        tables: tables of the joints, for display.
+        findings: remarks and warnings.
+        errors: reasons why the logs cannot be trained on.
+        examples: up to two trajectories that the page plots.
     """
 
     robot: str
@@ -94,7 +117,7 @@ class LogReport:
 
     @property
     def files(self) -> int:
-        """Number of files that the trajectories were read from."""
+        """Number of files from which the trajectories were read."""
         return len({clock.file for clock in self.trajectories} - {None})
 
     @property
@@ -113,7 +136,7 @@ class LogReport:
         return tuple(x for x in self.findings if x.severity == "warning")
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON form, versioned by `schema`."""
+        """Return the report in JSON form; `schema` is the version of the form."""
         return {
             "schema": 3,
             "robot": self.robot,
@@ -137,11 +160,11 @@ class LogReport:
         )
 
     def listings(self, limit: int | None = None) -> list[Listing]:
-        """Return all tables, with at most `limit` trajectories."""
+        """Return all tables; the table of sample times contains at most `limit` trajectories."""
         return [_clock_table(self.trajectories, limit), *self.tables]
 
     def _short_listings(self) -> list[Listing]:
-        # a data set of a thousand episodes would fill the terminal
+        # at most 20 trajectories: a data set of a thousand episodes would fill the terminal
         return self.listings(20)
 
     def text(self) -> str:
@@ -172,17 +195,20 @@ class LogReport:
 def joint_report(
     index: int, coordinate: Coordinate, measured: Sequence[Statistics], products: np.ndarray
 ) -> JointReport:
-    """Return the report of one joint over all trajectories. products: (2 n, 2 n), see `velocity_products`."""
+    """Return the report of the joint with this index, without gravity and tracking.
+
+    measured: statistics of all trajectories. products: (2n, 2n) sum of `velocity_products` over them.
+    """
     low, high, noise, steps = {}, {}, {}, {}
     for name in measured[0].signals:
         lows, highs, noises, quanta = np.array([x.signals[name][:, index] for x in measured]).T
         low[name], high[name] = float(lows.min()), float(highs.max())
-        # medians, so that one trajectory with contacts does not determine the noise
+        # medians over trajectories, so that one trajectory with contacts does not determine the noise
         noise[name], steps[name] = _median(noises, 0.0), _median(quanta, 0.5)
     factors, correlations = velocity_agreement(products)
     factor, correlation = factors[index], correlations[index, index]
     visited = None
-    # limits of a URDF may be equal or swapped
+    # the range is undefined for a URDF with equal or swapped limits
     if coordinate.limits is not None and coordinate.limits[0] < coordinate.limits[1]:
         visited = (high["q"] - low["q"]) / (coordinate.limits[1] - coordinate.limits[0])
     return JointReport(
@@ -205,7 +231,7 @@ def _median(values: np.ndarray, share: float) -> float | None:
 
 
 def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
-    """Return the table of durations, sample rates and gaps, with at most `limit` trajectories."""
+    """Return the table of durations, sample rates, jitter and gaps of at most `limit` trajectories."""
     head = ("trajectory", "samples", "duration", "sample rate", "jitter", "gaps", "longest")
     rows = []
     for clock in trajectories[:limit]:
@@ -219,7 +245,10 @@ def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
 
 
 def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> tuple[Listing, Listing]:
-    """Return the tables of ranges, and of noise and quantisation steps, of these quantities, q first."""
+    """Return two tables of the joints: ranges of these quantities, and their noise and quantisation steps.
+
+    The first quantity must be "q".
+    """
     ranges, signals = [], []
     for joint in joints:
         spans = [f"{number(joint.low[name])} .. {number(joint.high[name])}" for name in quantities]
@@ -244,5 +273,5 @@ def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> t
 
 
 def percent(fraction: float | None, digits: int = 0) -> str:
-    """Return a fraction in percent; a dash for None."""
+    """Return the text of a fraction in percent with this number of decimals; a dash for None."""
     return "-" if fraction is None else f"{fraction:.{digits}%}"

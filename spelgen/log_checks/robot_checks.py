@@ -1,4 +1,4 @@
-"""Check logs against the robot: limits of its joints, and the gravity of its URDF in each joint's torque."""
+"""Checks of logs against the robot's URDF: limits of the joints, and the gravity torque of the URDF."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -27,11 +27,13 @@ SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YA
 class RobotCheckTuning:
     """Thresholds of the checks of logs against the robot."""
 
-    # [rad, m] A position limit may be exceeded by the rounding of a logger.
+    # [rad, m] Tolerance of position limits, for positions that a logger has rounded.
     limit_rounding: float = 1e-3
-    # [1] Correlation from which on gravity is part of the torque; with a correlation below 1 - seen it is not.
+    # [1] The torque contains gravity if its correlation with the URDF's gravity torque is above this number, and does
+    # not if the magnitude of the correlation is below 1 minus this number. In between nothing is concluded.
     seen: float = 0.7
-    # [1] A column is dependent if the part that other columns do not span is below this fraction of its length.
+    # [1] A column of the regressor is linearly dependent on others if the norm of its residual after projection onto
+    # them is below this fraction of its norm.
     dependent: float = 1e-8
 
 
@@ -39,14 +41,14 @@ TUNING = RobotCheckTuning()
 
 
 def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
-    """Return the fit of the URDF's gravity to the torque of each joint."""
-    # for fewer samples gravity and friction are confounded
+    """Return the fit of the gravity torque of the URDF to the torque of each joint in samples of motion."""
+    # with fewer than 100 samples gravity and friction are confounded
     if len(motion.q) < 100:
         return [GravityFit()] * motion.q.shape[1]
     still, qd = np.zeros_like(motion.q), motion.qd
     rows = regressor(arm, motion.q, still, still)  # (S, n, 10 B)
     load = rows @ urdf_parameters(arm)
-    # friction and the joint's own inertia are correlated with gravity in a slow swing: they are removed
+    # friction and the joint's own inertia are removed, since in a slow swing they are correlated with gravity
     friction = np.stack([np.ones_like(qd), qd, np.tanh(qd / SAMPLES.moving), motion.qdd], axis=2)
     fits = []
     for joint in range(qd.shape[1]):
@@ -56,14 +58,18 @@ def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
 
 
 def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
-    """Return the fit of a torque. signals: (S, 2 + K), the torque, the URDF's gravity torque, and its K columns."""
+    """Return the fit of gravity to the torque of one joint.
+
+    signals: (S, 2 + K), the torque, the gravity torque of the URDF, and the K regressor columns of gravity. friction:
+    (S, F) columns of friction and inertia, which are removed from the signals by projection.
+    """
     remainders = _without(friction, signals)
     lengths = np.linalg.norm(remainders, axis=0)
-    # the residual of a constant torque consists of rounding errors
+    # signals that consist of rounding errors after the projection, e.g. a constant torque
     is_rounding = lengths <= TUNING.dependent * np.linalg.norm(signals, axis=0)
     largest = max(1.0, float(np.abs(signals[:, 2:]).max(initial=0.0)))
     is_seen = lengths[2:] > TUNING.dependent * largest * np.sqrt(len(signals))
-    # gravity does not act about a vertical axis; a motor that is off has no torque
+    # gravity cannot be fitted to a constant torque, as of a motor that is off, and does not load a vertical axis
     if is_rounding[0] or not is_seen.any():
         return GravityFit()
     torque, load = remainders[:, 0], remainders[:, 1]
@@ -78,36 +84,39 @@ def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
 
 
 def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the residual of the values (S,) or (S, K) after projection onto the columns (S, C)."""
+    """Return the residual of values (S,) or (S, K) after projection onto the span of the columns (S, C)."""
     basis = orth(columns, rcond=TUNING.dependent)
     return np.asarray(values - basis @ (basis.T @ values))
 
 
 class JointEvidence(NamedTuple):
-    """A joint and its report over all trajectories: the subject of the checks against the robot."""
+    """Joint of the URDF and its report over all trajectories, which the checks against the robot compare."""
 
     coordinate: Coordinate
     report: JointReport
 
     def limits(self) -> tuple[float, float]:
-        """Return the lower and the upper position limit, infinite without a limit."""
+        """Return the lower and the upper position limit [rad, m]; infinite for a joint without this limit."""
         lower, upper = self.coordinate.lower, self.coordinate.upper
         if self.coordinate.continuous:
             lower = upper = None
         return -inf if lower is None else lower, inf if upper is None else upper
 
     def gravity_in_torque(self) -> tuple[float, float]:
-        """Return factor and correlation of the URDF's gravity in the torque; NaN if gravity is too small."""
+        """Return the ratio of the torque to the URDF's gravity torque, and their correlation.
+
+        Both are NaN for a joint whose gravity torque is too small.
+        """
         fit = self.report.gravity
-        # The factor of a joint that gravity hardly loads is undetermined: on the UR10e gravity is visible in the torque
-        # from a fifth of its standard deviation on.
+        # The ratio is undetermined if gravity is small. In logs of a UR10e, gravity is visible if its standard
+        # deviation is at least a fifth of the torque's.
         if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < 0.2:
             return nan, nan  # every comparison with NaN is false
         return fit.factor, fit.correlation
 
 
 def find_beyond_limits(joint: JointEvidence) -> str | None:
-    """Find positions, measured or commanded, beyond the limits."""
+    """Find measured or commanded positions beyond the position limits of the joint."""
     findings = []
     (lower, upper), unit = joint.limits(), UNITS[joint.coordinate.joint_type].position
     for name in ("q", "u"):
@@ -120,27 +129,28 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
 
 
 def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
-    """Find a quantity above the joint's limit, "velocity" or "effort"."""
+    """Find values of a signal, "qd" or "tau", whose magnitude exceeds the joint's limit, "velocity" or "effort"."""
     limits = {"velocity": joint.coordinate.velocity, "effort": joint.coordinate.effort}
     bound, unit = limits[limit], asdict(UNITS[joint.coordinate.joint_type])[MEASURES[quantity]]
     largest = joint.report.largest(quantity)
-    # noise exceeds a limit by up to 1 %
+    # a tolerance of 1 % for noise at the limit
     if not bound or largest <= bound * 1.01:
         return None
     return f"{limit} up to {largest:.4g} {unit}, the limit is {bound:.4g}"
 
 
 def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) -> list[np.ndarray]:
-    """Return candidates of factors (n,) on the torques for another unit, from the magnitude of the URDF's gravity.
+    """Return candidates for factors (n,) that convert torques in a wrong unit, from the magnitude of gravity.
 
-    One for each joint whose torques are too large or too small by a factor that wrong inertials do not explain, and one
-    for all joints together. undeclared: joints whose unit no mapping states.
+    There is one candidate for each joint whose torques differ from the URDF's gravity by more than a factor of five,
+    which wrong inertials do not explain, and one with the same factor for all joints. undeclared: (n,) True for joints
+    whose torque has no unit in the mapping.
     """
     seen: list[float] = []
     factors = []
     for k, joint in enumerate(joints):
         factor, correlation = joint.report.gravity.factor, joint.report.gravity.correlation or 0.0
-        # the factor of a joint that gravity hardly loads is undetermined, unless its torque consists of gravity only
+        # for a joint with little gravity the ratio is known only if the torque is nearly proportional to gravity
         is_known = joint.gravity_in_torque()[1] > TUNING.seen or correlation > SIGNALS.agreement
         if factor is None or not (is_known and undeclared[k]):
             continue
@@ -155,27 +165,30 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
 
 
 def _rounded(factor: float) -> float:
-    """Return 0.001 for mNm, or one significant digit if it changes the factor by less than a tenth, else two."""
+    """Return a rounded factor: 0.001, from mNm to Nm, if it is close; else with one significant digit, or with two.
+
+    One digit is enough if it changes the factor by less than 10 %.
+    """
     if 1 / 1.5 < factor / 1e-3 < 1.5:
-        return 1e-3  # the factor is only as exact as the masses of the URDF
+        return 1e-3  # a tolerance of 50 %, since the factor is only as exact as the masses of the URDF
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * factor else float(f"{factor:.2g}")
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
     """Find torques that exceed the joint's effort limit by a factor that no drive and no unit explains."""
-    # in URDFs of unknown drives the effort is 0
+    # an effort of 0 in a URDF means that the limit is unknown
     limit, largest = joint.coordinate.effort or 0.0, joint.report.largest("tau")
-    # torques in mNm are 1000 times as large, currents at most some times; no drive gives 20 times its limit
+    # 20 times: torques in mNm are 1000 times as large as in Nm, and no drive exceeds its limit by such a factor
     if not 0 < 20.0 * limit < largest:
         return None
     return f"up to {largest:.4g}, {largest / limit:.3g} times what the drive can give"
 
 
 def find_coarse(joint: JointEvidence) -> str | None:
-    """Find signals whose quantisation step is a large fraction of their range."""
+    """Find signals whose quantisation step is a large fraction of the range of the signal."""
     for name in QUANTITIES:
-        # relative to the range: a step of 0.01 Nm is negligible at a shoulder, and may be the whole torque of a wrist
+        # compared with the range: a step of 0.01 Nm is negligible for a shoulder but may be the whole torque of a wrist
         step, width = joint.report.steps[name], joint.report.high[name] - joint.report.low[name]
         if step is not None and has_few_levels(step, width):
             return (
@@ -186,7 +199,7 @@ def find_coarse(joint: JointEvidence) -> str | None:
 
 
 def find_stop(joint: JointEvidence) -> str | None:
-    """Find joints that reach a position limit, at which a stop adds torques to the drive's."""
+    """Find joints that reach a position limit, at which a mechanical stop adds a contact torque."""
     for limit, extreme in zip(joint.limits(), (joint.report.low["q"], joint.report.high["q"]), strict=True):
         if abs(extreme - limit) <= TUNING.limit_rounding:
             return f"q reaches its limit {limit:.4g}: contact with the stop changes the torque; remove such motion"
@@ -196,7 +209,8 @@ def find_stop(joint: JointEvidence) -> str | None:
 def find_one_way(joint: JointEvidence) -> str | None:
     """Find joints that move in one direction only: dry friction is then confounded with the load of the joint."""
     slower, faster = sorted((-joint.report.low["qd"], joint.report.high["qd"]))
-    # A tenth of the speed is noise; a velocity that is not dq/dt does not determine the direction of motion.
+    # Velocities of the rarer sign may be noise if they are below a tenth of the others. A velocity that is not dq/dt
+    # does not show the direction of motion.
     if slower >= 0.1 * faster or not (joint.report.velocity_correlation or 0.0) > TUNING.seen:
         return None
     unit = UNITS[joint.coordinate.joint_type].velocity
@@ -207,7 +221,7 @@ def find_one_way(joint: JointEvidence) -> str | None:
 
 
 def find_no_gravity(joint: JointEvidence) -> str | None:
-    """Find torques that do not contain gravity."""
+    """Find torques that are not correlated with the gravity torque of the URDF."""
     correlation = joint.gravity_in_torque()[1]
     if not abs(correlation) < 1 - TUNING.seen:  # NaN included
         return None
@@ -217,7 +231,7 @@ def find_no_gravity(joint: JointEvidence) -> str | None:
     )
 
 
-# checks that need no torques, also for arms under position servos
+# checks that need no torques, and therefore also apply to arms under position servos
 POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
 CHECKS: list[Check[JointEvidence]] = [
     Check("torque-beyond-drive", "error", find_beyond_drive, expected="Nm or N at the joint", do=SAY_UNIT),

@@ -1,4 +1,4 @@
-"""Statistics of one trajectory: its clock, the ranges and the noise of its signals."""
+"""Statistics of one trajectory: sample times, and the ranges, noise and quantisation steps of the signals."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,8 +14,15 @@ from spelgen.logs.tuning import is_dense
 class Clock:
     """Sample times of one trajectory.
 
-    duration, longest_gap: [s], the latter 0 without gaps. sample_rate: [Hz], outside gaps. jitter: standard
-    deviation of the steps outside gaps, relative to their mean.
+    Attributes:
+        name: name of the trajectory.
+        file: path of the log; None if the trajectory was not read from a file.
+        samples: number of samples.
+        duration: time from the first to the last sample [s].
+        sample_rate: sample rate outside gaps [Hz].
+        jitter: standard deviation of the time steps outside gaps, divided by their mean.
+        gaps: number of gaps.
+        longest_gap: duration of the longest gap [s]; 0 if there is none.
     """
 
     name: str
@@ -29,10 +36,11 @@ class Clock:
 
 
 class Statistics(NamedTuple):
-    """One trajectory of n joints.
+    """Statistics of one trajectory of n joints.
 
-    signals: per quantity (see `Trajectory`) an array (4, n): lowest value, highest value, standard deviation of white
-    noise (NaN for sparse logs), and quantisation step (NaN for signals that are not quantised).
+    clock: sample times. signals: for each of "q", "qd" and "tau" or "u" an array (4, n) with the lowest value, the
+    highest value, the standard deviation of white noise (NaN for sparse logs), and the quantisation step (NaN for
+    signals that are not quantised).
     """
 
     clock: Clock
@@ -41,7 +49,7 @@ class Statistics(NamedTuple):
 
 def statistics(trajectory: Trajectory) -> Statistics:
     """Return the statistics of one trajectory."""
-    # third differences of sparse samples contain the motion
+    # at low sample rates the third differences, from which the noise is estimated, also contain the motion
     dense = is_dense(trajectory.sample_rate) and len(trajectory) > 8
     signals = {}
     for name in trajectory.quantities:
@@ -65,39 +73,42 @@ def statistics(trajectory: Trajectory) -> Statistics:
 
 
 def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the standard deviation (n,) of white noise on smooth signals (T, n) at jittered times (T,).
+    """Return the standard deviation (n,) of the white noise on smooth signals `values` (T, n) at times t (T,) [s].
 
-    It is computed from third divided differences, which are small for smooth motion, scaled to the standard deviation
-    of white noise. The median of their magnitudes is robust against outliers.
+    The noise is computed from third divided differences, which are small for smooth motion and valid for uneven time
+    steps. They are normalised, so that white noise has the same standard deviation in them as in the signal. The median
+    of their magnitudes is robust against outliers.
     """
     times = sliding_window_view(t, 4)  # (T - 3, 4)
     distances = times[:, :, None] - times[:, None, :] + np.eye(4)
     weights = 1.0 / distances.prod(axis=2)
     weights /= np.linalg.norm(weights, axis=1, keepdims=True)
     differences = np.einsum("tk,tnk->tn", weights, sliding_window_view(values, 4, axis=0))
-    # the median of |x| is 0.6745 standard deviations of a normal x
+    # the median of |x| is 0.6745 standard deviations for a normally distributed x
     return np.asarray(np.median(np.abs(differences), axis=0) / 0.6745)
 
 
 def quantisation_step(values: np.ndarray) -> float:
-    """Return the step of a quantised signal (T,); NaN if the signal is not quantised, or constant."""
+    """Return the quantisation step of a signal (T,); NaN if the signal is constant or not quantised."""
     differences = np.diff(np.unique(values))
-    tolerance = 0.05  # of a step, and of the levels, that may be off the grid
+    # a level is on the grid if it deviates by less than 5 % of a step; 5 % of the levels may be off the grid
+    tolerance = 0.05
     # two or three levels do not determine a grid
     if len(differences) < 3:
         return float("nan")
     smallest = np.quantile(differences, tolerance)
     step = float(np.median(differences[differences <= 1.5 * smallest]))
-    # over a hundred levels the error of the step accumulates to a fraction of a step
+    # larger differences are ignored: over a hundred levels the error of the step accumulates to a fraction of a step
     near = differences[differences < 100 * step] / step
     is_whole = np.abs(near - np.round(near)) < tolerance
     is_grid = len(near) > 2 and is_whole.mean() > 1 - tolerance
-    # a smooth quantised signal passes neighbouring levels one after the other; commands with round values jump
+    # A quantised measurement changes from one level to a neighbouring one. Commands with few rounded values, which jump
+    # over several levels, are not quantised in this sense.
     changes = np.abs(np.diff(values))
     is_command = has_few_levels(step, float(np.ptp(values))) and changes[changes > 0].mean() > 1.5 * step
     return step if is_grid and not is_command else float("nan")
 
 
 def has_few_levels(step: float, width: float) -> bool:
-    """Whether a signal that is quantised to steps has too few of them in its range for a reliable magnitude."""
+    """Return True if the range `width` of a quantised signal has fewer than ten steps, too few for a reliable value."""
     return width < 10.0 * step

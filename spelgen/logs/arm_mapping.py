@@ -1,4 +1,4 @@
-"""The joints of logs and the mapping of their columns, from an arm, a model, or names of joints."""
+"""Joints of logs and mapping of the logs' columns, determined from an arm, a model, or a list of joint names."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +15,10 @@ GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
 
 @runtime_checkable
 class JointNames(Protocol):
-    """Object with the joints of logs: an arm or a module. joint_types: "revolute" or "prismatic"."""
+    """Object that has the names and types of a log's joints: an arm or a trained model.
+
+    joint_types: "revolute" or "prismatic" for each joint.
+    """
 
     @property
     def joint_names(self) -> Sequence[str]: ...
@@ -25,7 +28,10 @@ class JointNames(Protocol):
 
 @runtime_checkable
 class DescribedArm(Protocol):
-    """Loaded arm with the settings of its logs. turning_joints: names of revolute joints without position limits."""
+    """Loaded arm with settings that describe the arm's logs.
+
+    turning_joints: names of revolute joints without position limits.
+    """
 
     @property
     def chain(self) -> JointNames: ...
@@ -39,7 +45,7 @@ class DescribedArm(Protocol):
 
 @runtime_checkable
 class DrivenModel(Protocol):
-    """Model with the quantity of its inputs: "torque" or "position"."""
+    """Model that states which input drives its joints: "torque" or "position"."""
 
     @property
     def input_quantity(self) -> str: ...
@@ -49,7 +55,10 @@ LoggedArm = DescribedArm | JointNames | Sequence[str]
 
 
 class LogSource(NamedTuple):
-    """Joints of logs and their mapping. joint_types: "revolute" or "prismatic", None if unknown."""
+    """Joints of logs, and the mapping of the logs' columns.
+
+    joint_types: "revolute" or "prismatic" for each joint; None if the types are unknown.
+    """
 
     joints: tuple[str, ...]
     joint_types: tuple[str, ...] | None
@@ -57,16 +66,16 @@ class LogSource(NamedTuple):
 
 
 def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
-    """Return the joints and the mapping of an argument of `read_logs`.
+    """Return the joints and the mapping of columns for the arguments `arm` and `mapping` of `read_logs`.
 
-    Raises LogError for other arguments, SettingsError for a wrong mapping.
+    Raises LogError if `arm` has a wrong type, SettingsError for a wrong mapping.
     """
     if isinstance(arm, DescribedArm):
         stated = arm.settings.logs
         log_mapping = stated if mapping is None else _mapping(mapping, list(arm.robot.joint), stated)
         if arm.settings.input == "position":
             log_mapping = log_mapping.model_copy(update={"input": "position"})
-        # an angle without limits may be logged in any interval of one turn
+        # joints without limits may be logged as angles within one turn: their wraps are removed
         log_mapping = log_mapping.with_turns(arm.turning_joints)
         return LogSource(tuple(arm.chain.joint_names), tuple(arm.chain.joint_types), log_mapping)
     if isinstance(arm, JointNames):
@@ -82,8 +91,8 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
 
 
 def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
-    """Return a mapping as an object; keys that a file or a dict does not have are from the settings, `stated`."""
-    # a complete mapping replaces the one of the settings; keys of a file or a dict complete it
+    """Return a mapping as a LogMapping; keys that a file or a dict does not have are from the settings, `stated`."""
+    # a LogMapping is complete and replaces the mapping of the settings; a file or a dict overrides single keys
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):
@@ -98,7 +107,7 @@ def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | 
 
 
 def _merged(stated: object, override: object) -> object:
-    """Return the union of two groups of keys, recursively; a key of both has the value of the second."""
+    """Return the union of two nested groups of keys; a key in both groups has the value of `override`."""
     if isinstance(stated, Mapping) and isinstance(override, Mapping):
         return {**stated, **{key: _merged(stated.get(key), value) for key, value in override.items()}}
     return override

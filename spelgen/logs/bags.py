@@ -1,7 +1,8 @@
-"""Read bags of ROS 2 (MCAP, sqlite3) and ROS 1 by the package `rosbags`: no ROS is needed.
+"""Reader of bags of ROS 2 (MCAP, sqlite3) and ROS 1 with the package `rosbags`; a ROS installation is not needed.
 
-MCAP files without an end are read here: a recorder that was killed writes no summary and no index. Their records follow
-one another: an operation code (1 byte), a length (8 bytes) and a body. https://mcap.dev/spec
+A recorder that was killed writes an MCAP file without the summary and index at the end, which `rosbags` cannot read.
+This module reads the records of such a file itself. A record is an operation code (1 byte), a length (8 bytes) and a
+body. https://mcap.dev/spec
 """
 
 import struct
@@ -23,28 +24,28 @@ from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
 MESSAGE = "sensor_msgs/msg/JointState"
-MEMORY = 2**29  # bytes in addition to the messages of a bag
+MEMORY = 2**29  # [B] memory that the reader may use in addition to a multiple of the bag's size
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
-MAGIC = b"\x89MCAP0\r\n"  # at both ends of a complete MCAP file
+MAGIC = b"\x89MCAP0\r\n"  # bytes at the beginning and at the end of a complete MCAP file
 SCHEMA, CHANNEL, MESSAGE_RECORD, CHUNK = 3, 4, 5, 6  # operation codes of MCAP
 
 StampedState = tuple[int, int, Any]
-"""Times [ns] of a joint state: of its header, 0 if it has none, and of the recorder; and the joint state."""
+"""Time stamp [ns] in a joint state's header (0 if not set), time [ns] of the recorder, and the joint state."""
 TimedState = tuple[int, Any]
 """Time [ns] of a joint state, and the joint state."""
 
 
 def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the joint states of a bag, or of a file of its storage, as one table.
+    """Return the joint states of a bag, or of a single file of a bag, as one table.
 
-    t [s] counts from the first message: by the header's stamps, or by the recorder's clock if no message has a stamp.
-    Messages without any of the joints belong to another device and are omitted. Raises LogError, also if `rosbags` is
-    not installed.
+    Times t [s] are relative to the first message. They are the stamps of the headers, or the times of the recorder if
+    no message has a stamp. Messages without any of the joints belong to another device and are omitted. Raises
+    LogError for a bag that cannot be read, and if `rosbags` is not installed.
     """
     remarks: list[str] = []
     messages = _stamped(list(_messages(path, mapping.topic, remarks)), remarks)
     table = _joint_states(path, messages, list(map(mapping.log_name, joints)))
-    # fields of messages are in SI units by definition: columns and units of the mapping do not apply
+    # ROS defines the fields of a joint state in SI units, so columns and units of the mapping do not apply
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
     layout = table_layout(table.schema, joints, mapping, path)
@@ -52,7 +53,10 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[TimedState]:
-    """Return times [ns] of one clock, and the states; the clocks of header and recorder may differ by hours."""
+    """Return the joint states with times [ns] of a single clock: the header's, or the recorder's without stamps.
+
+    Both clocks are never mixed, since they may differ by hours.
+    """
     # a stamp of 0 means that the publisher has set none
     stamped = [(stamp, state) for stamp, _, state in messages if stamp]
     if messages and not stamped:
@@ -64,7 +68,10 @@ def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[Timed
 
 
 def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[str]) -> pa.Table:
-    """Return the columns `t`, `q_<name>`, `qd_<name>`, `tau_<name>`; fields that are always empty are omitted."""
+    """Return a table with the columns `t`, `q_<name>`, `qd_<name>` and `tau_<name>` of the joints `names`.
+
+    Fields that are empty in all messages are omitted.
+    """
     times: list[int] = []
     rows: list[list[np.ndarray]] = []
     other_names: dict[str, None] = {}
@@ -87,7 +94,7 @@ def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[st
             if len(logged) not in (0, len(state.name)):
                 got = f"{len(logged)} values for {len(state.name)} joints"
                 raise LogError(got, file=path, element=f"{element}, {field}", expected="one of each")
-            # a field of a message may be empty
+            # ROS allows empty fields in a joint state, such as a missing effort
             row.append(logged[indices] if len(logged) else np.full(len(names), np.nan))
         times.append(stamp)
         rows.append(row)
@@ -103,7 +110,11 @@ def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[st
 
 
 def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
-    """Return the advice to map the names of joints; logged names with one prefix are written out."""
+    """Return the advice to map joint names to names in the log.
+
+    names: names of the joints that were not found. logged: joint names in the log. If exactly one logged name ends with
+    each joint's name, as with a prefix, the advice contains the settings.
+    """
     found = {name: [x for x in logged if x.endswith(name)] for name in names}
     if any(len(each) != 1 for each in found.values()):
         return "map the joints' names under 'logs'"
@@ -111,9 +122,9 @@ def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:
-    """Yield the joint states of one topic.
+    """Yield the joint states of one topic, with both time stamps.
 
-    Messages are decoded only by the published definition of the standard type; definitions in the bag are ignored.
+    Messages are decoded with the published definition of `JointState`; message definitions in the bag are ignored.
     """
     try:
         from rosbags.rosbag1 import Reader as Ros1Reader
@@ -125,14 +136,15 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     size = path.stat().st_size
     for file in path.rglob("*"):
         if not file.is_dir():
-            # rosbags opens all files of the folder
+            # a pipe in the folder would block, since rosbags opens all files of the folder
             require_regular_file(file, LogError, "files in the folder of a ROS 2 bag")
             size += file.stat().st_size
     is_ros1 = path.suffix == ROS1
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     try:
-        # rosbags unpacks a whole chunk of any size; messages as arrays take ten times their bytes
+        # A damaged bag could exhaust the memory, since rosbags unpacks chunks of any size. The bound of 20 times the
+        # file size is ample: messages as arrays take ten times their bytes.
         with limited_memory(MEMORY + 20 * size):
             messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, topic, path)
             unfinished = [] if is_ros1 else _unfinished(path)
@@ -151,7 +163,7 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
 
 
 def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> Iterator[tuple[int, bytes]]:
-    """Yield times [ns] and contents of the joint states of one topic."""
+    """Yield the recorder's times [ns] and the encoded joint states of one topic, read with `rosbags`."""
     with open_bag(path) as reader:
         topics = {f"{x.topic} ({x.msgtype})" for x in reader.connections}
         connections = [x for x in reader.connections if x.msgtype == MESSAGE]
@@ -161,7 +173,7 @@ def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> 
 
 
 def _unfinished(path: Path) -> list[Path]:
-    """Return the MCAP files of a bag if one of them is incomplete, else none."""
+    """Return all MCAP files of a bag if one of them lacks its end; return [] if all are complete."""
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     for file in files:
         with file.open("rb") as source:
@@ -175,7 +187,7 @@ def _unfinished(path: Path) -> list[Path]:
 def _without_end(
     files: Sequence[Path], topic: str | None, path: Path, remarks: list[str]
 ) -> Iterator[tuple[int, bytes]]:
-    """Yield times [ns] and contents of the joint states of one topic, in files of which one is incomplete."""
+    """Yield the recorder's times [ns] and the encoded joint states of one topic, from MCAP files without an end."""
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
         got = "a recording that was not closed, without a complete message of joint states"
@@ -186,7 +198,11 @@ def _without_end(
 
 
 def _chosen_topic(topics: set[str], present: set[str], topic: str | None, path: Path) -> str:
-    """Return the requested topic of joint states, or the only one."""
+    """Return the topic to read: `topic`, or the only one of `topics` if `topic` is None.
+
+    topics: all topics with joint states. present: topics of all types, for the error. Raises LogError for a topic that
+    is not among `topics`, and for several topics if none was requested.
+    """
     if topic in topics:
         return topic
     if topic is None and len(topics) == 1:
@@ -202,7 +218,7 @@ def _chosen_topic(topics: set[str], present: set[str], topic: str | None, path: 
 
 
 def mcap_messages(path: Path, message_type: str) -> Iterator[tuple[str, int, bytes]]:
-    """Yield topic, time of the recorder [ns] and content of the messages of a type, up to the last complete one."""
+    """Yield topic, recorder's time [ns] and encoded content of all complete messages of a type in an MCAP file."""
     types: dict[int, str] = {}
     topics: dict[int, str] = {}
     for code, body in _records(path.read_bytes()[len(MAGIC) :]):
@@ -219,13 +235,13 @@ def mcap_messages(path: Path, message_type: str) -> Iterator[tuple[str, int, byt
 
 
 def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield code and body of the records, also of those within chunks, until one is cut off."""
+    """Yield operation code and body of all complete records, including the records within chunks."""
     start = 0
     while start + 9 <= len(data):
         code, length = struct.unpack_from("<BQ", data, start)
         body = data[start + 9 : start + 9 + length]
         start += 9 + length
-        # a chunk that is cut off still has complete records before the cut
+        # the last chunk of an interrupted recording is incomplete, but begins with complete records
         if code == CHUNK:
             yield from _records(_unpacked(body))
         elif len(body) == length:
@@ -233,7 +249,7 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _unpacked(chunk: bytes) -> bytes:
-    """Return the records of a chunk, or the complete records of a chunk that is cut off."""
+    """Return the decompressed records of a chunk; of an incomplete chunk, the part that can be decompressed."""
     if len(chunk) < 40:
         return b""
     (size,) = struct.unpack_from("<Q", chunk, 16)
@@ -251,7 +267,7 @@ def _unpacked(chunk: bytes) -> bytes:
 
 
 def _text(data: bytes, start: int) -> str:
-    """Return the text at an offset in the data; it is preceded by its length."""
+    """Return the text at the offset `start`; MCAP stores a text as its length (4 bytes) and its characters."""
     (length,) = struct.unpack_from("<I", data, start)
     return data[start + 4 : start + 4 + length].decode()
 

@@ -1,7 +1,8 @@
-"""Checks of logs that need no robot: frozen columns, inconsistent velocities, degrees, gaps. Nothing is repaired.
+"""Checks of logs that need no robot: frozen columns, wrong velocities, degrees, gaps. The logs are not changed.
 
-A check is a code, a severity and a function of a subject, registered in CHECKS. Each trajectory is checked
-individually, so that only one need be in memory. Package `log_checks` has the checks that need the robot.
+A check consists of a code, a severity and a function of the checked object, and is registered in CHECKS. Trajectories
+are checked one at a time, so that only one of them need be in memory. The checks that need the robot are in the package
+`log_checks`.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -47,9 +48,14 @@ Subject = TypeVar("Subject")
 class Check(Generic[Subject]):
     """Check for one fault of logs.
 
-    find: function that returns the message for a subject; None without a finding. severity: logs with an error cannot
-    be trained on. unless: codes of earlier checks whose findings explain this one. everywhere: whether a finding must
-    occur in all trajectories. expected, do: of an error.
+    Attributes:
+        code: name of the check in reports, and in `--accept`.
+        severity: logs with a finding of severity "error" cannot be trained on.
+        find: function that returns the message about a checked object, or None if the object has no fault.
+        unless: codes of earlier checks whose findings explain this one; the check is then omitted.
+        everywhere: whether only a fault that occurs in all trajectories is reported.
+        expected: expected content of the log, for the error message.
+        do: advice how to correct the fault, for the error message.
     """
 
     code: str
@@ -61,13 +67,13 @@ class Check(Generic[Subject]):
     do: str | None = None
 
 
-# findings of checks of different subjects are kept together
+# type of the keys of `LogChecks`, which collects findings about trajectories and about joints in one dict
 AnyCheck = Check[Any]
 
 
 @dataclass(frozen=True)
 class Findings:
-    """Results of checks: notes, and errors, which prevent training."""
+    """Findings of checks: errors, which prevent training, and notes, which do not."""
 
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
@@ -80,7 +86,10 @@ class Findings:
         file: Path | None = None,
         keys: Mapping[str, object] | None = None,
     ) -> None:
-        """Add the message of a check. With keys of the group `logs` that remedy it, a finding is an error."""
+        """Add the message of a check, as an error or as a note according to the check's severity.
+
+        keys: settings of the group `logs` that correct the fault. A finding with such keys is always an error.
+        """
         if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
             return
@@ -91,7 +100,7 @@ class Findings:
 def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
 ) -> list[tuple[Check[Subject], Advice]]:
-    """Return the checks with a finding, and their findings. accepted: codes of checks that are omitted."""
+    """Return the checks that find a fault of `subject`, with their findings. accepted: codes of checks to omit."""
     results: dict[str, tuple[Check[Subject], Advice]] = {}
     for check in checks:
         # one message per cause: velocities in degrees would also fail the check of derivatives
@@ -106,14 +115,14 @@ def run_checks(
 def find_no_torques(signals: JointSignals) -> str | None:
     """Find recordings in which the torques of all joints are always 0."""
     trajectory = signals.trajectory
-    # reported once, and not for each joint
+    # reported for the first joint only, since the finding concerns all joints
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"
 
 
 def find_constant_torque(signals: JointSignals) -> str | None:
-    """Find torques that never change; logs of commands have none."""
+    """Find torques of a joint that never change; logs of position commands have no torques and are skipped."""
     tau = signals.trajectory.tau
     if not tau.size or np.ptp(tau[:, signals.number]) > 0:
         return None
@@ -121,14 +130,14 @@ def find_constant_torque(signals: JointSignals) -> str | None:
 
 
 def find_rest(signals: JointSignals) -> str | None:
-    """Find joints that do not move."""
+    """Find a joint whose position never changes in a trajectory."""
     if np.ptp(signals.q) > 0:
         return None
     return "does not move: the logs do not excite its dynamics"
 
 
 def find_gaps(trajectory: Trajectory) -> str | None:
-    """Find gaps in the sample times."""
+    """Find gaps in the sample times: time steps that are much longer than the median step."""
     gaps = len(gap_ends(trajectory.t)) - 2
     if not gaps:
         return None
@@ -136,7 +145,7 @@ def find_gaps(trajectory: Trajectory) -> str | None:
 
 
 def find_low_rate(trajectory: Trajectory) -> str | None:
-    """Find a sample rate that is too low for accelerations, which arms under position servos do not need."""
+    """Find a sample rate that is too low to compute accelerations; arms under position servos need none."""
     rate = trajectory.sample_rate
     if trajectory.u is not None or rate == 0 or is_dense(rate):
         return None
@@ -150,7 +159,8 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
 
 
 CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
-# reported when a log is read, one message per repair
+# These two checks find nothing themselves: their findings are the messages of the reader about changed rows (REPAIRED)
+# and about properties of the file (REMARKED).
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
@@ -201,9 +211,11 @@ CHECKS: list[Check[JointSignals]] = [
 
 
 class LogChecks:
-    """Checks of logs that need no robot. Trajectories are added one at a time: only one has to be in memory.
+    """Collector of the findings of all checks that need no robot, over the trajectories of n joints.
 
-    products: (2n, 2n), sum of `velocity_products` over all trajectories.
+    Trajectories are added one at a time, so that only one of them has to be in memory.
+
+    products: (2n, 2n) sum of `velocity_products` over all trajectories.
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
@@ -213,7 +225,7 @@ class LogChecks:
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
-        """Add a trajectory."""
+        """Check a trajectory, and add its findings."""
         self._count += 1
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
         findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
@@ -234,11 +246,15 @@ class LogChecks:
         self._results.setdefault((group, check), []).append(occurrence)
 
     def findings(self) -> Findings:
-        """Return the findings: one error per check, with all its joints; one note per check and joint or message."""
+        """Return the findings, summarised over trajectories.
+
+        An error names all joints with the same fault. There is a separate note for each joint, and for each message
+        about whole trajectories.
+        """
         summary = Findings()
         groups: dict[tuple[AnyCheck, str], list[str]] = {}
         for (group, check), occurrences in self._results.items():
-            # joints at rest are a finding only if they never move
+            # e.g. a joint at rest in one trajectory is no fault if it moves in another one
             if not check.everywhere or len(occurrences) == self._count:
                 is_error = check.severity == "error" or occurrences[0][0].is_line
                 groups.setdefault((check, "" if is_error else group), []).append(group)
@@ -256,7 +272,10 @@ class LogChecks:
         return summary
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
-        """Return the keys of joints in the group `logs`; joints that rest or move little have the units of most."""
+        """Return settings of the group `logs` that correct a fault. entries: keys per faulty joint.
+
+        If most joints of a type need another unit, joints of this type whose motion does not show a unit get it, too.
+        """
         first, *_ = entries
         units, kinds = entries[first].get("units", {}), dict(zip(self._joints, self._kinds, strict=True))
         ratio = SCALES.get(units.get("qd"), 1.0) / SCALES.get(units.get("q"), 1.0)
@@ -272,10 +291,10 @@ class LogChecks:
 def check(
     trajectories: Iterable[Trajectory], joints: Sequence[str], joint_types: Sequence[str]
 ) -> list[Diagnostic]:
-    """Return the findings of the checks of logs; nothing is repaired.
+    """Return the notes of the checks of logs that need no robot; the logs are not changed.
 
-    Raises LogError if revolute joints were probably recorded in degrees, unless units are declared, and if a position
-    or a velocity is constant while the other one changes.
+    Raises LogError with all findings of severity "error", e.g. positions in degrees without a declared unit, or a
+    velocity that is constant while the position changes.
     """
     checks = LogChecks(joints, joint_types)
     for trajectory in trajectories:

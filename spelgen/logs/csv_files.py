@@ -17,11 +17,20 @@ from spelgen.logs.tables import LogFormat, LogTable, table_layout
 from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
-STAMP = ("sec", "nanosec", "frame_id")  # columns of the header of a message
+# first columns that `ros2 topic echo --csv` writes: the header of the message
+STAMP = ("sec", "nanosec", "frame_id")
 
 
 class Beginning(NamedTuple):
-    """Lines before the header, the header, the lines after it without values (of units, or the header again), rows."""
+    """Beginning of a CSV file, divided into comments, header, other lines and rows of values.
+
+    Attributes:
+        encoding: text encoding of the file.
+        comments: number of comment lines before the header.
+        header: the header line.
+        others: number of lines between the header and the values, such as a line of units.
+        rows: the first rows of values.
+    """
 
     encoding: str
     comments: int
@@ -31,7 +40,7 @@ class Beginning(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the one table of a file; a last line that is cut off is omitted, with a remark."""
+    """Return a list with the only table of a CSV file; an incomplete last line is omitted, with a remark."""
     table, header, cut = _csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
     return [
@@ -40,15 +49,15 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def csv_columns(file: Path) -> pa.Table:
-    """Return the table of a file, see `_csv_table`."""
+    """Return all columns of a CSV file as logged."""
     return _csv_table(file)[0]
 
 
 def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
-    """Return a table of commas, semicolons or tabs, the number of lines before its values, and a cut last line.
+    """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
 
-    Numbers may have decimal commas, text may be UTF-8, UTF-16 or Latin-1. Joint states written by `ros2 topic echo
-    --csv` have no header.
+    Columns may be separated by commas, semicolons or tabs; numbers may have decimal commas; the encoding may be UTF-8,
+    UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
     """
     text = _beginning(file)
     delimiter = max(",;\t", key=text.header.count)
@@ -62,7 +71,7 @@ def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
         wrong.append(row)
         return "skip" if len(wrong) == 1 else "error"
 
-    # one thread, and the system's allocator: memory is bounded and returned, and 17 MB take 0.02 s more
+    # one thread and the system's allocator bound the memory and return it; the cost is 0.02 s for 17 MB
     rows = {"skip_rows": text.comments, "skip_rows_after_names": text.others, "column_names": names}
     table = pa.csv.read_csv(
         file,
@@ -72,7 +81,7 @@ def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
         memory_pool=pa.system_memory_pool(),
     )
     header = text.comments + 1 + text.others
-    # only the last line may be cut off: a recorder lost its power
+    # only the last line may be incomplete, as after a power failure of the recorder; other such lines are errors
     for row in wrong:
         if not len(table) or row.number <= header + len(table):
             got = f"{row.actual_columns} values ({row.text:.40})"
@@ -89,10 +98,10 @@ def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
 
 
 def _beginning(file: Path) -> Beginning:
-    """Return the beginning of a file: comments start with #, lines of units have no digits."""
+    """Return the beginning of a CSV file, in which comments start with # and a line of units contains no digits."""
     encoding, head = _decoded_head(file)
     lines = head.splitlines() or [""]
-    # at least one line remains as the header, and one as values
+    # the last line is never skipped, so that a file has at least a header and, below, a row of values
     comments = len(list(takewhile(lambda line: line.startswith("#"), lines[:-1])))
     header, rows = lines[comments], lines[comments + 1 :]
     skipped = list(takewhile(lambda x: x and (x == header or not re.search(r"\d", x)), rows[:-1]))
@@ -100,7 +109,7 @@ def _beginning(file: Path) -> Beginning:
 
 
 def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
-    """Return names for the columns of joint states as `ros2 topic echo --csv` writes them, which has no header.
+    """Return the column names of a file that `ros2 topic echo --csv` wrote without a header. cells: its first line.
 
     Raises LogError for any other file that begins with numbers.
     """
@@ -121,7 +130,7 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
 def _decoded_head(file: Path) -> tuple[str, str]:
     """Return the encoding and the first characters of a file."""
-    # of the head, from which encoding, delimiter and decimal point are detected
+    # [B] size of the head of the file, from which encoding, delimiter and decimal point are detected
     size = 2**16
     with file.open("rb") as source:
         head = source.read(size)

@@ -1,4 +1,4 @@
-"""Samples of the dynamics from logs: filtered, with accelerations, at a common rate, of a moving arm."""
+"""Filtered samples of a moving arm with accelerations and torques, at a common sample rate, for fits of dynamics."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, TUNING, shows_accelerations
 
-FREQUENCY = 100.0  # [Hz] of the common grid: twelve times the cutoff of the low-pass filter
-SHORTEST = 1.0  # [s] of a gap-free piece: shorter ones consist of filter transients
-HOLE = 0.25 / TUNING.automatic_cutoff  # [s] a shorter gap has no information in the pass band of the filter
+FREQUENCY = 100.0  # [Hz] common sample rate: twelve times the cutoff of the low-pass filter
+SHORTEST = 1.0  # [s] shortest gap-free piece that is used: shorter pieces consist of filter transients
+# [s] Shortest gap at which a recording is cut: the filter would remove any signal within a shorter gap.
+HOLE = 0.25 / TUNING.automatic_cutoff
 AUTOMATIC = Preprocessing()
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicsSamples:
-    """Samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged.
+    """Samples of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N], each (T, n); tau as logged.
 
-    z: (T, n, K) [rad, m], bristle states of friction, from the history of motion; None: unknown. direction: (T, n) of
-    rate-only dry friction, filtered as tau; None: unknown. rate: [Hz].
+    z: (T, n, K) [rad, m] bristle states of friction, computed from the history of motion; None if not computed.
+    direction: (T, n) smoothed sign of the velocity for dry friction without a state, with the same filter as tau;
+    None if not computed. rate: sample rate [Hz].
     """
 
     name: str
@@ -37,7 +39,7 @@ class DynamicsSamples:
     rate: float = field(default=FREQUENCY, kw_only=True)
 
     def __getitem__(self, rows: slice) -> DynamicsSamples:
-        """Return the samples of these rows."""
+        """Return the samples in a slice of rows; a step of the slice lowers the sample rate."""
         z = None if self.z is None else self.z[rows]
         direction = None if self.direction is None else self.direction[rows]
         motion = self.q[rows], self.qd[rows], self.qdd[rows], self.tau[rows]
@@ -51,15 +53,17 @@ def dynamics_samples(
     preprocessing: Preprocessing = AUTOMATIC,
     reach: BristleReach | None = None,
 ) -> list[DynamicsSamples]:
-    """Return the samples of each trajectory with a sufficient sample rate, at which any joint moves (|qd| > 0.02
-    rad/s).
+    """Return the samples of each trajectory at which a joint moves (|qd| > 0.02 rad/s or m/s).
 
-    Each gap-free piece is brought to 100 Hz (logs from 24 Hz on are interpolated, see `resampled`). The zero-phase
-    low-pass of ``preprocessing``, by default of 8 Hz, is applied to q, qd and tau at the higher of the two rates, and
-    its transients at both ends are removed. qdd is the central difference of the filtered qd.
+    Trajectories whose sample rate is too low for accelerations are omitted.
 
-    pauses: return all samples from the first to the last motion, standstill between them included. reach: break-away
-    displacements of the bristles whose states z are computed, with the same filter; see ``bristles_along``.
+    Each gap-free piece is resampled to 100 Hz; the sample rate of a log must be at least 24 Hz, see `resampled`. The
+    zero-phase low-pass of ``preprocessing``, by default with a cutoff of 8 Hz, is applied to q, qd and tau at the
+    higher of both sample rates, and the transients of the filter at both ends are removed. qdd is the central
+    difference of the filtered qd.
+
+    pauses: True: return all samples from the first to the last motion, including standstill. reach: break-away
+    displacements of the bristles whose states z are computed and filtered like tau; see ``bristles_along``.
     """
     samples = []
     for trajectory in preprocessing.moved(trajectories):
@@ -75,22 +79,29 @@ def dynamics_samples(
 
 
 def long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
-    """Return the gap-free pieces that are longer than the transients of the filter."""
+    """Return the gap-free pieces of at least 1 s; shorter pieces would consist of filter transients.
+
+    gap: a time step longer than this multiple of the median step is a gap.
+    """
     return [piece for piece in split_at_gaps(trajectory, gap, HOLE) if piece.duration >= SHORTEST]
 
 
 def _columns(
     piece: Trajectory, pauses: bool, cutoff: float | None, reach: BristleReach | None
 ) -> list[np.ndarray]:
-    """Return q, qd, qdd, tau (T, n), and z (T, n, K) if a reach is given, of the selected samples of a piece."""
+    """Return the columns of `DynamicsSamples` for one piece, at the samples at which a joint moves.
+
+    The columns are q, qd, qdd, tau (T, n) and, if `reach` is given, z (T, n, K) and the direction of friction (T, n).
+    pauses: see `dynamics_samples`. cutoff: cutoff of the low-pass filter [Hz]; None: no filter.
+    """
     rate, times, t = piece.sample_rate, piece.t, regular_times(piece.t, FREQUENCY)
     is_denser = rate > 1.5 * FREQUENCY
 
     def sampled(signals: np.ndarray) -> np.ndarray:
-        """Return signals (T, ...) at the times of the piece, filtered and resampled to the regular times."""
+        """Return signals, given at the piece's times as (T, ...), filtered and resampled to the common rate."""
         if cutoff is None:
             return resampled(times, signals, t, rate)
-        # filtered at the higher of the two rates: frequencies above half the lower rate are removed by then
+        # filtering at the higher of the two rates prevents aliasing: it removes frequencies above half the lower rate
         if is_denser:
             return resampled(times, low_passed(times, signals, cutoff), t, rate)
         return low_passed(t, resampled(times, signals, t, rate), cutoff)
@@ -99,8 +110,8 @@ def _columns(
         require_cutoff(piece, rate if is_denser else FREQUENCY, cutoff)
     q, qd, tau = sampled(piece.q), sampled(piece.qd), sampled(piece.tau)
     selected = is_moving(qd)
-    # a filter that begins or ends within a motion has a transient, whose error is 20 times the noise for this long, in
-    # periods of the cutoff
+    # If a piece begins or ends during motion, the filter has a transient there, with an error of 20 times the noise.
+    # The samples within 0.75 periods of the cutoff from both ends are therefore removed.
     if cutoff is not None:
         unsettled = round(0.75 * FREQUENCY / cutoff)
         selected[:unsettled] = selected[len(selected) - unsettled :] = False
@@ -109,7 +120,7 @@ def _columns(
         selected[moving[0] : moving[-1]] = True
     columns = [q, qd, np.gradient(qd, t, axis=0), tau]
     if reach is not None and reach.elements:
-        # The torque has steps at reversals, which were filtered and resampled. The friction state is treated equally:
+        # The filter smooths the steps of the torque at reversals of a joint. The friction state is filtered equally:
         # otherwise its steps would be wrong by up to one sample, an error that is confounded with inertia.
         path, speed = piece.q, piece.qd
         if cutoff is not None:

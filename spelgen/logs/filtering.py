@@ -8,14 +8,14 @@ import numpy as np
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.tuning import is_dense
 
-# SciPy is imported in the functions that need it: its import takes most of a second, and few commands need it
+# SciPy is imported within functions, since its import takes most of a second and few commands need it
 
 
 def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
-    """Return a gap-free piece with q, qd and tau filtered by a zero-phase Butterworth low-pass.
+    """Return a gap-free trajectory with q, qd and tau filtered by a zero-phase Butterworth low-pass.
 
-    cutoff [Hz]. All signals have the same filter: filtered input and output of a linear system obey the same equation.
-    Raises LogError if the sample rate is too low for this cutoff.
+    cutoff: cutoff frequency [Hz]. All signals have the same filter, since the equation of a linear system remains
+    valid if its input and output are filtered equally. Raises LogError if the sample rate is too low for this cutoff.
     """
     t = trajectory.t
     require_cutoff(trajectory, _mean_rate(t), cutoff)
@@ -31,16 +31,20 @@ def require_cutoff(trajectory: Trajectory, rate: float, cutoff: float) -> None:
 
 
 def low_passed(t: np.ndarray, signals: np.ndarray, cutoff: float) -> np.ndarray:
-    """Return signals (T, ...) at times t, filtered by the zero-phase low-pass.
+    """Return signals (T, ...) at times t (T,) [s], filtered by the zero-phase low-pass with a cutoff [Hz].
 
-    The filter needs a regular grid: signals are interpolated (cubic) to the mean rate, filtered and interpolated back.
+    The filter needs a regular grid: the signals are interpolated by a cubic spline to the mean rate, filtered, and
+    interpolated back to the times t.
     """
     grid = np.linspace(t[0], t[-1], len(t))
     return interpolated(grid, low_pass_regular(interpolated(t, signals, grid), _mean_rate(t), cutoff), t)
 
 
 def interpolated(t: np.ndarray, signals: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return signals (T, ...) at times t, interpolated at other times by a cubic; unchanged if the times are equal."""
+    """Return signals (T, ...) at times t (T,), interpolated by a cubic spline at other `times`.
+
+    If both times are equal, the signals are returned unchanged.
+    """
     if len(t) == len(times) and np.abs(t - times).max() < 1e-6 / _mean_rate(t):
         return signals
     from scipy.interpolate import CubicSpline
@@ -53,54 +57,58 @@ def _mean_rate(t: np.ndarray) -> float:
 
 
 def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
-    """Return signals (T, ...) at a regular rate [Hz], filtered by the zero-phase low-pass."""
+    """Return signals (T, ...) of a constant rate [Hz], filtered by the zero-phase low-pass with a cutoff [Hz]."""
     from scipy.signal import sosfiltfilt
 
-    # signals are extended at both ends by three periods of the cutoff
+    # signals are extended at both ends by three periods of the cutoff, which reduces the transients of the filter
     padding = min(len(signals) - 1, int(3 * rate / cutoff))
     filtered = sosfiltfilt(_sections(rate, cutoff), signals, axis=0, padlen=padding)
     return np.ascontiguousarray(filtered)  # the filter returns a reversed view, which torch does not accept
 
 
-@lru_cache(maxsize=8)  # logs of a robot have few rates
+# cached: a design takes as long as filtering one minute of a joint, and the logs of a robot have few rates
+@lru_cache(maxsize=8)
 def _sections(rate: float, cutoff: float) -> np.ndarray:
-    """Return the filter's second-order sections (S, 6); their design takes as long as filtering a minute of a joint."""
+    """Return the second-order sections (S, 6) of the Butterworth filter for a sample rate and a cutoff [Hz]."""
     from scipy.signal import butter
 
-    # fourth order, run forward and backward as in the logs' published protocols
+    # fourth order, applied forward and backward, as in the publications of the recorded logs
     return np.asarray(butter(4, cutoff, fs=rate, output="sos"))
 
 
 def regular_times(t: np.ndarray, frequency: float) -> np.ndarray:
-    """Return regular times at a rate [Hz] within the range of times t (T,)."""
+    """Return evenly spaced times [s] of a frequency [Hz] within the range of the times t (T,)."""
     return np.arange(t[0], t[-1], 1.0 / frequency)
 
 
 def resampled(t: np.ndarray, signals: np.ndarray, times: np.ndarray, rate: float) -> np.ndarray:
-    """Return signals (T, ...) of this rate [Hz] at other times, interpolated linearly if dense, else by a cubic."""
+    """Return signals, given as (T, ...) at times t (T,), interpolated at other `times`.
+
+    rate: sample rate of the signals [Hz]. From 50 Hz the interpolation is linear, below 50 Hz it is cubic.
+    """
     from scipy.interpolate import interp1d
 
-    # a line between samples that are far apart would cut off the peaks of the motion
+    # linear interpolation between distant samples would cut off the peaks of the motion
     kind = "linear" if is_dense(rate) else "cubic"
-    # rounding errors may move the last time beyond the last sample
+    # extrapolation: by rounding errors the last time may be after the last sample
     return np.asarray(interp1d(t, signals, kind, axis=0, fill_value="extrapolate")(times))
 
 
 def velocities(trajectory: Trajectory) -> np.ndarray:
-    """Return qd (T, n), smoothed."""
+    """Return smoothed velocities (T, n) [rad/s, m/s], differentiated from the positions of a trajectory."""
     return derivative(trajectory.q, trajectory.sample_rate, 1)
 
 
 def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
-    """Return the derivative of q (..., T, n) at a rate [Hz]; of order 0: the smoothed q.
+    """Return the time derivative of this order of positions q (..., T, n) at a sample rate [Hz]; order 0: smoothed q.
 
-    By cubic polynomials over 0.18 s (Savitzky and Golay, Anal. Chem. 36, 1964).
+    The derivative is from cubic polynomials over 0.18 s (Savitzky and Golay, Anal. Chem. 36, 1964).
     """
     from scipy.signal import savgol_filter
 
     samples = q.shape[-2]
-    # the span is a trade-off of noise and lag (SO-101)
+    # the span of 0.18 s was chosen on logs of an SO-101: shorter spans are noisier, longer ones smooth the motion
     width = 2 * round(0.18 * rate / 2) + 1
-    # the width is uneven, at least five samples for a cubic, and at most the number of samples
+    # the filter needs an uneven width of at least five samples for a cubic, and at most the number of samples
     width = min(max(5, width), samples - 1 + samples % 2)
     return np.asarray(savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2))

@@ -1,6 +1,6 @@
-"""Formats of logs, and the logs at given paths.
+"""Formats of logs, and the search for logs at given paths.
 
-A new format is a file like `csv_files.py`, and its name in FORMATS.
+To add a format, write a module like `csv_files.py` and add its `LogFormat` to FORMATS.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,14 +17,14 @@ from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
 
 LogPaths = Path | str | Iterable[Path | str]
-"""Files and folders of logs, or addresses."""
+"""Paths of log files and of folders with logs, or their addresses (see `local`)."""
 
 UNPACK = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".xz": "unxz", ".bz2": "bunzip2"}
 FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
 
 
 def format_of(path: Path) -> LogFormat | None:
-    """Return the format of a file or folder; None for other files, such as a pipe, whose reading might not end."""
+    """Return the log format of a file or folder; None if it is not a log. A pipe is no log: reading might not end."""
     for log_format in FORMATS:
         is_folder = log_format.marker and (path / log_format.marker).is_file()
         if is_folder or (path.suffix in log_format.suffixes and path.is_file()):
@@ -33,7 +33,7 @@ def format_of(path: Path) -> LogFormat | None:
 
 
 def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the tables of a log. Raises LogError, also if columns are missing."""
+    """Return the tables of a log. Raises LogError for a damaged file and for missing columns."""
     log_format = format_of(path)
     assert log_format is not None, "log_files gives logs alone"
     with reading(path):
@@ -41,9 +41,10 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[
 
 
 def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], list[SpelgenError]]:
-    """Return the logs at these paths, each once, and the errors of all other paths.
+    """Return the logs at these paths, each once, and one error for each path without a log.
 
-    role: "train" or "test": of a folder with files train.* or test.*, only the files with this stem are used.
+    role: "train" or "test". If a folder contains files named train.* or test.*, only the files named after the role
+    are used. None: all logs of a folder are used.
     """
     files: dict[Path, None] = {}
     errors: list[SpelgenError] = []
@@ -72,12 +73,12 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
     if not path.is_dir():
         require_regular_file(path, LogError, f"a file: {formats}")
         raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=formats, do=_unpacking(path))
-    # hidden files are not recordings: macOS adds "._log.csv" to log.csv on other file systems
+    # hidden files are no logs: macOS writes "._log.csv" in addition to log.csv on foreign file systems
     logs = sorted(x for x in path.iterdir() if format_of(x) is not None and not x.name.startswith("."))
     if not logs:
         packed = next(filter(None, map(_unpacking, sorted(path.iterdir()))), None)
         raise LogError("a folder without logs", file=path, expected=formats, do=packed)
-    # other names state no role: all logs of the folder are then used
+    # all logs are used if no file of the folder is named train.* or test.*
     selected = [log for log in logs if log.stem == role]
     if selected or role is None or {"train", "test"}.isdisjoint(log.stem for log in logs):
         return selected or logs

@@ -1,9 +1,9 @@
-"""Signals of one joint in one trajectory, and checks of them: outliers, register words, held values, elastic joints.
+"""Checks of the signals of one joint: frozen signals, outliers, undecoded register words, elastic joints.
 
-The apparent inertia of an elastic joint at the motor increases with frequency up to a resonance. For a motor with
-inertia J_m that drives a link with inertia J_l by a spring, the ratio of the torque in phase with the acceleration to
-the acceleration is H(f) = J_m + J_l / (1 - (f / f_0)^2), with the resonance f_0 of the link at a locked motor. A rigid
-joint has H = J + c / f^2, with a constant c due to gravity.
+The apparent inertia of an elastic joint, seen from the motor, increases with frequency up to a resonance. Let a motor
+with inertia J_m drive a link with inertia J_l through a spring. The torque component in phase with the acceleration,
+divided by the acceleration, is H(f) = J_m + J_l / (1 - (f / f_0)^2), where f_0 is the resonance of the link with a
+locked motor. A rigid joint has H(f) = J + c / f^2, where the constant c is due to gravity.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,11 @@ from spelgen.logs.tuning import SIGNALS, shows_accelerations
 
 
 class Advice(NamedTuple):
-    """Finding of a check, and the keys of the joint and of the group `logs` that remedy it, which are tested."""
+    """Finding of a check, with the settings that correct the log.
+
+    message: the finding. joint: settings of the joint within the group `logs`. keys: settings of the group `logs`
+    itself. Both are empty if the check knows no correction.
+    """
 
     message: str
     joint: Mapping[str, Any] = {}
@@ -29,23 +33,27 @@ class Advice(NamedTuple):
 
     @property
     def is_line(self) -> bool:
-        """Whether there is a remedy."""
+        """True if settings that correct the log are known."""
         return bool(self.joint or self.keys)
 
 
 def settings_line(keys: Mapping[str, object]) -> str:
-    """Return keys of the settings as YAML in one line, without the outer braces."""
+    """Return settings as one line of YAML, without the outer braces."""
     text: str = yaml.safe_dump(dict(keys), default_flow_style=True, sort_keys=False, width=float("inf"))
     return text.strip()[1:-1]
 
 
 def mapping_line(keys: Mapping[str, object]) -> str:
-    """Return the advice to write keys of the group `logs`."""
+    """Return the advice to write these settings into the group `logs`."""
     return f"write '{settings_line(keys)}' under 'logs' in the robot's YAML"
 
 
 def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str]) -> dict[str, object]:
-    """Return the keys of joints for the group `logs`; a unit that is equal at all joints becomes a unit of the log."""
+    """Return the settings of joints as settings of the group `logs`.
+
+    If all joints have the same unit as their only setting, it becomes the unit of the log. entries: settings per
+    joint. joints: names of all joints.
+    """
     first = next(iter(entries.values()))
     if first.keys() == {"units"} and all(entries.get(joint) == first for joint in joints):
         return dict(first)
@@ -53,16 +61,23 @@ def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str
 
 
 def plain_number(value: float, digits: int = 5) -> float:
-    """Return a number rounded to some digits; an integer if it is one."""
+    """Return a number rounded to significant digits, as an int if the result is whole."""
     rounded = float(f"{value:.{digits}g}")
     return int(rounded) if rounded.is_integer() else rounded
 
 
 class JointSignals(NamedTuple):
-    """Signals of one joint in one trajectory: the subject of the checks without the robot.
+    """Signals of one joint in one trajectory, as the checks without the robot use them.
 
-    q, qd: (T,). factor: ratio of dq/dt to qd; NaN for a joint at rest. correlations: of dq/dt with qd of each joint;
-    NaN for a joint at rest.
+    Attributes:
+        trajectory: the recording of all joints.
+        number: index of the joint.
+        kind: joint type: "continuous", "revolute" or "prismatic".
+        joints: names of all joints.
+        q: (T,) positions of the joint [rad, m].
+        qd: (T,) velocities of the joint [rad/s, m/s].
+        factor: ratio of dq/dt to qd; NaN for a joint at rest.
+        correlations: correlations of this joint's dq/dt with the qd of each joint; NaN for joints at rest.
     """
 
     trajectory: Trajectory
@@ -76,12 +91,12 @@ class JointSignals(NamedTuple):
 
     @property
     def turns(self) -> bool:
-        """Whether the joint can turn without limit."""
+        """True if the joint can rotate without limit."""
         return self.kind == "continuous" or bool(self.trajectory.mapping.word("period", "q", self.joint))
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Names of the measured quantities: without commands, and without differentiated velocities."""
+        """Names of the logged measurements, which exclude commands and differentiated velocities."""
         if self.trajectory.u is None and self.trajectory.tau.size:
             return self.trajectory.mapping.quantities
         return ("q",)
@@ -98,35 +113,35 @@ class JointSignals(NamedTuple):
         return self.joints[self.number]
 
     def signal(self, quantity: str) -> np.ndarray:
-        """Return "q", "qd", "tau" or "u" of the joint, (T,); (0,) if it was not logged."""
+        """Return the joint's signal "q", "qd", "tau" or "u", (T,); an empty array if it was not logged."""
         values = self.trajectory.column(quantity)
         return values[:, self.number] if values.size else np.zeros(0)
 
     @property
     def correlation(self) -> float:
-        """Correlation of qd and dq/dt."""
+        """Correlation of this joint's dq/dt with its own qd."""
         return self.correlations[self.number]
 
     def changes_by(self, unit: float) -> bool:
-        """Return True if dq/dt is this multiple of qd, which indicates a wrong unit."""
+        """Return True if dq/dt is about `unit` times qd, which indicates a wrong unit."""
         return self.correlation > SIGNALS.agreement and is_factor(self.factor, unit)
 
 
 def is_factor(value: float, unit: float) -> bool:
-    """Return True if a factor equals the factor of a unit within a tolerance."""
-    # within this ratio a measured factor is the factor of a unit
+    """Return True if a measured factor `value` equals the conversion factor `unit` within 25 %."""
+    # a measured factor within this tolerance counts as the conversion factor of the unit
     return 0.8 < value / unit < 1.25
 
 
 def find_frozen(signals: JointSignals) -> str | Advice | None:
-    """Find a position or a velocity that never changes while the other one does, and values that are old for long."""
+    """Find frozen signals: a constant q while qd shows motion, a constant qd while q changes, or repeated values."""
     from scipy.integrate import cumulative_trapezoid
 
-    # [rad, m] above this integral of qd a constant q is frozen, and the reverse
+    # [rad, m] motion of 0.05 in one of q and qd proves that the other one, if constant, is frozen
     t, q, qd, motion = signals.trajectory.t, signals.q, signals.qd, 0.05
     if np.ptp(qd) == 0 and np.ptp(q) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
-    # by the trapezoidal rule, so that noise of qd about zero has a small integral
+    # the integral averages noise of qd about zero, which would exceed a threshold on qd itself
     drift = np.abs(cumulative_trapezoid(qd, t)).max(initial=0.0)
     if np.ptp(q) == 0 and drift > motion:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
@@ -140,7 +155,7 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
 
 
 def find_dropouts(signals: JointSignals) -> str | None:
-    """Find lost samples and outliers."""
+    """Find lost samples and outliers in the measured signals of a joint."""
     for name in signals.measured:
         values = signals.signal(name)
         rows = np.flatnonzero(outlier_rows(name, values))
@@ -154,7 +169,7 @@ def find_dropouts(signals: JointSignals) -> str | None:
 
 
 def find_jumps(signals: JointSignals) -> str | Advice | None:
-    """Find signals that jump: undecoded register words, wrapped angles, joined recordings."""
+    """Find jumps of signals, which are due to undecoded register words, wrapped angles or joined recordings."""
     for name in signals.trajectory.quantities:
         words = _find_words(signals, name)
         if words is not None:
@@ -170,21 +185,21 @@ def find_jumps(signals: JointSignals) -> str | Advice | None:
 
 
 def _find_words(signals: JointSignals, name: str) -> Advice | None:
-    """Find undecoded register words, or wrapped angles, in "q", "qd", "tau" or "u" of the joint."""
+    """Find undecoded register words or wrapped angles in one signal of the joint: "q", "qd", "tau" or "u"."""
     mapping, values = signals.trajectory.mapping, signals.signal(name)
     scale, offset = mapping.scale(name, signals.joint), mapping.offset(name, signals.joint)
     unit = mapping.unit(name, signals.joint)
     turns: list[float | None] = [None]
     if signals.kind != "prismatic" and name in ("q", "u"):
-        # angles without a stated unit may be in degrees
+        # candidates for the size of a revolution in logged units: angles without a stated unit may be in degrees
         turns = [2 * np.pi / abs(scale), *([360.0] if unit is None else [])]
-    # a lost sample or an outlier has two jumps, unlike a register
+    # lost samples and outliers are removed: their jumps are not due to a register
     values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
     for turn in turns:
         word = read_as_words((values - offset) / scale, turn)
         if word is None:
             continue
-        # commands may jump: they count as words only if decoded commands are close to the positions
+        # commands may jump by themselves, so that decoding must bring them closer to the positions
         if name == "u":
             q = signals.q[~is_lost(signals.signal("u"))]
             if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
@@ -202,35 +217,35 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
 
 
 def find_elastic(signals: JointSignals) -> str | None:
-    """Find joints whose torques show the resonance of an elastic gear or belt."""
+    """Find joints whose apparent inertia shows the resonance of an elastic gear or belt (see the module)."""
     piece = max(split_at_gaps(signals.trajectory), key=len)
     rate, k = piece.sample_rate, signals.number
-    # a segment of 2 s: its inverse is the resolution in frequency
+    # samples of a segment of 2 s, which gives a frequency resolution of 0.5 Hz
     length = round(2.0 * rate)
     is_long = shows_accelerations(rate) and len(piece) >= 4 * length
     if not (is_long and piece.tau.size and np.ptp(piece.tau[:, k])):
         return None
     frequency, inertia = _apparent_inertia(piece.qd[:, k], piece.tau[:, k], rate, length)
-    # fewer bands do not determine two constants and a resonance
+    # fewer than five bands do not determine the two inertias and the resonance
     if len(frequency) < 5:
         return None
     ones = np.ones_like(frequency)
     rigid, _ = _relative_error([ones, frequency**-2.0], inertia)
     candidates = []
-    # a resonance up to 1.5 times the excited frequencies is visible
+    # a resonance at up to 1.5 times the highest excited frequency still changes the apparent inertia noticeably
     for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
-        # multiplied by the denominator, so that one band at the resonance does not dominate
+        # H is multiplied by 1 - (f / f_0)^2: otherwise its pole would give a band at the resonance too much weight
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error([factor, ones], factor * inertia)
-        # a smaller link has no visible resonance
+        # the resonance of a link with less than a tenth of the motor's inertia is not visible
         if motor > 0 and link > 0.1 * motor:
             candidates.append((error, resonance, motor, link))
-    # smallest relative error of the rigid model, and largest one of the elastic model, of the apparent inertia: with
-    # these no recorded arm shows a resonance
+    # A joint counts as elastic if the rigid model has an error of at least 10 %, and the elastic model one of at most
+    # 6 % and half of the rigid model's. With these thresholds no recorded arm counts as elastic.
     if rigid < 0.1 or not candidates or min(candidates)[0] > min(0.06, rigid / 2):
         return None
     _, resonance, motor, link = min(candidates)
-    # up to this frequency the apparent inertia differs from its value at rest by less than 10 %
+    # a rigid model is valid up to the frequency at which the apparent inertia is 10 % above its value at f = 0
     share = 0.1 * (motor + link) / link
     valid = resonance * float(np.sqrt(share / (1 + share)))
     unit = "kg" if signals.kind == "prismatic" else "kg m^2"
@@ -243,16 +258,18 @@ def find_elastic(signals: JointSignals) -> str | None:
 def _apparent_inertia(
     qd: np.ndarray, tau: np.ndarray, rate: float, length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies (B,) [Hz] and apparent inertias (B,), the in-phase ratios of torque to acceleration, of
-    coherent bands.
+    """Return frequencies (B,) [Hz] and apparent inertias (B,) [kg m^2, kg] of the coherent frequency bands.
+
+    The apparent inertia is the torque component in phase with the acceleration, divided by the acceleration. A band is
+    coherent if its torque is nearly proportional to the acceleration.
 
     Args:
         qd: (T,) velocity [rad/s, m/s].
         tau: (T,) torque [Nm, N].
         rate: sample rate [Hz].
-        length: samples of a segment; segments overlap by half.
+        length: number of samples of a segment of the averaged spectra; segments overlap by half.
     """
-    # [Hz] below, gravity and friction dominate; links of arms have resonances between 3 and 30 Hz
+    # [Hz] below 0.9 Hz gravity and friction dominate; links of arms have resonances between 3 and 30 Hz
     lowest, highest = 0.9, 30.0
     frequency = np.fft.rfftfreq(length, 1 / rate)
     band = (frequency >= lowest) & (frequency <= min(highest, rate / 3))
@@ -267,14 +284,17 @@ def _apparent_inertia(
     firsts = np.unique(np.searchsorted(frequency, edges))
     (moved, driven), together = np.add.reduceat(power, firsts, axis=1), np.add.reduceat(cross, firsts)
     means = np.add.reduceat(frequency, firsts) / np.diff(np.append(firsts, len(frequency)))
-    # torque in phase with the acceleration, in bands that the motion excites
+    # coherent bands: squared in-phase coherence above 0.85, and enough motion for a ratio that is not noise
     coherent = together**2 > 0.85 * moved * driven
     coherent &= moved > 1e-3 * moved.max(initial=0.0)
     return means[coherent], together[coherent] / moved[coherent]
 
 
 def _relative_error(columns: Sequence[np.ndarray], values: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the RMS residual of least squares relative to the RMS of the values (B,), and the coefficients (C,)."""
+    """Return the relative RMS residual of a least-squares fit, and the coefficients (C,).
+
+    columns: C regressor columns (B,). values: (B,) the fitted values, whose RMS is the reference.
+    """
     matrix = np.stack(columns, axis=1)
     x = np.linalg.lstsq(matrix, values, rcond=None)[0]
     return float(np.linalg.norm(matrix @ x - values) / np.linalg.norm(values)), x

@@ -1,7 +1,7 @@
 """Detection of jumps of logged signals: lost samples, outliers, wrapped angles, register words, repeated rows.
 
-Every function takes one signal (T,) or the columns of a log (T, C), of any format and any robot. A step is the
-difference between neighbouring samples, the typical step the median of the steps that are not 0.
+The functions apply to one signal (T,) or to the columns of a log (T, C), for logs of any format and any robot. A step
+is the difference between neighbouring samples; the typical step is the median magnitude of the nonzero steps.
 """
 
 from itertools import pairwise
@@ -11,16 +11,17 @@ import numpy as np
 
 from spelgen.logs.tuning import TUNING
 
-FINEST_WORD = 4e-6  # smallest step of words relative to the range of a signal: words of 18 bits
+# Smallest step of register words, as a fraction of the signal's range: words have at most 18 bits, and 2^-18 is 4e-6.
+FINEST_WORD = 4e-6
 
 
 def jump_count(values: np.ndarray, period: float) -> int:
-    """Return the number of steps of a signal (T,) that are longer than half a period."""
+    """Return the number of wraps of a signal (T,): steps whose magnitude exceeds half a period."""
     return int(np.count_nonzero(np.abs(np.diff(values)) > period / 2))
 
 
 def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
-    """Return the signal (T,) without jumps of whole periods."""
+    """Return the signal (T,) with jumps of whole periods removed, starting at the unchanged first value."""
     if not jump_count(values, period):
         return values
     steps = np.diff(values, prepend=values[:1])
@@ -33,18 +34,18 @@ def centred(values: np.ndarray, period: float) -> np.ndarray:
 
 
 def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
-    """Return the numbers that sign-magnitude words (T,) represent: words from `sign_bit` on are negative."""
+    """Return the numbers that sign-magnitude words (T,) represent: a word w >= sign_bit is sign_bit - w."""
     return np.where(words >= sign_bit, sign_bit - words, words)
 
 
 def is_lost(values: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of samples that are exactly 0 between samples far from 0: missing values of loggers."""
+    """Return a mask (T,) of lost samples: loggers write exactly 0 for a missing value between values far from 0."""
     lost = np.zeros(len(values), bool)
     logged = np.flatnonzero(values)
     if not logged.size or logged[-1] - logged[0] == len(logged) - 1:
-        return lost  # zeros occur only at the ends, where the signal itself may be zero
+        return lost  # zeros occur only at the ends, at which the arm may have been at rest
     steps = np.abs(np.diff(values[logged]))
-    # a signal that passes through 0 has samples close to 0 first
+    # a continuous signal that passes through 0 has samples close to 0 before and after
     nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))
     lost[logged[0] : logged[-1]] = np.repeat(nearest > TUNING.jump * _usual(steps), np.diff(logged))
     return np.asarray(lost & (values == 0))
@@ -53,8 +54,8 @@ def is_lost(values: np.ndarray) -> np.ndarray:
 def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     """Return a mask (T,) of lost samples and of outliers.
 
-    smooth: True for positions, whose steps change gradually. Torques and velocities may have steps: their outliers
-    must also exceed the range of all other samples by half of it.
+    smooth: True for positions, whose steps change gradually. False for torques and velocities, which may have genuine
+    steps: their outliers must also be outside the range of all other samples by half of this range.
     """
     outliers = is_lost(values)
     if len(values) < TUNING.jump_window:
@@ -62,17 +63,19 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     steps = np.diff(values)
     sizes = np.abs(steps)
     is_jump = sizes > TUNING.jump * _usual(sizes)
-    # a signal with more large steps is noisy
+    # a signal in which more than 5 % of the steps are large is noisy: its large steps are no outliers
     if not is_jump.any() or is_jump.mean() > 0.05:
         return outliers
     for first, second in pairwise(np.flatnonzero(is_jump)):
         out, back = steps[first], steps[second]
-        # an outlier has at most five samples: a signal that returns later has jumped
+        # An excursion consists of two opposite jumps of similar size. It is an outlier if it lasts at most five
+        # samples; a signal that returns later has jumped twice.
         is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= 5
         if not is_excursion:
             continue
         low, high = max(0, first - TUNING.jump_window), second + 1 + TUNING.jump_window
-        # a fast motion has large steps on both sides; the two largest steps may belong to another outlier
+        # During fast motion the neighbouring steps are large, too, and the excursion is no outlier. The two largest
+        # neighbouring steps are ignored, since they may belong to another outlier.
         around = np.sort(np.concatenate([sizes[low:first], sizes[second + 1 : high]]))[:-2]
         if min(abs(out), abs(back)) > 4.0 * around.max(initial=0.0):
             outliers[first + 1 : second + 1] = True
@@ -85,10 +88,11 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
 
 
 def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.ndarray:
-    """Return a mask (T,) of samples that repeat an old value for long, in a signal that otherwise changes.
+    """Return a mask (T,) of stale samples: repetitions of an old value while the measured quantity must have changed.
 
-    A quantised signal, as of a drive with a dead zone, may keep a value: the step to the next one must then be large.
-    changes: (T,), a signal that cannot change by more than `least` while the values are constant.
+    values: (T,) the signal. changes: (T,) another signal; if it changes by more than `min_change` within a block of
+    equal values, these values are stale. Quantised signals have genuine blocks of equal values: such a block is stale
+    only if the step at its end is large, too.
     """
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
@@ -105,26 +109,27 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
 
 
 def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the rows after which a position (T,) jumps: faster than any arm, and than typical steps.
+    """Return the rows after which a position q (T,) at times t (T,) jumps.
 
-    Steps across gaps in time are not jumps: the arm may have moved in the gap.
+    A jump is faster than any arm, and much larger than the typical step. Steps across gaps in time are no jumps, since
+    the arm may have moved in the gap.
     """
     if len(q) < TUNING.jump_window:
         return np.zeros(0, int)
     sizes, dt = np.abs(np.diff(q)), np.diff(t)
     median = float(np.median(dt))
     is_jump = (sizes > TUNING.jump * _usual(sizes)) & (dt <= TUNING.gap * median)
-    # no arm is faster than 40 rad/s, m/s; time stamps may come in bursts: a step lasts at least the median time
+    # No arm is faster than 40 rad/s or m/s. Time stamps of messages that arrive in bursts are too close: a step is
+    # assumed to last at least the median time.
     return np.flatnonzero(is_jump & (sizes > 40.0 * np.maximum(dt, median)))
 
 
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
-    """Return a mask (T,) of the rows of a log (T, C) that repeat the row before during motion, and the copies of each
-    row.
+    """Return a mask (T,) of the rows of a log (T, C) that are repeated although the arm moves, and the copies per row.
 
-    positions: number of leading columns that are positions. Equal rows count as repeats if the motion continued
-    meanwhile: the step after k equal rows is as large as k steps of the motion after it. Rows of an arm at rest are
-    kept; if rows of a motion are written n times, one of n rows at rest is kept.
+    positions: number of leading columns that are positions. A block of k equal rows consists of repeats if the arm
+    moved meanwhile: then the step at its end is as large as k steps of the motion that follows. Equal rows of an arm at
+    rest are no repeats, unless the rows of motions occur n times each: then only every n-th row at rest is kept.
     """
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
     lengths = np.diff(np.append(starts, len(columns)))
@@ -132,7 +137,7 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     index = np.arange(len(columns)) - np.repeat(starts, lengths)
     if len(starts) < 4 or not index.any():
         return np.repeat(is_held, lengths), 1
-    # after each block of equal rows except the last
+    # the step of each position at the end of each block of equal rows, except the last block
     steps = np.abs(np.diff(columns[starts, :positions], axis=0))
     speeds = steps[1:] / lengths[1:-1, None]
     quantum = np.min(np.where(steps > 0, steps, np.inf), axis=0)
@@ -144,12 +149,12 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
 
 
 def held_samples(values: np.ndarray) -> int:
-    """Return the number of samples for which each value of a changing signal (T,) is held: 1 for a faultless signal."""
+    """Return the number of consecutive samples for which a changing signal (T,) keeps each value; 1 if none is held."""
     changes = np.flatnonzero(np.diff(values))
     if len(changes) < TUNING.jump_window:
         return 1
     sizes = np.abs(np.diff(values)[changes])
-    # slow quantised signals are constant for several samples without being held: only large steps count
+    # a slow quantised signal has equal samples without being held; only steps of several quantisation steps count
     large = sizes[1:] > 2.5 * sizes.min()
     if large.sum() < TUNING.jump_window:
         return 1
@@ -159,7 +164,8 @@ def held_samples(values: np.ndarray) -> int:
 class Word(NamedTuple):
     """Decoding of a signal as register words.
 
-    key, value: of the mapping, in logged units. jumps: number of jumps of the signal. values: the decoded signal.
+    key: setting of the mapping that decodes it, "period" or "sign_bit". value: value of this setting in logged units.
+    jumps: number of jumps of the undecoded signal. values: (T,) the decoded signal.
     """
 
     key: str
@@ -169,22 +175,26 @@ class Word(NamedTuple):
 
 
 def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
-    """Return the decoding of a signal (T,) in logged units that removes its jumps; None if there is none.
+    """Return the decoding as register words that removes the jumps of a signal (T,); None if no decoding does.
 
-    Hypotheses are sign-magnitude words and overflowing words, of 2^k steps of the signal's grid or of 2^k revolutions
-    (`turn` in logged units, None for joints that do not turn). The best decoding has the fewest remaining jumps, and
-    among these the smoothest signal.
+    The candidates are words with a sign bit and words that overflow, with a size of 2^k quantisation steps or of 2^k
+    revolutions. The best decoding has the fewest remaining jumps and, if several have equally few, the smoothest
+    signal.
+
+    values: (T,) in logged units. turn: one revolution in logged units; None for a joint that does not rotate.
     """
     if len(values) < 4:  # the median step might itself be a jump
         return None
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
     rows = np.flatnonzero(np.abs(steps) > limit)
-    # a signal about 0, and with it the sign bit of its words, changes its sign at half of the steps at most
+    # Noise about 0 changes the sign bit of words at half of the steps at most; with more jumps the signal does not
+    # consist of words.
     if not len(rows) or len(rows) > 0.5 * len(values):
         return None
     jump, usual = float(np.median(np.abs(steps[rows]))), _usual(np.abs(steps))
-    # torques may reverse abruptly: in a signal with negative values only jumps over the whole range are overflows
+    # Torques may reverse abruptly. A jump of a signal with negative values is therefore an overflow only if it is
+    # nearly as large as the range.
     is_signed = values.min() < -FINEST_WORD * np.ptp(values)
     if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * usual):
         return None
@@ -192,7 +202,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        # overflowing words are within one period but for noise; words with a sign bit are on both sides of it
+        # words that overflow have a range of one period (plus 1 % for noise); negative words exceed the sign bit
         readings = []
         if np.ptp(values) < 1.01 * size:
             readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))
@@ -200,7 +210,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
             jumps = np.abs(np.diff(reading.values))
-            # the steps of a fast motion, or of one across a gap, only become smaller by a period
+            # a wrong decoding is rejected: it shortens large steps of motion by one period, but they remain large
             if np.median(jumps[rows]) > TUNING.jump * usual:
                 continue
             bends = np.abs(np.diff(reading.values, 2))
@@ -214,11 +224,11 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
 
 def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
-    """Return candidate register sizes of a signal (T,) in logged units: 2^k turns, and 2^k steps of its grid."""
+    """Return candidates for the size of a register in logged units: 2^k revolutions, and 2^k quantisation steps."""
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)
     differences = np.diff(levels)
-    # values were converted back from SI units: equal ones differ by rounding errors
+    # smaller differences are rounding errors, since the values were converted to SI units and back
     differences = differences[differences > FINEST_WORD * np.ptp(values)]
     if differences.size:
         step = float(differences.min())
@@ -229,6 +239,6 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
 
 
 def _usual(sizes: np.ndarray) -> float:
-    """Return the median of the nonzero step sizes (T,); infinite if all are zero."""
+    """Return the typical step, the median of the nonzero step sizes (T,); infinity if all are zero."""
     moving = sizes[sizes > 0]
     return float(np.median(moving)) if moving.size else np.inf

@@ -1,4 +1,4 @@
-"""Reader of NPZ archives, with an array per column, or matrices with a column per joint."""
+"""Reader of NPZ archives that contain one array per column, or matrices with one column per joint."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,12 +13,12 @@ from spelgen.logs.tables import LogFormat, LogTable, missing_columns, stored_col
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-JOINT_NAMES = "joints"  # array with the names of the joints in the order of the columns of matrices
+JOINT_NAMES = "joints"  # name of an optional array with the names of the joints in the columns of matrices
 TRAJECTORY = "{trajectory}"
 
 
 class NpzArrays:
-    """Arrays of an NPZ archive, each read when it is first used, and never unpickled."""
+    """Arrays of an NPZ archive. An array is read when it is first used; pickled objects are rejected."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -31,7 +31,7 @@ class NpzArrays:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
             member = self._members[name]
-            # zipfile itself reads at most this size of a member
+            # the size that the archive states is a reliable bound, since zipfile does not read more of a member
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
                 got, expected = (
@@ -47,22 +47,23 @@ class NpzArrays:
         return self._arrays[name]
 
     def error(self, name: str, got: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about an array."""
+        """Return an error about the array of this name."""
         return LogError(got, file=self.file, element=f"array {name}", expected=expected, do=do)
 
     def column(self, name: str) -> pa.Array:
-        """Return an array as a column; a matrix becomes a column of lists."""
+        """Return an array as a column of a table; a matrix becomes a column of lists."""
         array = self[name]
-        # Arrow rejects half and extended precision, and foreign byte orders
+        # converted to double precision and native byte order, since Arrow rejects other ones
         wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
         values = pa.array(array.astype(wide).ravel())
         return pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if array.ndim == 2 else values
 
 
 def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return one table, or one per text in place of `{trajectory}` in the name of the times.
+    """Return one table per recording; only the arrays that the mapping names are read.
 
-    Only the arrays of the mapping are read.
+    An archive contains several recordings if the mapping's name for the times contains `{trajectory}`. Each text that
+    an array's name has in this place is the name of a recording.
     """
     arrays, times = NpzArrays(file), mapping.columns.t
     if TRAJECTORY not in times:
@@ -74,7 +75,7 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def npz_columns(file: Path) -> pa.Table:
-    """Return a table of all arrays that are as long as the longest one; matrices are columns of lists."""
+    """Return a table of all arrays with as many rows as the longest one; matrices become columns of lists."""
     arrays = NpzArrays(file)
     lengths = {name: len(arrays[name]) for name in arrays.names if arrays[name].ndim in (1, 2)}
     samples = max(lengths.values(), default=0)
@@ -82,9 +83,10 @@ def npz_columns(file: Path) -> pa.Table:
 
 
 def _trajectory_text(pattern: str, name: str) -> str | None:
-    """Return the text in place of `{trajectory}` in a name, equal at all places; None if the pattern does not match.
+    """Return the text that an array's name has in place of `{trajectory}`; None if the name does not match the pattern.
 
-    It is found by lengths, since regular expressions with several wildcards take exponential time on long names.
+    A pattern may contain `{trajectory}` several times, always for the same text. The text's length follows from the
+    length of the name: regular expressions with several wildcards would take exponential time on long names.
     """
     start = pattern.index(TRAJECTORY)
     length = (len(name) - len(pattern)) // pattern.count(TRAJECTORY) + len(TRAJECTORY)
@@ -94,10 +96,10 @@ def _trajectory_text(pattern: str, name: str) -> str | None:
 
 
 def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping) -> LogTable:
-    """Return the table of one recording of the archive, or of the only one."""
+    """Return the table of one recording of the archive; `recording` is its name, None if it is the only one."""
     for quantity in mapping.quantities:
         mapping = _with_matrix_columns(quantity, arrays, joints, mapping)
-    # names only: the type of an array is unknown before it is read
+    # the schema has names without types, since the type of an array is known only after reading it
     schema = pa.schema([(name, pa.null()) for name in arrays.names])
     layout = table_layout(schema, joints, mapping, arrays.file)
     if recording is not None:
@@ -106,7 +108,7 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
     columns = stored_columns(layout, arrays.names)
     for name in columns:
         shape = arrays[name].shape
-        # the elements of a matrix are columns of the layout, the matrix itself is none
+        # an array may have two dimensions only if the layout refers to its elements, such as q[0], and not to itself
         if shape[:1] != samples or len(shape) > 1 + (name not in layout.columns):
             expected = f"a value for each of the {samples[0] if samples else 0} times"
             raise arrays.error(name, f"an array of shape {shape}", expected)
@@ -116,7 +118,10 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
 def _with_matrix_columns(
     quantity: str, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping
 ) -> LogMapping:
-    """Return the mapping with the columns of a matrix such as `q` (T, n), if there is one of the quantity's name."""
+    """Return the mapping with columns such as `q[0]`, if the archive contains a quantity as a matrix (T, n).
+
+    Without such a matrix the mapping is returned unchanged.
+    """
     pattern = mapping.pattern(quantity)
     matrix = pattern.replace("{joint}", "").rstrip("_")
     if matrix not in arrays.names or arrays[matrix].ndim != 2:
@@ -126,14 +131,17 @@ def _with_matrix_columns(
     columns: dict[str, dict[str, str | None]] = {}
     for joint, name in zip(joints, names, strict=True):
         column = mapping.column(quantity, joint)
-        # a joint may have the column of another one
+        # the mapping may assign the column of another joint to this joint
         owners = [x for x in (name, *names) if pattern.replace("{joint}", x) == column]
         columns[joint] = {quantity: f"{matrix}[{column_of[owners[0]]}]" if owners else column}
     return mapping.with_joint_columns(columns)
 
 
 def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str]) -> list[int]:
-    """Return the columns of a matrix for the joints: by the array `joints`, else in the order of the arm's joints."""
+    """Return the index of each joint's column in a matrix.
+
+    The array `joints` of the archive states the order of the columns; without it the order is the arm's.
+    """
     width = arrays[matrix].shape[1]
     if JOINT_NAMES not in arrays.names:
         if width != len(joints):

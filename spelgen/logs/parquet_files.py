@@ -1,4 +1,4 @@
-"""Reader of the columns of Parquet logs, and of LeRobot 3 data sets, which consist of Parquet files."""
+"""Reader of Parquet logs, and of LeRobot 3 data sets, which consist of Parquet files."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,26 +16,26 @@ from spelgen.logs.tables import LogFormat, LogTable, reading, stored_columns, ta
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.yaml_document import YamlDocument, validated
 
-INFO = "meta/info.json"  # file in a LeRobot data set
+INFO = "meta/info.json"  # description of a LeRobot data set, within the folder of the data set
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
 ENDING = ".pos"
 LARGEST_NORMALISED = 100.001  # 100 in single precision
 
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with the table of a file. The mapping does not apply to files that spelgen wrote."""
+    """Return a list with the only table of a file. The mapping is ignored for files that spelgen wrote."""
     schema = pa.parquet.read_schema(file)
     layout = table_layout(schema, joints, mapping, file)
     columns = stored_columns(layout, schema.names)
-    # pre-buffering would hold the compressed file in memory in addition to the table
+    # without pre-buffering, which would keep the compressed file in memory in addition to the table
     return [(layout, pa.parquet.read_table(file, columns=columns, pre_buffer=False))]
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the tables of all files of a data set; joints have the names of its motors.
+    """Return the tables of all files of a LeRobot data set, whose motors have the names of the joints.
 
-    Raises LogError without files, for a joint that is not among the motors, and for normalised positions without a
-    calibration.
+    Raises LogError if the data set has no files, if a joint is not among the motors, and for normalised positions
+    without a calibration.
     """
     info = read_json(folder / INFO, LogError)
     states, actions = _motor_names(folder, info, STATE), _motor_names(folder, info, ACTION)
@@ -59,7 +59,7 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         expected = "data/chunk-000/file-000.parquet"
         raise LogError("a data set without Parquet files", file=folder, expected=expected)
     mapping, remarks = _with_scale(folder, files, joints, mapping)
-    # LeRobot 2 has positions in degrees, and no suffixes in the names
+    # data sets of LeRobot 2, whose names have no suffix, contain degrees: remarks about normalised values do not apply
     if ENDING not in str(info["features"][STATE]["names"]):
         remarks = ()
     fps = info.get("fps")
@@ -79,10 +79,11 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
 def _with_scale(
     folder: Path, files: Sequence[Path], joints: Sequence[str], mapping: LogMapping
 ) -> tuple[LogMapping, tuple[str, ...]]:
-    """Return the mapping with the unit of positions, and remarks on it.
+    """Return the mapping with the unit of the positions in a data set, and remarks on the unit.
 
-    LeRobot stores -100..100 for each motor's calibrated range by default, and degrees or radians as an option; the
-    data set does not specify the unit. Raises LogError for values in -100..100 without a calibration.
+    By default LeRobot normalises the calibrated range of each motor to -100..100; degrees or radians are options. The
+    data set does not state the unit, which is therefore derived from the largest value. Raises LogError for values that
+    may be normalised, if neither a unit nor a calibration is given.
     """
     largest = 0.0
     for file in files:
@@ -116,7 +117,7 @@ def _with_scale(
 
 
 def _calibration(folder: Path) -> dict[str, MotorCalibration]:
-    """Return the calibration of the motors in a data set; {} if there is none."""
+    """Return the calibration per motor from the calibration.json of a data set; {} if there is no such file."""
     for file in (folder / "calibration.json", folder / "meta" / "calibration.json"):
         if file.is_file():
             document = YamlDocument(file, None)
@@ -125,12 +126,12 @@ def _calibration(folder: Path) -> dict[str, MotorCalibration]:
 
 
 def dataset_motors(folder: Path) -> list[str]:
-    """Return the names of the motors of a data set."""
+    """Return the names of the motors of a data set, in the order of the columns of its state."""
     return _motor_names(folder, read_json(folder / INFO, LogError), STATE)
 
 
 def _motor_names(folder: Path, info: Any, feature: str) -> list[str]:
-    """Return the names of the motors of a feature, without LeRobot's suffix."""
+    """Return the motors' names for a feature ("observation.state" or "action"), without LeRobot's suffix ".pos"."""
     try:
         names = info["features"][feature]["names"] or []
         if isinstance(names, dict):  # LeRobot writes a list, or a group of lists

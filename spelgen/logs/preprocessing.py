@@ -1,4 +1,4 @@
-"""Preprocessing of logs in training, identification and evaluation."""
+"""Preprocessing of logs for training, identification and evaluation: cuts at gaps, filter, decimation, torque delay."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from spelgen.logs.tuning import FAST, TUNING
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Options of cutting, filtering and decimation of logs. Raises SettingsError for invalid values.
+    """Options for cutting, filtering and decimating logs. Raises SettingsError for invalid values.
 
-    cutoff: of the zero-phase low-pass on q, qd and tau [Hz]; 0: none; None: 8 Hz, but no filter for windows if any log
-    is sampled at 50 Hz or less.
-    decimation: stride of the samples of a window; None: chosen for the filter.
+    cutoff: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: no filter; None: 8 Hz, but no filter for windows
+    if a log is sampled at 50 Hz or less.
+    decimation: number of log samples from one sample of a window to the next; None: chosen for the filter.
     gap: a time step longer than this multiple of the median step is a gap, at which a recording is cut.
     torque_delay: delay of logged torques relative to positions [s]; None: estimated in fits to torques.
     """
@@ -40,23 +40,23 @@ class Preprocessing:
                 raise SettingsError(repr(getattr(self, name)), element=name, expected=expected)
 
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
-        """Return the resolved options for windows of logs with these sample rates [Hz], which the record of a run
-        contains.
+        """Return the options with cutoff and decimation chosen for windows of logs with these sample rates [Hz].
 
-        The cutoff remains None for logs whose rate is too low for the default filter.
+        The record of a training run contains the resolved options. The cutoff remains None for logs whose rate is too
+        low for the default filter.
         """
         rates = list(rates)
         cutoff, decimation = self.cutoff, self.decimation or 1
         if cutoff is None and all(rate > TUNING.dense_rate * FAST for rate in rates):
             cutoff = TUNING.automatic_cutoff
-        # no decimation, unless filtered logs have a higher rate than their filter needs
+        # by default only filtered logs are decimated, if their rate is higher than the filter needs
         if self.decimation is None and cutoff:
             decimation = max(1, int(min(rates) * FAST / (TUNING.samples_per_period * cutoff)))
         return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=self.torque_delay or 0.0)
 
     @property
     def acceleration_cutoff(self) -> float | None:
-        """Cutoff of the filter for accelerations [Hz]; None: no filter."""
+        """Cutoff [Hz] of the low-pass filter for samples with accelerations; None: no filter."""
         if self.cutoff is None:
             return TUNING.automatic_cutoff
         return self.cutoff or None
@@ -68,17 +68,16 @@ class Preprocessing:
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """A remark if the logs are filtered; the options must be ``resolved``."""
+        """A remark with the cutoff if the logs are filtered, else []; the options must be ``resolved``."""
         if not self.cutoff:
             return []
         message = f"q, qd and tau filtered at {self.cutoff:g} Hz, zero phase"
         return [Diagnostic("info", "filter", "logs", None, message)]
 
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
-        """Return filtered gap-free pieces (see `gap_ends`) of at least `shortest` samples; the options must be
-        ``resolved``.
+        """Return the filtered gap-free pieces of the trajectories that have at least `shortest` samples.
 
-        Raises LogError for a trajectory without a piece of this length.
+        The options must be ``resolved``. Raises LogError for a trajectory without a piece of this length.
         """
         prepared: list[Trajectory] = []
         errors: list[SpelgenError] = []
@@ -95,8 +94,8 @@ class Preprocessing:
         return prepared
 
     def moved(self, trajectories: Sequence[Trajectory]) -> Sequence[Trajectory]:
-        """Return the trajectories with torques shifted by the delay to the times at which they act."""
+        """Return the trajectories with torques shifted back by `torque_delay`, to the times at which they acted."""
         delay = self.torque_delay
-        if not delay:  # most logs have no delay; new trajectories would be validated again
+        if not delay:  # most logs have no delay, and unchanged trajectories need not be validated again
             return trajectories
         return [replace(x, tau=earlier(x.t, x.tau, delay)) for x in trajectories]

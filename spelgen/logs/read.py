@@ -1,4 +1,4 @@
-"""Reading and writing of log files, in SI units and with the URDF's signs; without filter and resampling."""
+"""Reading and writing of log files, in SI units and with the URDF's signs, without filtering or resampling."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,24 +27,30 @@ def read_logs(
     *,
     joint_types: Sequence[str] | None = None,
 ) -> list[Trajectory]:
-    """Return all trajectories of the given files and folders, in sorted order of their files.
+    """Return all trajectories of the given files and folders; the files of a folder are read in alphabetical order.
 
-    Without a mapping, the columns are the time `t` [s] and, for joint j, `q_<j>`, `qd_<j>` and `tau_<j>`. A column
-    `trajectory` divides a file into several trajectories.
+    Without a mapping, a log has a column `t` with times [s] and, for each joint j, the columns `q_<j>`, `qd_<j>` and
+    `tau_<j>`. A column `trajectory` divides a file into several trajectories.
 
-    arm: result of `load_arm`, a model, or the names of the joints in the URDF. mapping: columns and units of the logs,
-    as a LogMapping, a dict of its keys, or a YAML file; by default the group `logs` of the arm's settings. role:
-    "train" or "test": of a folder with files train.* or test.*, only the files with this stem are read. joint_types:
-    for the check of the mapping's units if `arm` is a list of names.
+    Args:
+        paths: files and folders of logs.
+        arm: result of `load_arm`, a model, or the names of the joints in the URDF.
+        mapping: columns and units of the logs, as a LogMapping, a dict of its keys, or a YAML file; None: the group
+            `logs` of the arm's settings.
+        role: "train" or "test". If a folder contains files train.* or test.*, only the files named after the role are
+            read. None: all files are read.
+        joint_types: "revolute" or "prismatic" per joint, for the check of the mapping's units if `arm` is a list of
+            names.
 
-    Raises LogError (or one error with several) with file, row and column, and SettingsError for a mapping that does
-    not fit the joints.
+    Raises:
+        LogError: with file, row and column of a fault; several faults are raised as one error.
+        SettingsError: for a mapping that does not fit the joints.
     """
     return _read(paths, log_source(arm, mapping), role, LogSegments(), joint_types)
 
 
 class BoundedLogs(NamedTuple):
-    """Logs within a bound of memory. notes: statement of the kept part; empty if all samples were kept."""
+    """Trajectories reduced to a bound of memory, and a note on the kept part; no note if all samples were kept."""
 
     trajectories: list[Trajectory]
     notes: list[Diagnostic]
@@ -53,11 +59,11 @@ class BoundedLogs(NamedTuple):
 def read_bounded_logs(
     paths: LogPaths, arm: LoggedArm, mapping: GivenMapping = None, role: str | None = None
 ) -> BoundedLogs:
-    """Return the logs as `read_logs` does, reduced to evenly spread segments if they exceed `LogTuning.kept_bytes`.
+    """Return the logs like `read_logs`, reduced to evenly spread segments if they exceed `LogTuning.kept_bytes`.
 
-    Each file is read and reduced by itself, so that memory is bounded by the largest file and the kept samples. A
-    reduced recording has gaps between its segments. The same files give the same samples. Raises the errors of
-    `read_logs` for rows that are kept.
+    Files are read and reduced one at a time, so that only the largest file and the kept samples need to fit into
+    memory. A reduced recording has gaps between its segments. The selection is deterministic. Raises the errors of
+    `read_logs`, but only for rows that are kept.
     """
     segments = LogSegments(TUNING.kept_bytes)
     trajectories = _read(paths, log_source(arm, mapping), role, segments)
@@ -79,16 +85,16 @@ def _read(
     segments: LogSegments,
     joint_types: Sequence[str] | None = None,
 ) -> list[Trajectory]:
-    """Return the trajectories of all files, collected in `segments`.
+    """Return the trajectories of all files, collected in `segments`; raise the first error of each file, as one error.
 
-    Raises the first error of each file, all together.
+    source: joints and mapping. role, joint_types: see `read_logs`.
     """
     collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))
     files, errors = log_files(paths, role)
     for file in files:
         try:
             tables = read_tables(file, source.joints, source.mapping)
-            while tables:  # each table is released before the next one is read
+            while tables:  # a table is removed from the list, so that its memory is free after it was added
                 segments.add(*tables.pop(0))
         except LogError as error:
             errors.append(error)
@@ -103,10 +109,11 @@ def _read(
 
 
 def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: LoggedArm) -> Path:
-    """Write a Parquet or CSV file (by suffix) with a column `trajectory`, all or nothing; return the path.
+    """Write trajectories to one Parquet or CSV file, as the suffix of the path states; return the path.
 
-    `read_logs` returns the same numbers from both formats. Parquet files declare their units. arm: see `read_logs`.
-    Raises LogError for another suffix, without trajectories, and for trajectories with another number of joints.
+    The file is complete, or not written if an error occurs. The column `trajectory` contains the names of the
+    trajectories. `read_logs` returns the same numbers from both formats. arm: see `read_logs`. Raises LogError for
+    another suffix, if there are no trajectories, and for trajectories whose number of joints differs from the arm's.
     """
     path, joints = Path(path), log_source(arm).joints
     if path.suffix not in (".parquet", ".csv"):
@@ -121,7 +128,7 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     for quantity in trajectories[0].quantities:
         values = joined_column(trajectories, quantity)
         columns |= {f"{quantity}_{joint}": column for joint, column in zip(joints, values.T, strict=True)}
-    # the file states that it is in SI units, so that no mapping is applied when it is read back
+    # the declaration of SI units in the metadata prevents that a mapping is applied when the file is read
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
     with replacing(path) as unfinished:
         if path.suffix == ".csv":
@@ -132,9 +139,9 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
 
 
 def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Return the trajectories with the shortest names that are unique."""
+    """Return the trajectories with unique names: the name, or file stem and name, or path and name."""
     names: list[str] = []
-    # short names first: they occur in tables and messages
+    # the shortest form that is unique is used, since names occur in tables and messages
     for form in ("{0.name}", "{0.file.stem}/{0.name}", "{0.file}/{0.name}"):
         names = list(map(form.format, trajectories))
         if len(set(names)) == len(names):

@@ -1,4 +1,4 @@
-"""Conversion of rows in SI units to trajectories: order, wraps, repeats, outliers, velocities, delay of torques."""
+"""Conversion of rows in SI units to trajectories: sorting, unwrapping, removal of repeats, velocities, torque delay."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -16,14 +16,15 @@ from spelgen.logs.values import foreign_rows
 from spelgen.settings.log_mapping import LogMapping
 
 Repaired = tuple[np.ndarray, tuple[str, ...]]
-"""Rows of a log (T, C), and messages on their changes."""
+"""Rows of a log (T, C) after a repair, and messages about the changes."""
 
 
 def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:
-    """Return a trajectory of these rows (T, C) in SI units, velocities differentiated if none were logged.
+    """Return the trajectory of the rows `data` (T, C) in SI units, whose columns the layout describes.
 
-    Before the differentiation, wrapped angles and overflowed registers are unwrapped, and repeated rows are removed;
-    with 'dropouts: dropped' lost rows and outliers are removed, too.
+    First wrapped angles and overflowed registers are unwrapped, and repeated rows are removed; with the setting
+    'dropouts: dropped' lost rows and outliers are removed, too. Velocities that were not logged are then computed by
+    differentiation, and torques are shifted by the mapping's delay. repairs: messages about earlier changes of rows.
     """
     mapping = layout.mapping
     signals = mapping.signals(layout.joints)
@@ -47,7 +48,10 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
 
 
 def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> Repaired:
-    """Return rows (T, C) in which signals with a period are unwrapped, and remarks."""
+    """Return rows (T, C) in which the signals with a period in the mapping are unwrapped, and remarks about them.
+
+    signals: quantity and joint of each column after the times.
+    """
     remarks: list[str] = []
     if not any(mapping.word("period", *signal) for signal in signals):
         return data, ()
@@ -60,9 +64,10 @@ def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping
         count = jump_count(column, period)
         result = unwrapped(column, period)
         if quantity == "u":
-            # commands are close to positions; their registers may start in different revolutions
+            # Registers of commands and of positions may start in different revolutions: the median difference of the
+            # unwrapped signals is reduced to less than half a period
             result = result - period * np.round(np.median(result - values["q", joint]) / period)
-        # angles are centred within half a turn only if they wrap
+        # an angle that does not wrap keeps its logged revolution; all other signals are centred about zero
         elif count or abs(period - 2 * pi) > 1e-6:
             offset = mapping.offset(quantity, joint)
             result = centred(result - offset, period) + offset
@@ -73,13 +78,17 @@ def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping
 
 
 def _without_repeats(data: np.ndarray, positions: int, mapping: LogMapping) -> Repaired:
-    """Return rows (T, C), without repeats if all rows are repeated or 'dropouts: dropped' is set, and messages."""
-    # too short to distinguish motion from rest; an archive may have thousands of such recordings
+    """Return rows (T, C) without repeated rows, and a message about the repeats.
+
+    Repeats are removed if every row is written several times, or with the setting 'dropouts: dropped'; otherwise they
+    are only reported. positions: number of columns of positions.
+    """
+    # a recording of so few rows does not show whether the arm moves or rests
     if len(data) < TUNING.jump_window:
         return data, ()
     repeats, copies = repeated_rows(data[:, 1:], positions)
     count = int(np.count_nonzero(repeats))
-    # so few have no effect on a fit
+    # up to 2 % of repeated rows have no effect on a fit
     if count <= 0.02 * len(data):
         return data, ()
     rate = (len(data) - 1 - count) / (data[-1, 0] - data[0, 0])
@@ -94,7 +103,7 @@ def _without_repeats(data: np.ndarray, positions: int, mapping: LogMapping) -> R
 
 
 def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> Repaired:
-    """Return rows (T, C) without lost samples and outliers, and messages that list them."""
+    """Return rows (T, C) without lost samples, outliers and stale values, and a message that lists the removed rows."""
     outliers = np.zeros(len(data), bool)
     dropped = []
     columns = dict(zip(signals, data[:, 1:].T, strict=True))
@@ -102,7 +111,7 @@ def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> R
         rows = outlier_rows(quantity, values)
         if ("qd", joint) in columns:
             rows |= stale_rows(quantity, values, data[:, 0], columns["q", joint], columns["qd", joint])
-        # commands may jump
+        # jumps of commands are no faults
         if quantity != "u" and rows.any():
             outliers |= rows
             dropped.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
@@ -113,36 +122,45 @@ def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> R
 
 
 def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau"; zero velocities are not lost."""
+    """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau".
+
+    Velocities of exactly 0 are no lost samples: a joint at rest has them.
+    """
     rows = is_outlier(values, smooth=quantity == "q")
     return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
 
 
 def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of samples of "q", "qd" or "tau" of a moving joint that repeat an old value for long.
+    """Return a mask (T,) of the samples of "q", "qd" or "tau" that repeat an old value although the joint moves.
 
-    A torque at its largest or smallest value is not stale, but clipped, and the last one may be of a motor at rest.
+    A constant torque at its largest or smallest value is clipped, not stale. A constant torque at the end of a
+    recording is accepted, since the motor may be at rest.
     """
     if quantity == "tau":
         stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
         return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
     from scipy.integrate import cumulative_trapezoid  # takes long to import
 
-    return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)  # rad, m
+    # if q or qd is frozen, the integral of qd drifts from q; a drift of more than 0.05 rad or m is evidence
+    return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)
 
 
 def listed_times(t: np.ndarray) -> str:
-    """Return a text with the first of the times (T,) [s] and the number of the others."""
+    """Return a text that lists the first few of the times (T,) [s] and the number of the remaining times."""
     times = ", ".join(f"{x:.4g}" for x in t[: TUNING.listed].tolist())
     unlisted = len(t) - TUNING.listed
     return f"{times} s" + (f" and {unlisted} more" if unlisted > 0 else "")
 
 
 def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaired:
-    """Return the values (T, C) of rows of a file with increasing times, and messages about repairs.
+    """Return the values (T, C) with increasing times, and messages about repairs.
 
-    Rows are sorted if this makes the positions smoother. Of several rows with one time the first is kept, or the times
-    are reconstructed if the clock is coarse. Raises LogError for a clock that restarts or is too coarse.
+    Rows are sorted by time if this makes the positions smoother. Of several rows with equal times the first is kept; if
+    the resolution of the clock is too low for the rows, evenly spaced times are reconstructed instead. Rows of another
+    topic or publisher are removed.
+
+    data: (T, C) values in SI units. rows: (T,) row numbers in the file, for errors. Raises LogError for a clock that
+    restarts, and for times that cannot be reconstructed.
     """
     repairs: tuple[str, ...] = ()
     foreign = foreign_rows(data, len(layout.joints))
@@ -158,14 +176,15 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
     if late:
         ordered = data[np.argsort(t, kind="stable")]
         positions = slice(1, 1 + len(layout.joints))
-        # sorting must not interleave two recordings in one file
+        # the clock of two recordings in one file restarts: sorting would interleave them, with rougher positions
         if _roughness(ordered[:, positions]) > _roughness(data[:, positions]):
             raise _backward_times(t, rows, layout)
         data = ordered
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
-    # many rows with equal times and different values: the clock is coarse; up to ten are accidental
+    # Many rows with equal times and different values show that the resolution of the clock is too low. Up to ten such
+    # rows, or 2 %, count as accidental.
     if np.count_nonzero(differs) > max(10, 0.02 * len(data)):
         t, message = _reconstructed(data[:, 0], layout)
         return np.column_stack([t, data[:, 1:]]), (*repairs, message)
@@ -177,13 +196,13 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
 
 
 def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
-    """Return evenly spaced times (T,) for times of a coarse clock, and a message.
+    """Return evenly spaced times (T,) [s] for times t (T,) of a clock with a low resolution, and a message.
 
-    Raises LogError unless each time equals the evenly spaced one within a tick of the clock.
+    Raises LogError if a reconstructed time differs from the logged one by more than a tick of the clock.
     """
     steps = np.diff(t)
     tick = float(steps[steps > 0].min(initial=np.inf))
-    # a step longer than the rounding of the clock explains is a gap
+    # a step that is too long for the resolution of the clock is a gap; times are evenly spaced between gaps only
     holes = np.flatnonzero(steps > TUNING.gap * max(tick, float(steps.mean()))) + 1
     times, rates = t.copy(), []
     for start, stop in pairwise([0, *holes.tolist(), len(t)]):
@@ -205,14 +224,14 @@ def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
 
 
 def _roughness(positions: np.ndarray) -> float:
-    """Return the path length of positions (T, n), summed over joints and relative to their ranges."""
+    """Return the roughness of positions (T, n): each joint's path length divided by its range, summed over joints."""
     ranges = np.ptp(positions, axis=0)
     length = np.abs(np.diff(positions, axis=0)).sum(axis=0)
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
 
 
 def _backward_times(t: np.ndarray, rows: np.ndarray, layout: Layout) -> LogError:
-    """Return the error of times (T,) that do not increase; rows: their numbers in the file."""
+    """Return the error about times t (T,) [s] that do not increase. rows: (T,) row numbers in the file."""
     backward = np.flatnonzero(np.diff(t) < TUNING.shortest_step)
     k = backward[0]
     got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"
@@ -221,19 +240,22 @@ def _backward_times(t: np.ndarray, rows: np.ndarray, layout: Layout) -> LogError
 
 
 def _pieces(t: np.ndarray) -> Iterator[slice]:
-    """Yield the gap-free pieces of at least two samples of times (T,)."""
+    """Yield the rows of each gap-free piece of at least two samples in the times t (T,)."""
     yield from (slice(start, stop) for start, stop in pairwise(gap_ends(t)) if stop - start > 1)
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Return delayed values (T, n) shifted back by the delay [s], constant at the ends of each gap-free piece."""
+    """Return delayed values (T, n), sampled at times t (T,), shifted back by the delay [s].
+
+    Beyond the ends of a gap-free piece the values are constant.
+    """
     if not delay:
         return values
-    from scipy.interpolate import CubicSpline  # takes long to import, as in `low_pass`
+    from scipy.interpolate import CubicSpline  # imported only if needed, since the import takes long
 
     moved = values.copy()
     for rows in _pieces(t):
-        # cubic: linear interpolation would attenuate high frequencies of the torques
+        # a cubic spline, since linear interpolation would attenuate high frequencies of the torques
         spline = CubicSpline(t[rows], values[rows])
         moved[rows] = spline(np.clip(t[rows] + delay, t[rows][0], t[rows][-1]))
     return moved

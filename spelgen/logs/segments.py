@@ -1,4 +1,4 @@
-"""Collector of recordings from log tables: complete, or as evenly spread segments within a bound of memory."""
+"""Collector of recordings from log tables, which keeps all rows, or evenly spread segments within a bound of memory."""
 
 from collections.abc import Iterator
 from math import inf
@@ -15,7 +15,7 @@ from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import clock_start, values_in_si
 
 Piece = tuple[int, str, np.ndarray]
-"""Number and name of a recording, and rows of it."""
+"""Number of a recording, its name, and the row numbers (T,) of a part of the recording."""
 
 
 class Segment(NamedTuple):
@@ -24,6 +24,7 @@ class Segment(NamedTuple):
     Attributes:
         recording: number of the recording among all recordings.
         name: name of the recording.
+        layout: columns of the file.
         rows: (T,) row numbers in the file, from 0.
         values: (T, C) columns of the layout in SI units.
     """
@@ -36,10 +37,11 @@ class Segment(NamedTuple):
 
 
 class LogSegments:
-    """Segments of all recordings, numbered in the order of the files; one of `every` segments is kept.
+    """Collector of segments of recordings. Segments are numbered in the order of the files; every k-th one is kept.
 
-    `every` is doubled whenever the kept segments would exceed `kept_bytes`, so that the kept segments are evenly
-    spread over all files, and the selection depends only on the files. Without a bound each recording is one segment.
+    The attribute `every` is k. It is 1 at first, and doubled whenever the kept segments would exceed `kept_bytes`.
+    Therefore the kept segments are evenly spread over all files, and the selection depends only on the files. Without a
+    bound of memory each recording is one segment. The attribute `rows` is the number of all rows.
     """
 
     def __init__(self, kept_bytes: float = inf) -> None:
@@ -50,7 +52,7 @@ class LogSegments:
         self._bytes = self._recordings = self._count = 0
 
     def add(self, layout: Layout, table: pa.Table) -> None:
-        """Add the recordings of a table. Raises LogError for values that are no numbers in the kept rows."""
+        """Add the recordings of a table. Raises LogError if it is empty, and for kept values that are not numbers."""
         if not table.num_rows:
             raise LogError("no rows", file=layout.file, expected="at least one window of samples")
         start, pieces = clock_start(table, layout), []
@@ -59,7 +61,8 @@ class LogSegments:
             pieces += [(self._recordings, name, piece) for piece in np.array_split(rows, count)]
             self._recordings += 1
         pieces = self._selected(pieces, 8 * len(layout.columns))
-        # a table that is kept completely is converted at once: this is faster, and errors count its rows
+        # A table that is kept completely is converted in one call. This is faster than a call per recording, and an
+        # error states how many rows of the whole table have the fault.
         data = values_in_si(table, layout, start, range(table.num_rows)) if self.every == 1 else None
         for recording, name, rows in pieces:
             values = values_in_si(_taken(table, rows), layout, start, rows) if data is None else data[rows]
@@ -68,8 +71,8 @@ class LogSegments:
         self.rows += table.num_rows
 
     def trajectories(self) -> Iterator[Trajectory | LogError]:
-        """Yield each kept recording, or the error of its times, and remove its segments."""
-        # each segment is released once it is joined: their memory is not needed twice
+        """Yield the trajectory of each recording, or the error about its times, and remove the recording's segments."""
+        # segments are removed from the list when they are joined, so that their memory is not needed twice
         segments, self._segments = self._segments[::-1], []
         while segments:
             group = [segments.pop()]
@@ -85,33 +88,37 @@ class LogSegments:
                 yield error
 
     def _selected(self, pieces: list[Piece], row_bytes: int) -> list[Piece]:
-        """Return the pieces of a table to keep, after the removal of segments that exceed the bound of memory."""
+        """Return the pieces of a table that are kept; remove earlier segments if the bound of memory is exceeded.
+
+        row_bytes: memory of one row of the table [B].
+        """
         while True:
             selected = pieces[-self._count % self.every :: self.every]
             size = self._bytes + row_bytes * sum(len(rows) for _, _, rows in selected)
             if size <= self._kept_bytes or len(self._segments) + len(selected) <= 1:
                 self._count += len(pieces)
                 return selected
-            # each second segment is dropped, so that the others remain evenly spread
+            # every second segment is removed, so that the remaining segments are evenly spread
             self.every *= 2
             self._segments = self._segments[::2]
             self._bytes = sum(x.values.nbytes for x in self._segments)
 
 
 def _taken(table: pa.Table, rows: np.ndarray) -> pa.Table:
-    """Return these rows (T,) of a table; without a copy if they are consecutive."""
+    """Return the rows of a table with these numbers (T,); consecutive rows are not copied."""
     first, count = int(rows[0]), len(rows)
     return table.slice(first, count) if int(rows[-1]) - first + 1 == count else table.take(rows)
 
 
 def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]:
-    """Return name and rows (T,) of each recording of a table, in order of their first rows."""
+    """Return the name and the row numbers (T,) of each recording in a table, in order of their first rows."""
     if layout.labels is None:
         return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
-    # each label once: names of a megabyte on a million rows compress to a small file
+    # Labels are encoded as numbers, which stores each text once. A small compressed file may contain a label of a
+    # megabyte in each of a million rows.
     labels = table[layout.labels].dictionary_encode("encode").combine_chunks()
     numbers = labels.indices.to_numpy()
-    # by sorting, time and memory are proportional to the rows for any number of recordings
+    # sorting the labels avoids a pass over all rows for each recording
     rows = np.argsort(numbers, kind="stable")
     ends = np.cumsum(np.bincount(numbers))
     return list(zip(map(str, labels.dictionary.to_pylist()), np.split(rows, ends[:-1]), strict=True))

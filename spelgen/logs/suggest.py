@@ -1,6 +1,7 @@
-"""Draft of the mapping of an undescribed log, from the names and the first values of its columns.
+"""Draft of a mapping for a log without one, from the names and the first values of the log's columns.
 
-Units that neither names nor times specify remain SI: the checks of logs detect degrees, and state the lines to write.
+A quantity gets an SI unit if its unit is unknown from the column names and from the steps of the times. The checks of
+logs then detect e.g. degrees, and state which settings to write.
 """
 
 import difflib
@@ -27,13 +28,13 @@ WORDS = {
     "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega"},
     "tau": {"tau", "torque", "torques", "effort", "efforts", "current", "currents", "curr", "cur", "moment", "load"},
 }  # fmt: skip
-# set points have names similar to measurements
+# Words in the names of commanded values, which otherwise resemble the names of measured ones.
 COMMANDED = {
     "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
     "demand",
 }  # fmt: skip
 NOT_MEASURED = COMMANDED | {"error", "std"}
-# units in names, with their values in a mapping, per quantity
+# For each quantity: units as written in column names, in lower case, and the corresponding units of a mapping.
 UNITS = {
     "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "ns": "ns"},
     "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad",
@@ -44,19 +45,19 @@ UNITS = {
     "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
-BARE = {"s", "n", "a", "m"}  # letters that count as units only in brackets
+BARE = {"s", "n", "a", "m"}  # letters that are units only in brackets, since they are ambiguous otherwise
 CURRENT = {"current", "currents", "curr", "cur"}
 
 
 class Suggestion(NamedTuple):
-    """A mapping as YAML text, with comments on assumptions. missing: quantities without a column."""
+    """Draft of a mapping as YAML text, with comments on its assumptions. missing: quantities without a column."""
 
     text: str
     missing: tuple[str, ...]
 
 
 class ColumnName(NamedTuple):
-    """Name of a column, with its words and its unit."""
+    """Name of a column, with the lower-case words in it, and the unit in it ("" if it contains none)."""
 
     name: str
     words: set[str]
@@ -64,9 +65,10 @@ class ColumnName(NamedTuple):
 
 
 def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False) -> Suggestion:
-    """Return a draft of the mapping of a file. commands: whether commanded positions are read, in place of torques.
+    """Return a draft of the mapping for a log file.
 
-    Raises LogError if the file cannot be opened, or has no column of times.
+    commands: True if the log contains commanded positions instead of torques. Raises LogError if the file cannot be
+    read, and if it has no column of times.
     """
     log_format = format_of(file)
     if log_format is LEROBOT:
@@ -87,12 +89,13 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     if not columns_of["t"]:
         got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
         raise LogError(got, file=file, expected="one of times, called t or time")
-    # a header has the time of measurement, other columns may be times of receipt; else the shortest name is used
+    # Of several columns of times, the stamp in a message's header is preferred: it is the time of measurement, while
+    # others may be times of receipt. Otherwise the name with the fewest words is used.
     clock = min(columns_of.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
-    # loggers have orders of their own, ROS often the alphabetical one
+    # the order of the joints in the log is read from cells with names: loggers differ, and ROS often sorts by name
     order = _order_in_cells(table, joints)
     by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in columns_of.items()}
-    # without velocities of all joints, all are differentiated: logs have them for all joints or none
+    # a mapping has velocities of all joints or none: if one is missing, all velocities are differentiated
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)
@@ -114,7 +117,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
             lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
     used = {column.name for named in by_joint.values() for column in named.values()}
     unused = [x.name for quantity in by_joint for x in columns_of[quantity] if x.name not in used]
-    if unused:  # of a gripper, or of another arm with the same names
+    if unused:  # e.g. columns of a gripper, or of another arm with similar names
         lines.append(f"# not used: {shortened(unused, TUNING.listed)}")
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     return _suggestion(lines, missing, "column")
@@ -126,7 +129,7 @@ def _suggestion(lines: Sequence[str], missing: Sequence[str], kind: str) -> Sugg
 
 
 def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
-    """Return the mapping of a data set of LeRobot: the names of its motors."""
+    """Return a draft of the mapping for a LeRobot data set, which assigns a motor to each joint by name."""
     motors = dataset_motors(folder)
     close = {x: [x] if x in motors else difflib.get_close_matches(x, motors, n=1) for x in joints}
     lines = [
@@ -144,7 +147,7 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
 
 
 def _column_name(name: str) -> ColumnName:
-    """Return a name with its words and its unit; the unit is in brackets, or the last word."""
+    """Return the parts of a column's name; its unit is in brackets, or its last word."""
     bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d]+)[\])]", name)
     base, unit = bracketed.groups() if bracketed else (name, "")
     unit_names = set().union(*UNITS.values())
@@ -158,7 +161,11 @@ def _column_name(name: str) -> ColumnName:
 def _by_quantity(
     columns: Sequence[ColumnName], commands: bool, joints: Sequence[str]
 ) -> dict[str, list[ColumnName]]:
-    """Return the columns per quantity: by the words of their names, or else by their units."""
+    """Return the columns per quantity, which the words in a column's name determine, or else its unit.
+
+    commands: True for logs with commanded positions "u" instead of velocities and torques. joints: names of the joints;
+    a joint's name in a column's name does not count as a word for commands, even if it is one.
+    """
     by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
     names = {joint.lower() for joint in joints}
     for column in columns:
@@ -177,11 +184,12 @@ def _by_quantity(
 def _units(
     clock: ColumnName, by_joint: Mapping[str, Mapping[str, ColumnName]], table: pa.Table
 ) -> dict[str, str]:
-    """Return the units in the names of the columns; for times without one, the unit that fits their steps."""
+    """Return the unit per quantity from the names of its columns; for times without a unit, from their steps."""
     units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
     for quantity, named in by_joint.items():
         for column in named.values():
-            stated = UNITS.get(quantity, {}).get(column.unit)  # commands have the units of positions
+            # commands have no unit of their own: the unit of positions applies to them
+            stated = UNITS.get(quantity, {}).get(column.unit)
             if stated is None and quantity == "qd":
                 stated = {"deg": "deg/s", "rad": "rad/s"}.get(units.get("q", ""))
             if stated is None and quantity == "tau" and column.words & CURRENT:
@@ -192,7 +200,7 @@ def _units(
 
 
 def _unit_of_times(name: str, table: pa.Table) -> str | None:
-    """Return the unit of a column of times in which its median step is plausible; None if there is none."""
+    """Return the unit in which the median step of a column of times is plausible; None if no unit is."""
     if name not in table.schema.names:
         return None
     times = table[name].drop_null()
@@ -203,7 +211,11 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
-    """Return the index per joint from cells with names of joints: a column `name0`, or a list of names per row."""
+    """Return each joint's index in the log, from cells that contain joint names.
+
+    Such cells are in columns `name0`, `name1`, ..., or in a column with a list of names per row. Only the first row is
+    used; joints without a cell are omitted.
+    """
     order: dict[str, int] = {}
     for name, column in zip(table.schema.names, table.columns if len(table) else (), strict=False):
         numbers, first = re.findall(r"\d+", name), column[0].as_py()
@@ -215,7 +227,7 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
 
 
 def _names(table: pa.Table) -> list[str]:
-    """Return the unique names of all columns, and of the elements of columns of lists."""
+    """Return the names of all columns whose name is unique; a column of lists has a name per element, like `q[0]`."""
     names: list[str] = []
     for name, column in zip(table.column_names, table.columns, strict=True):
         values = column.drop_null()
@@ -228,7 +240,11 @@ def _names(table: pa.Table) -> list[str]:
 def _by_joint(
     columns: Sequence[ColumnName], joints: Sequence[str], order: Mapping[str, int]
 ) -> dict[str, ColumnName]:
-    """Return the column per joint, by its name; if no column has one, by its last number: `order`, or ascending."""
+    """Return the column per joint: the column whose name contains the joint's name.
+
+    If no name of a column contains a joint's name, columns are assigned by the last number in their names: according to
+    `order`, index per joint, or else in ascending order of the numbers.
+    """
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
     numbers = [(re.findall(r"\d+", column.name), column) for column in columns]
     numbered = {int(match[-1]): column for match, column in numbers if match}

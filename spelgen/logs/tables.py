@@ -1,4 +1,4 @@
-"""Result of all readers of logs: a table, and its columns for the quantities of an arm."""
+"""Common result of all readers of logs: a table, and its layout, which states the column of each quantity and joint."""
 
 import difflib
 import re
@@ -17,11 +17,11 @@ from spelgen.errors import LogError, shortened
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-UNITS_KEY = b"units"  # key in the metadata of a Parquet file that declares its units
-UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # not checked for declared units
-UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # declaration in files of spelgen
+UNITS_KEY = b"units"  # key in the metadata of a Parquet file under which it declares its units
+UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # checks of units
+UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # declaration of units in files that spelgen wrote
 
-# Arrow, NumPy and zipfile raise all of these for damaged files
+# types of the errors that Arrow, NumPy and zipfile raise for damaged files
 UNREADABLE = (
     pa.ArrowException, OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
@@ -29,12 +29,19 @@ UNREADABLE = (
 
 @dataclass(frozen=True)
 class Layout:
-    """Columns of the quantities of an arm in a log, and their units.
+    """Layout of a table: the columns that contain the quantities of an arm, and the mapping with their units.
 
-    file: for errors and trajectories. columns: of t, then of q, qd and tau per joint; without qd if velocities are
-    differentiated. labels: the column with the names of recordings; None if there is none. accepted: see `Trajectory`.
-    recording: name of the recording if the format separates recordings. remarks: facts about the file.
-    header: lines of a CSV before its values.
+    Attributes:
+        file: path of the log, for errors and trajectories.
+        columns: names of the columns of t, then of q, qd and tau for each joint; without qd if velocities are
+            differentiated, and with u instead of qd and tau for logs of commands.
+        labels: column with the names of recordings; None if the table has none.
+        joints: names of the joints in the URDF.
+        mapping: mapping of the columns, with units, signs and offsets.
+        accepted: codes of checks that are omitted.
+        recording: name of the recording, if the table contains a single one of several in the file.
+        remarks: messages about properties of the file.
+        header: number of lines in a CSV file before the values.
     """
 
     file: Path
@@ -48,7 +55,7 @@ class Layout:
     header: int = 1
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about a column in a 0-based data row, with the line of a CSV."""
+        """Return an error about a column in a row of values (counted from 0), with the line number for a CSV file."""
         line = int(row) + 1 + self.header if self.file.suffix == ".csv" else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
@@ -58,12 +65,15 @@ LogTable = tuple[Layout, pa.Table]
 
 
 class LogFormat(NamedTuple):
-    """A format of logs: its files and its reader.
+    """Format of logs: its files, and its reader.
 
-    read: function of a path, the joints and the mapping that returns tables, or raises LogError. suffixes: of its
-    files.
-    columns: function that returns all columns of a file, for a draft of a mapping; None if the format defines them.
-    marker: a file in each folder that is a log of this format; folder: name of such a folder.
+    Attributes:
+        read: function of a path, the joint names and the mapping that returns tables, or raises LogError.
+        suffixes: suffixes of files in this format.
+        columns: function that returns all columns of a file, for a draft of a mapping; None if the format itself
+            defines the columns.
+        marker: path of a file that identifies a folder as a log of this format; "" if logs are single files.
+        folder: description of such a folder, for messages.
     """
 
     read: Callable[[Path, Sequence[str], LogMapping], list[LogTable]]
@@ -74,12 +84,13 @@ class LogFormat(NamedTuple):
 
 
 def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, file: Path) -> Layout:
-    """Return the layout of a table. Raises LogError if a column is missing, or occurs twice.
+    """Return the layout of a table with this schema. Raises LogError if a column is missing or occurs twice.
 
-    The mapping does not apply to files that spelgen wrote.
+    For files that spelgen wrote, only the input and the accepted checks of the mapping apply: they have SI units and
+    the default names of columns.
     """
     metadata = schema.metadata or {}
-    # e.g. simulated logs of an arm whose settings are for the logger of the real arm
+    # files of spelgen, e.g. simulated logs, are in SI units, even if the arm's mapping describes another logger
     if metadata.get(UNITS_KEY) == UNITS:
         mapping = mapping.in_si()
     columns = [mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))]
@@ -96,10 +107,11 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     if missing:
         raise missing_columns(missing, schema.names, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
-    # lists cannot be names of recordings
+    # a column of lists would raise an obscure error when it is used as names of recordings
     if labels and pa.types.is_nested(schema.field(labels).type):
         got = f"values of type {schema.field(labels).type}"
         raise LogError(got, file=file, element=f"column {labels}", expected="names")
+    # units that the file declares are not checked
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
@@ -107,7 +119,10 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
 
 
 def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
-    """Return the column of lists and the index for a name like `position[2]`; None for other names."""
+    """Return the column and the index that a name like `position[2]` refers to; None for other names.
+
+    columns: names of the table's columns.
+    """
     match = re.fullmatch(r"(.+)\[(\d{1,3})\]", name)
     if match is None or name in columns or match[1] not in columns:
         return None
@@ -115,7 +130,7 @@ def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
 
 
 def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
-    """Return the columns of a file that contain the columns of a layout, each once."""
+    """Return the file's columns that must be read for a layout, each once: for `position[2]` this is `position`."""
     elements = [list_element(name, columns) or (name, 0) for name in layout.columns]
     labels = [layout.labels] if layout.labels else []
     return list(dict.fromkeys([name for name, _ in elements] + labels))
@@ -124,12 +139,15 @@ def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
 def missing_columns(
     missing: Sequence[str], columns: Collection[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> LogError:
-    """Return the error for missing columns, with a remedy."""
+    """Return the error about missing columns of a log, with advice for the most likely cause.
+
+    columns: names of all columns of the file.
+    """
     of_quantity = {x: [mapping.column(x, joint) for joint in joints] for x in mapping.quantities}
     patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]
     of_joints = dict(zip(joints, zip(*of_quantity.values(), strict=True), strict=True))
     unlogged = [joint for joint, names in of_joints.items() if set(names) <= set(missing)]
-    # a joint without any column was not logged; a wrong name affects one of its columns
+    # a joint without any column was not logged, whereas a wrong name in the mapping affects a single column
     if unlogged and len(unlogged) < len(joints):
         logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (
@@ -138,7 +156,7 @@ def missing_columns(
         )
     elif mapping.input == "torque" and _are_commands(columns, mapping, joints):
         do = "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
-    # loggers without velocities are frequent, and have their own remedy
+    # only velocities are missing, as with many loggers: they can be computed from the positions
     elif set(missing) <= set(of_quantity.get("qd", ())):
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
@@ -152,7 +170,7 @@ def missing_columns(
 
 
 def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequence[str]) -> bool:
-    """Return True if a log has commands of all joints and no torques."""
+    """Return True if the columns of a log contain commanded positions of all joints and no torques."""
     commands = {mapping.column("u", joint) for joint in joints}
     torques = {mapping.column("tau", joint) for joint in joints}
     return commands <= set(columns) and torques.isdisjoint(columns)
@@ -161,11 +179,14 @@ def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequenc
 def _renaming(
     name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
 ) -> str:
-    """Return the advice for a missing column `name`: rename an unused column of its joint, or map the names."""
+    """Return the advice for the missing column `name`: rename a similar unused column of this joint, or map the names.
+
+    of_quantity: names of the expected columns per quantity. joints: the joints' names in the log.
+    """
     named = [
         joint for names in of_quantity.values() for x, joint in zip(names, joints, strict=True) if x == name
     ]
-    # accelerations are no torques: motions of `excite` have both names
+    # columns of accelerations are not proposed in place of torques: files of `excite` contain both
     unused = [
         x
         for x in columns
@@ -181,13 +202,13 @@ def _renaming(
 
 
 def names_joint(column: str, joint: str) -> bool:
-    """Return True if a column's name contains a joint's name as a separate word: `q_1` has 1, `q_12` has not."""
+    """Return True if a column's name contains a joint's name as a separate word: `q_1` contains 1, `q_12` does not."""
     return re.search(rf"(?<![0-9a-z]){re.escape(joint)}(?![0-9a-z])", column, re.IGNORECASE) is not None
 
 
 @contextmanager
 def reading(file: Path) -> Iterator[None]:
-    """Convert exceptions of libraries about a damaged file to a LogError with the file."""
+    """Convert the exceptions that libraries raise for a damaged file to a LogError that names the file."""
     try:
         yield
     except UNREADABLE as error:

@@ -1,4 +1,4 @@
-"""A recording of an arm: the data between log files and training samples."""
+"""Recording of an arm in SI units: the result of reading a log, from which training samples are made."""
 
 from __future__ import annotations
 
@@ -26,18 +26,19 @@ IN_SI = LogMapping()
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
-    """One uninterrupted recording of an arm with n joints, from lists, NumPy arrays or tensors; kept as float64.
+    """Recording of an arm with n joints; lists, NumPy arrays and tensors are converted to float64 arrays.
 
     t: (T,) sample times [s], strictly increasing, not necessarily regular.
     q, qd: (T, n) joint positions and velocities [rad, rad/s; m, m/s for prismatic joints].
     tau: (T, n) joint torques or forces [Nm; N]. In a simulated log tau[k] is constant from t[k] to t[k+1]; in a
-        measured log it is the torque at t[k]. (T, 0) without torques, in logs of commands u.
+        measured log it is the torque at t[k]. Logs of commands u have no torques: tau is then (T, 0).
     u: (T, n) commanded positions of joints with servos [rad; m], u[k] constant from t[k] to t[k+1]; None without
     servos.
     name: unique among the trajectories that are used together.
     file: source of the recording; None if it was not read from a file.
     accepted: codes of checks (see `spelgen.logs.checks`) that are omitted.
-    repairs, remarks: changes of the rows at reading, and facts about them. mapping: columns and units of the log.
+    repairs: messages about rows that the reader changed or removed. remarks: messages about properties of the log.
+    mapping: columns and units of the log.
     Raises LogError for inconsistent shapes, for numbers that are not finite or impossibly large, and for times that do
     not increase.
     """
@@ -57,7 +58,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         columns = ("t", *self.quantities)
         for column in columns:
-            # the dataclass is frozen, and accepts lists and tensors
+            # converts lists and tensors; the frozen dataclass does not allow a normal assignment
             object.__setattr__(self, column, self._as_array(column))
         if self.t.ndim != 1 or not self.t.size:
             raise self.error(f"an array of shape {self.t.shape}", "(T,), a time for each sample", column="t")
@@ -75,7 +76,7 @@ class Trajectory:
                 is_finite = np.isfinite(values[row]).all()
                 expected = f"numbers below {largest:g}" if is_finite else "finite numbers"
                 raise self.error(f"{values[row].tolist()} at sample {row}", expected, column=column)
-        # a step of nearly zero would give infinite velocities
+        # a time step of nearly zero would give infinite velocities by differentiation
         backward = np.flatnonzero(np.diff(self.t) < TUNING.shortest_step)
         if backward.size:
             k = backward[0]
@@ -86,18 +87,18 @@ class Trajectory:
         return len(self.t)
 
     def __getitem__(self, rows: slice) -> Trajectory:
-        """Return the recording reduced to these rows."""
+        """Return a recording that contains only the samples of a slice."""
         u = None if self.u is None else self.u[rows]
         return replace(self, t=self.t[rows], q=self.q[rows], qd=self.qd[rows], tau=self.tau[rows], u=u)
 
     def column(self, name: str) -> np.ndarray:
-        """Return t, q, qd, tau or u, (T,) or (T, n); (0,) for commands that were not logged."""
+        """Return t (T,), or q, qd, tau or u (T, n), by name; an empty array for commands that were not logged."""
         values: np.ndarray | None = getattr(self, name)
         return np.zeros(0) if values is None else values
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Names of its columns except times: q, qd, and tau or u."""
+        """Names of the signals: q, qd, and u for logs of commands, else tau."""
         return QUANTITIES if self.u is None else ("q", "qd", "u")
 
     @property
@@ -107,13 +108,16 @@ class Trajectory:
 
     @property
     def sample_rate(self) -> float:
-        """Sample rate outside gaps [Hz], from the mean time step; the median of jittered steps would be biased."""
+        """Sample rate outside gaps [Hz], the inverse of the mean time step; 0 for a single sample.
+
+        The median time step would be biased by jitter.
+        """
         steps = self.regular_steps
         return float(1.0 / steps.mean()) if steps.size else 0.0
 
     @property
     def regular_steps(self) -> np.ndarray:
-        """Times (T,) [s] between samples, without gaps, since a pause of a minute could halve the rate."""
+        """Time steps between samples [s], without the gaps: a pause of a minute could halve the sample rate."""
         steps = np.diff(self.t)
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 
@@ -141,7 +145,7 @@ class Trajectory:
 
 
 def require_torques(trajectories: Sequence[Trajectory]) -> None:
-    """Raise LogError for trajectories without torques."""
+    """Raise LogError if a trajectory has commanded positions instead of torques."""
     for trajectory in trajectories:
         if trajectory.u is not None:
             do = "arms under position servos are fitted and judged by `train` and `evaluate`"
@@ -156,7 +160,7 @@ def require_commands(trajectory: Trajectory) -> np.ndarray:
 
 
 def trajectory_listing(trajectories: Sequence[Trajectory]) -> Listing:
-    """Return trajectories as a table: samples, duration, sample rate, joints."""
+    """Return a table of trajectories with the numbers of samples and joints, duration and sample rate."""
     head = ("trajectory", "samples", "duration", "sample rate", "joints")
     return Listing("Trajectories", head, tuple(map(_summary, trajectories)))
 
@@ -167,19 +171,19 @@ def _summary(x: Trajectory) -> tuple[str, ...]:
 
 
 def require_joints(trajectory: Trajectory, joints: Sequence[str]) -> None:
-    """Raise LogError unless the trajectory has a column for each of these joints."""
+    """Raise LogError unless the number of joints in the trajectory is the number of these joints."""
     count = trajectory.q.shape[1]
     if count != len(joints):
         raise trajectory.error(f"{count} joints", f"{len(joints)}: {', '.join(joints)}")
 
 
 def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
-    """Return the first rows of the gap-free pieces of times (T,), and T.
+    """Return the first row of each gap-free piece of the times t (T,) [s], followed by T.
 
-    gap: shortest gap in median steps; hole: in [s].
+    gap, hole: a gap is a time step longer than `gap` median steps and longer than `hole` [s].
     """
     steps = np.diff(t)
-    # few recordings have gaps, and the median takes most of the time
+    # few recordings have gaps: this test avoids the median, which takes most of the time
     if not steps.size or steps.max() <= gap * steps.min():
         return [0, len(t)]
     return [0, *(np.flatnonzero(steps > max(gap * np.median(steps), hole)) + 1).tolist(), len(t)]
@@ -188,27 +192,33 @@ def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
 def split_at_gaps(
     trajectory: Trajectory, gap: float = GAP, hole: float = 0.0, *, shortest: int = 1
 ) -> list[Trajectory]:
-    """Return the gap-free pieces of at least `shortest` samples, in order; each has the name of the trajectory."""
+    """Return the gap-free pieces of a trajectory that have at least `shortest` samples, in order, all with its name.
+
+    gap, hole: see `gap_ends`.
+    """
     ends = gap_ends(trajectory.t, gap, hole)
-    # a trajectory without gaps is not copied: it would be validated again
+    # a trajectory without gaps is returned itself, since a copy would be validated again
     pieces = [trajectory[start:stop] for start, stop in pairwise(ends)] if len(ends) > 2 else [trajectory]
     return [piece for piece in pieces if len(piece) >= shortest]
 
 
 def joined_column(trajectories: Sequence[Trajectory], name: str) -> np.ndarray:
-    """Return a column of all trajectories joined, (T,) or (T, n), by its name: t, q, qd, tau or u."""
+    """Return a signal of all trajectories, concatenated: t (T,), or q, qd, tau or u (T, n), by name."""
     return np.concatenate([x.column(name) for x in trajectories])
 
 
 def set_aside(items: Sequence[T], numbers: np.ndarray) -> tuple[list[T], list[T]]:
-    """Return two lists: the items whose indices are not in `numbers` (k,), and the others, both in order."""
+    """Return the items whose indices are not in `numbers` (k,), and the items whose indices are, both in order."""
     chosen = set(numbers.tolist())
     remaining = [item for k, item in enumerate(items) if k not in chosen]
     return remaining, [item for k, item in enumerate(items) if k in chosen]
 
 
 def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
-    """Return the total duration `seconds` and, per joint, the ranges of `q` and `qd` with histograms of samples."""
+    """Return the motion that logs cover, in JSON form: the duration [s], and ranges and histograms of `q` and `qd`.
+
+    Keys: `seconds`; `q` and `qd` with `low`, `high` and the `counts` of 24 bins for each joint.
+    """
     result: dict[str, object] = {"seconds": _rounded(sum(log.duration for log in logs))}
     for name in ("q", "qd"):
         joints = []
@@ -220,36 +230,36 @@ def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
 
 
 def _rounded(value: float) -> float:
-    """Return a value to five significant digits."""
+    """Return a value rounded to five significant digits."""
     return float(f"{value:.5g}")
 
 
 LogRows = tuple[Trajectory, slice]
-"""A part of a log: rows from start to stop."""
+"""Part of a log: the trajectory, and a slice of its rows."""
 
 
 def steps_between(trajectory: Trajectory, longest: float = 3.4e-3) -> int:
-    """Return the number of steps of at most ``longest`` [s] into which the interval between samples is divided."""
-    # the default: longer steps of motion under position servos bias armatures by a few per cent (measured)
+    """Return the number of integration steps per sample interval, so that a step is at most ``longest`` [s]."""
+    # default of 3.4 ms: with longer steps, fits of position servos had armatures biased by a few per cent
     return max(1, math.ceil(1 / (trajectory.sample_rate * longest) - 1e-6))
 
 
 def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: int) -> np.ndarray:
-    """Return the means (K, steps, n) of the delayed commands over the steps between the samples of ``rows``; delay
-    [s].
+    """Return the delayed commands (K, steps, n) [rad, m], averaged over each integration step.
 
-    Each command is held until the next. Means are differentiable with respect to the delay; values at single times are
+    Each of the K intervals between the samples of ``rows`` is divided into ``steps`` equal steps. A command is held
+    until the next one. Means over steps are differentiable with respect to the delay [s], values at single times are
     not.
     """
     samples = trajectory.t[rows]
     earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)
-    # from the command that was held at that time
+    # the first row has the command that was held at the earliest delayed time
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
     previous = np.concatenate([u[:1], u[:-1]])  # the command held until each sample
     corners = np.concatenate(
         [t[:1] - 1e3, t]
-    )  # [s] the first command is assumed to hold before the recording
+    )  # [s] the first command is assumed to have been held for a long time before the recording
     integral = np.zeros((len(t) + 1, u.shape[1]))
     integral[1:] = np.cumsum(np.diff(corners)[:, None] * previous, axis=0)
     edges = samples[:-1, None] + np.diff(samples)[:, None] * np.arange(steps) / steps

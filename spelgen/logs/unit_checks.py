@@ -1,6 +1,7 @@
-"""Compare positions with the integrals of velocities: units, senses and columns that explain a mismatch.
+"""Checks of units, signs and columns, by a comparison of positions with the integrals of velocities.
 
-A finding with a line advises a reading of the columns under which positions and velocities agree.
+If positions and velocities contradict each other, a check searches for units, a sign or other columns with which they
+agree, and advises the corresponding settings.
 """
 
 from collections.abc import Iterator
@@ -18,8 +19,8 @@ from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SIGNALS, shows_accelerations
 from spelgen.settings.log_mapping import SCALES, TIMES
 
-TURNS = 4 * np.pi  # [rad] A joint with limits turns less: larger positions are in another unit.
-# units of loggers; SI units, which need no line, come first
+TURNS = 4 * np.pi  # [rad] largest range of a joint with limits: a larger range of q shows another unit
+# units of positions and of velocities that loggers use, per joint type; the SI unit, the default, is first
 UNITS = {
     "revolute": (("rad", "deg", "turns", "mrad"), ("rad/s", "deg/s", "rpm", "turns/s", "mrad/s")),
     "prismatic": (("m", "mm"), ("m/s", "mm/s")),
@@ -27,13 +28,13 @@ UNITS = {
 
 
 def velocity_products(trajectory: Trajectory) -> np.ndarray:
-    """Return sums of products (2n, 2n) of increments over several samples: of the integrals of qd, then of q."""
-    # imported here, since it takes half a second
+    """Return the Gram matrix (2n, 2n) of increments over ten samples: of the integrals of qd (n), then of q (n)."""
+    # imported here, since the import takes half a second
     from scipy.integrate import cumulative_trapezoid
 
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
     for piece in split_at_gaps(trajectory, shortest=2):
-        # over several samples: between neighbouring samples the quantisation of q may be larger than its change
+        # increments over several samples: between neighbours the quantisation step may be larger than the change of q
         span = min(SIGNALS.increments, len(piece) - 1)
         integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
         positions = np.concatenate([integral, piece.q], axis=1)
@@ -43,10 +44,10 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
 
 
 def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return factors (n,) by which qd must be multiplied to be dq/dt, and correlations (n, n).
+    """Return the factors (n,) between dq/dt and qd of each joint, and the correlations (n, n) of all qd and dq/dt.
 
-    Correlation (i, j) is 1 if qd of joint i is proportional to dq/dt of joint j, and NaN if one of them is at rest.
-    products: see `velocity_products`.
+    A factor times qd is dq/dt in the least-squares sense. Correlation (i, j) is between qd of joint i and dq/dt of
+    joint j; it is NaN if one of these joints is at rest. products: see `velocity_products`.
     """
     n = len(products) // 2
     qd_squares, q_squares = np.split(products.diagonal(), 2)
@@ -56,7 +57,7 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_units(signals: JointSignals) -> str | Advice | None:
-    """Find other units than the mapping states: q is more than two turns, or a multiple of the integral of qd."""
+    """Find wrong units of q or qd: a range of q of more than two turns, or dq/dt that is a multiple of qd."""
     mapping, joint = signals.trajectory.mapping, signals.joint
     if signals.step > SIGNALS.slowest_step:
         return None  # the times are in another unit
@@ -73,13 +74,14 @@ def find_units(signals: JointSignals) -> str | Advice | None:
 
 
 def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float, dict[str, Any]]]:
-    """Yield the keys of a joint for all units that its mapping does not state.
+    """Yield a distance and the settings of the joint, for all combinations of units that its mapping does not state.
 
-    Before them, the distance of the ratio of dq/dt to qd from 1, in which another unit costs something. is_far: q is
-    more than two turns.
+    The distance is |log r|, where r is the ratio of dq/dt to qd with these units, plus a penalty for units other than
+    SI. is_far: True if the range of q is more than two turns.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
-    # without velocities only the range shows a unit
+    # the ratio is known only if velocities were logged and are proportional to dq/dt; otherwise only the range of q
+    # shows a unit
     is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
     is_known &= "qd" in mapping.quantities
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
@@ -99,14 +101,14 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
 
 
 def find_time_unit(signals: JointSignals) -> str | Advice | None:
-    """Find times that are not in seconds: from a sample rate below 2 Hz, or from the ratio of dq/dt to qd."""
+    """Find times that are not in seconds: the sample rate is below 2 Hz, or dq/dt is a power of 1000 times qd."""
     step, is_stated = signals.step, signals.trajectory.mapping.units.t != "s"
     message, unit = f"a sample every {step:.3g} s", time_unit(step)
     if step <= SIGNALS.slowest_step:
         message = f"q that changes {signals.factor:.3g} times as fast as qd"
         unit = next((x for x in TIMES if x != "s" and signals.changes_by(TIMES[x])), None)
     elif signals.number:
-        return None  # reported once, and not for each joint
+        return None  # reported for the first joint only, since all joints share the times
     elif unit is not None:
         message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
     if unit is None or is_stated:
@@ -115,23 +117,24 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 
 
 def time_unit(step: float) -> str | None:
-    """Return the unit of time in which a step between samples is plausible for a robot's log; None if there is none."""
-    # units differ by a factor of 1000, the range of plausible steps by 5000: the first plausible unit is the largest
+    """Return the unit in which a time step between samples is plausible for a robot's log; None if no unit is."""
+    # Several units may be plausible, since they differ by factors of 1000, and the plausible steps range over a factor
+    # of 5000. The largest plausible unit is returned.
     slowest, fastest = SIGNALS.slowest_step, SIGNALS.fastest_step
     return next((unit for unit, size in TIMES.items() if fastest <= step * size <= slowest), None)
 
 
 def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
-    """Find velocities that are not the derivative of the positions, and the columns or the sense that fit better."""
+    """Find velocities that are not the derivative of the positions, and a sign or other columns that fit better."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
-    # times in another unit are a finding of the first joint already
+    # times in a wrong unit also make dq/dt wrong; the check of times reports this cause
     if signals.step > SIGNALS.slowest_step:
         return None
     if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
         return None
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
-        return message  # of two samples every correlation is 1
+        return message  # too few increments for evidence: two samples always have a correlation of 1 or -1
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
         return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
@@ -149,7 +152,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
 
 
 def find_held(signals: JointSignals) -> str | None:
-    """Find signals whose values are held over several rows."""
+    """Find signals of a moving joint that keep each value for several rows."""
     rate = signals.trajectory.sample_rate
     for name in signals.measured:
         often = held_samples(signals.signal(name))
@@ -160,7 +163,7 @@ def find_held(signals: JointSignals) -> str | None:
 
 
 def find_too_rare(signals: JointSignals) -> str | Advice | None:
-    """Find held signals from which no acceleration can be computed; arms under servos need none."""
+    """Find held signals whose values change too rarely to compute accelerations; arms under servos need none."""
     rate = signals.trajectory.sample_rate
     if signals.trajectory.u is not None or not shows_accelerations(rate):
         return None
@@ -168,17 +171,17 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
     message = find_held(signals)
     if message is None or shows_accelerations(rate / max(repeated.values())):
         return None
-    # positions that are new show the velocities
+    # if only velocities are held, they can be computed from the positions instead
     is_mended = all(often == 1 for name, often in repeated.items() if name != "qd")
     return Advice(message, keys={"velocity": "differentiated"}) if is_mended else message
 
 
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
-    """Find velocities that are the magnitude of dq/dt."""
-    # largest velocity of the rarer sign, relative to the largest velocity, of a signal without sign
+    """Find velocities without sign: qd is |dq/dt|."""
+    # share: qd has no sign if its extreme velocity of one sign is below 5 % of its extreme velocity of the other sign
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
     lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
-    # the velocity noise of a joint at rest has both signs
+    # velocities of both signs are not magnitudes, and differentiated ones cannot lack their sign
     if trajectory.mapping.velocity == "differentiated" or lowest > share * highest or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)

@@ -1,4 +1,4 @@
-"""Conversion of logged columns to numbers in SI units with the URDF's signs; errors name rows without a number."""
+"""Conversion of logged columns to numbers in SI units, with the URDF's signs."""
 
 from collections.abc import Sequence
 from itertools import starmap
@@ -19,14 +19,20 @@ Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 
 
 def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows: Rows) -> np.ndarray:
-    """Return the columns of a layout (T, C) in SI units. start: time that becomes 0. rows: row numbers in the file.
+    """Return the columns of a layout as numbers (T, C) in SI units.
 
     Rows of another topic or publisher (see `foreign_rows`) contain NaN. Raises LogError, with row and column, for
-    values that are not numbers, or beyond the range of any arm.
+    values that are not numbers, and for values beyond the range of any arm.
+
+    Args:
+        table: the logged columns.
+        layout: names of the columns, and the mapping with units, signs and offsets.
+        start: logged time that becomes 0; None: times are unchanged.
+        rows: (T,) row numbers in the file, for errors.
     """
     times, unit = _clock(table, layout)
     if start is not None:
-        # subtracted as integers: 1.7e18 ns as a double has no microseconds
+        # subtracted as integers before the conversion: doubles near 1.7e18 ns are 256 ns apart
         times = pa.compute.subtract(times, start)
     logged = [_floats(times, layout.columns[0], layout, rows)]
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
@@ -36,7 +42,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         logged.append(signed(values, sign_bit) if sign_bit else values)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
     offsets = np.array([0.0, *starmap(mapping.offset, signals)])
-    # overflows are reported below, with their rows
+    # warnings of NumPy are suppressed, since values that overflow are reported below with their rows
     with np.errstate(over="ignore", invalid="ignore"):
         data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
     largest = np.array([TUNING.latest, *[TUNING.largest_value] * len(signals)])
@@ -59,27 +65,33 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 
 
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
-    """Return a mask (T,) of the rows of another topic or publisher: without values, or with positions only."""
+    """Return a mask (T,) of the rows that another topic or publisher logged: all values except positions are missing.
+
+    data: (T, 1 + C), times and values. joints: number of joints, whose positions are the first values.
+    """
     empty = np.isnan(data[:, 1 + joints :])
     return np.asarray(empty.all(axis=1))
 
 
 def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
-    """Return the origin of times: the first time if the clock shows the date, else None."""
+    """Return the logged time that becomes 0: the first time if the times are dates; None for relative times."""
     first_row = table.slice(0, 1)
     times, _ = _clock(first_row, layout)
     is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
     if not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
         return None
-    # seconds since 1970 as floating-point numbers have too few digits; a clock that starts with the recording stays
-    # below 1e8 in any unit
+    # Dates are times since 1970, which as floating-point numbers have too few digits. Times of a clock that starts with
+    # the recording are below 1e8 in any unit.
     first = times[0].as_py()
     is_date = first is not None and (is_stamp or 1e8 < abs(first) < np.inf)
     return times[0] if is_date else None
 
 
 def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
-    """Return the times as plain numbers, and their unit [s]. Raises LogError for dates beyond the range of Arrow."""
+    """Return the column of times as numbers, and the unit of these numbers in seconds.
+
+    Raises LogError for dates beyond the range of Arrow.
+    """
     name = layout.columns[0]
     times = _column(table, name)
     if not pa.types.is_temporal(times.type):
@@ -99,7 +111,10 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
 
 
 def _column(table: pa.Table, name: str) -> Column:
-    """Return a column, or for a name like `position[2]` this element of each of its lists; lists may be text."""
+    """Return a column, or for a name like `position[2]` the element 2 of each list in the column `position`.
+
+    A list may also be written as text, such as "[0.1, 0.2]".
+    """
     element = list_element(name, table.schema.names)
     if element is None:
         return table.column(name)
@@ -108,7 +123,7 @@ def _column(table: pa.Table, name: str) -> Column:
     if is_text:
         bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[(]\s*|\s*[\])].*$", "")
         lists = pa.compute.split_pattern_regex(bare, r"[,;\s]+")
-    # a list that is too short has a missing number, for which Arrow would raise an error
+    # an element beyond the end of a list becomes a missing number, where Arrow would raise an error
     long_enough = pa.compute.greater(pa.compute.list_value_length(lists), index)
     lists = pa.compute.if_else(long_enough, lists, pa.scalar(None, lists.type))
     elements = pa.compute.list_element(lists, index)
@@ -116,13 +131,17 @@ def _column(table: pa.Table, name: str) -> Column:
 
 
 def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray:
-    """Return a column as float64 (T,)."""
+    """Return the values of a column as float64 (T,).
+
+    name: name of the column in errors. rows: (T,) row numbers in the file. Raises LogError for a value that is not a
+    number.
+    """
     try:
-        # integers beyond 2^53, such as times in nanoseconds, are rounded
+        # an unsafe cast rounds integers beyond 2^53, such as times in nanoseconds; a safe one would raise an error
         floats = values.cast(pa.float64(), safe=not pa.types.is_integer(values.type))
         return np.asarray(floats.to_numpy(zero_copy_only=False))
     except (pa.ArrowException, ValueError) as error:
-        # Arrow's error does not contain the row
+        # the error of Arrow does not contain the row of the value, which is therefore searched
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
         for index, text in enumerate(texts):
             if text and not is_number(text):

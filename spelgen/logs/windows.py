@@ -1,4 +1,4 @@
-"""Windows of a few samples, cut from gap-free trajectories, and the split into training and validation."""
+"""Windows of a few samples, cut from gap-free trajectories, and the split of logs into training and validation."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.logs.trajectory import Trajectory, set_aside
 
 LAST_PART = " (last part)"
-"""Suffix of the name of the part of a trajectory that validates a fit to the other part."""
+"""Suffix of a trajectory's name for its last part, which is used for validation, while the first part is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """W windows of K consecutive samples of n joints, with the log's own times.
+    """W windows of K consecutive samples of n joints.
 
-    dt: (W, K-1) steps between the samples [s].
-    q, qd: (W, K, n) measured positions and velocities.
-    tau: (W, K-1, n) the input, constant over each step.
-    z: (W, n, B) [rad, m] bristle states of friction at the first sample, from the history of motion; None: unknown.
+    dt: (W, K-1) time steps between the samples [s], which need not be equal.
+    q, qd: (W, K, n) measured positions and velocities [rad, rad/s; m, m/s].
+    tau: (W, K-1, n) input, constant over each step: torques [Nm, N].
+    z: (W, n, B) [rad, m] states of the B friction bristles per joint at the first sample, computed from the history of
+        motion; None if not computed.
     """
 
     dt: torch.Tensor
@@ -41,7 +42,7 @@ class Windows:
         return Windows(*(x[rows] for x in self.columns()))
 
     def split(self, size: int) -> list[Windows]:
-        """Return consecutive parts of at most `size` windows."""
+        """Return the windows divided into consecutive batches of at most `size` windows."""
         return [self[start : start + size] for start in range(0, len(self), size)]
 
     def to(self, device: str | torch.device) -> Windows:
@@ -49,18 +50,18 @@ class Windows:
         return Windows(*(x.to(device) for x in self.columns()))
 
     def columns(self) -> list[torch.Tensor]:
-        """Return the tensors that are not None."""
+        """Return the tensors dt, q, qd, tau and, if it is not None, z."""
         columns = [self.dt, self.q, self.qd, self.tau]
         return columns if self.z is None else [*columns, self.z]
 
 
 def thinned(windows: Windows, count: int) -> Windows:
-    """Return at most ``count`` windows, evenly spread."""
+    """Return an evenly spaced subset of at most ``count`` windows."""
     return windows[:: -(-len(windows) // count)]
 
 
 def joined(batches: Sequence[Windows]) -> Windows:
-    """Return one batch of all windows, in order."""
+    """Return one batch that contains the windows of all batches, in order."""
     columns = zip(*map(Windows.columns, batches), strict=True)
     return Windows(*map(torch.cat, columns))
 
@@ -74,12 +75,21 @@ def cut_windows(
     measured: bool,
     reach: BristleReach | None = None,
 ) -> Windows:
-    """Return all windows of `window` samples, `decimation` apart, that start at every `stride`-th sample of a piece.
+    """Return the windows of gap-free pieces. The input of a step is the time average of the torque over the step.
 
-    The input of each step is its mean over time. measured: False: tau[k] is constant from t[k] to t[k+1], as in a
-    simulation with zero-order hold. True: tau[k] was measured at t[k], and the input of a step is the mean of both
-    ends; a constant tau[k] would have a delay of half a sample. reach: (n, B) break-away displacements of the bristles
-    whose states z are computed, zero at the start of each piece. Raises LogError if there is no window.
+    Args:
+        pieces: trajectories without gaps.
+        window: number of samples of a window.
+        stride: number of samples of a piece from the start of a window to the start of the next window.
+        decimation: number of samples of a piece from one sample of a window to the next.
+        measured: False: tau[k] is constant from t[k] to t[k+1], as in a simulation with zero-order hold. True: tau[k]
+            was measured at t[k], and the torque between two samples is the mean of both; without this mean
+            torques would be delayed by half a sample.
+        reach: (n, B) break-away displacements of the bristles whose states z are computed, starting from zero at the
+            start of each piece; None: z is not computed.
+
+    Raises:
+        LogError: if no piece is long enough for a window.
     """
     span = (window - 1) * decimation
     batches: list[Windows] = []
@@ -88,7 +98,7 @@ def cut_windows(
             tau = piece.tau[:-1]
             if measured:
                 tau = (tau + piece.tau[1:]) / 2
-            # means of impulses, since the steps of a jittered clock differ
+            # torques are weighted by their time steps, which differ if the clock has jitter
             impulses = tau * np.diff(piece.t)[:, None]
             impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)  # (T - decimation, n)
             dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
@@ -104,14 +114,14 @@ def cut_windows(
 
 
 def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> torch.Tensor:
-    """Return the windows (W, window, n) of values (T, n)."""
-    # torch does not accept reversed views
+    """Return values (T, n) cut into windows, (W, window, n); see `cut_windows` for `stride` and `decimation`."""
+    # contiguous, since torch does not accept reversed views
     windows = torch.tensor(np.ascontiguousarray(values)).unfold(0, (window - 1) * decimation + 1, stride)
     return windows[..., ::decimation].transpose(1, 2)
 
 
 class Split(NamedTuple):
-    """Training and validation pieces without common samples, and a note on their choice."""
+    """Trajectories for training and for validation, without common samples, and a note that names the latter."""
 
     training: tuple[Trajectory, ...]
     validation: tuple[Trajectory, ...]
@@ -119,9 +129,9 @@ class Split(NamedTuple):
 
 
 def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: int) -> Split:
-    """Choose whole trajectories for validation: a `fraction` of them, at least one, at random by the seed.
+    """Split trajectories into training and validation: a random `fraction` of them, at least one, is for validation.
 
-    A single trajectory is cut in time, and its last part is for validation.
+    A single trajectory is cut in time; its last part, a `fraction` of its duration, is used for validation.
     """
     total = len(trajectories)
     if total == 1:
@@ -135,7 +145,7 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
         note = Diagnostic("info", "validation-split", "logs", None, message)
         last = replace(trajectory[cut:], name=trajectory.name + LAST_PART)
         return Split((trajectory[:cut],), (last,), note)
-    # whole trajectories, since neighbouring windows have common samples
+    # whole trajectories are set aside, since neighbouring windows of a trajectory have common samples
     count = min(max(1, round(fraction * total)), total - 1)
     training, validation = set_aside(trajectories, np.random.default_rng(seed).permutation(total)[:count])
     names = ", ".join(x.name for x in validation) if count <= 3 else f"{count} of {total} trajectories"
