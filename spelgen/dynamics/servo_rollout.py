@@ -104,7 +104,7 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     velocity = slipped(inertia * qd + impulse, inertia + damping, bristle_stiffness, bent, reach)
     if load.coupled:
         momentum = applied(load.inertia, qd) + impulse
-        # Which bristles slide depends on the displacements of the other joints: two passes suffice.
+        # The inertia couples joints: the bristles that slide follow from a fixed point, reached in two iterations.
         for _ in range(2):
             rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
             secant = rise / torch.where(velocity == 0, 1.0, velocity)

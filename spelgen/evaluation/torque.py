@@ -67,9 +67,9 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 
 
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
-    """Return the arguments of the dynamics for the friction state z (T, n, K) and the direction (T, n) of the samples.
+    """Return the friction state (T, n, K) of K bristles and the direction of motion (T, n), in [-1, 1].
 
-    See `known_past`.
+    Methods of `dynamics` have these last arguments; arguments that a model lacks are omitted (see `known_past`).
     """
     past = (None if x is None else torch.from_numpy(x) for x in (samples.z, samples.direction))
     return known_past(dynamics, *past)

@@ -123,7 +123,10 @@ def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
 
 
 def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> dict[str, Tensor]:
-    """Return the RMS error over joints of each predictor, divided by the motion, (W, K-1)."""
+    """Return the RMS over joints of errors of position and velocity of each predictor, (W, K-1).
+
+    Errors are divided by their scales (see `loss_scales`). W: windows; K: samples, the first of which has no error.
+    """
     windows = predictions.windows
     scales = loss_scales(windows, joint_types)
     errors = {}

@@ -59,7 +59,7 @@ def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> 
 
 
 def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
-    """Return a function of the states, without inputs for residual terms: it computes these terms from q and qd."""
+    """Return `function` with the states as its only inputs; its inputs for residual terms are computed from them."""
     needed = residuals_needed(function)
     if not needed:
         return function
@@ -139,7 +139,7 @@ def _network(network: SigmoidNetwork, encoded: ca.MX) -> ca.MX:
 
 
 def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
-    """Return the potential energy of functions of single joints, (1, 1) [J], at q (n, 1)."""
+    """Return the potential energy (1, 1) [J] at q (n, 1) of torques that depend on the position of one joint each."""
     energy = ca.MX(0)
     for joint, spline in residuals.torque.items():
         energy += _spline(spline_energy(spline), q[joint])

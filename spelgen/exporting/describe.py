@@ -62,7 +62,7 @@ class Trained:
 
     @cached_property
     def described(self) -> TrainedModel:
-        """The model as plain numbers. Raises RunError for a model without rigid bodies."""
+        """The model with NumPy arrays in place of PyTorch modules. Raises RunError for a model without rigid bodies."""
         return describe(self.model, self.arm)
 
     @cached_property

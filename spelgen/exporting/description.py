@@ -61,7 +61,7 @@ class Residuals:
 
 
 def spline_energy(spline: BSpline) -> BSpline:
-    """Return the integral of a torque spline, with opposite values at both ends of the range, as in the runtime."""
+    """Return the antiderivative of a torque spline whose values at both ends of the range have opposite signs."""
     energy = spline.antiderivative()
     count = len(energy.t) - energy.k - 1
     half = energy(spline.t[-4]) / 2

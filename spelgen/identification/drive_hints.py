@@ -235,7 +235,7 @@ class DriveProblem:
         return float(errors / self.errors[:, coupling.pair].mean())
 
     def coupled(self, coupling: Coupling) -> DriveProblem:
-        """Return the problem with the Gram matrices of a model with an additional coupling; `rows` is unchanged."""
+        """Return a copy whose Gram matrices of both coupled joints belong to a model with this coupling."""
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
         motion = np.stack([self.samples.qd, self.samples.qdd])
         qd, qdd = motion[..., [joint]] + ratio * motion[..., [moved_by]]

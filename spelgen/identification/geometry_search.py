@@ -276,9 +276,10 @@ def _with_offset(
 
 
 def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[HypothesisFit]:
-    """Return the fits for the best direction of gravity, and for torques without the gravity that a controller adds.
+    """Return at most two fits: with the best direction of gravity, and with torques that lack gravity compensation.
 
-    The directions along the axes of the root link are preferred. Changes below calibration errors are omitted.
+    Directions along the axes of the root link are preferred. A direction is omitted if it differs from the present one
+    by less than typical calibration errors.
     """
     present = np.array(base.hypothesis.gravity)
     size = float(np.linalg.norm(present))

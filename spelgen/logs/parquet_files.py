@@ -59,7 +59,7 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         expected = "data/chunk-000/file-000.parquet"
         raise LogError("a data set without Parquet files", file=folder, expected=expected)
     mapping, remarks = _with_scale(folder, files, joints, mapping)
-    # data sets of LeRobot 2, whose names have no suffix, contain degrees: remarks about normalised values do not apply
+    # Joint names of LeRobot 2 have no suffix, and its positions are in degrees: these remarks do not apply.
     if ENDING not in str(info["features"][STATE]["names"]):
         remarks = ()
     fps = info.get("fps")

@@ -164,7 +164,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 
 def _verdict(runs: Mapping[str, Results]) -> str:
-    """Return a sentence that states the run with the smallest error, for each figure that all runs have."""
+    """Return sentences that name the run with the smallest value of each error that all runs have."""
     # Figure -> (value, run, text) of each run; `min` compares the values first.
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():

@@ -116,7 +116,7 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
     carried: set[str] = set()
     visible = [robot.root]
     for joint in robot.joints_from_root:
-        # All children of a carried link are carried as well.
+        # A link moves with the arm if its joint belongs to the arm or its parent link moves with the arm.
         if joint.name in joints or joint.parent in carried:
             carried.add(joint.child)
         fixed = joint.parent in visible and not joint.moves

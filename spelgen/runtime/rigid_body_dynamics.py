@@ -77,7 +77,8 @@ class RigidBodyDynamics(PortHamiltonian):
         # parameter, because only a fit to torques sets it.
         self.raw_friction_compensation = nn.Buffer(torch.zeros_like(self.actuated))
         motors = None if motor_speeds is None else torch.stack([vector(row) for row in motor_speeds])
-        self.register_buffer("motors", motors)  # C; loads: its inverse
+        # `motors`: from joint speeds to motor speeds, (n, n); `loads`: its inverse.
+        self.register_buffer("motors", motors)
         self.register_buffer("loads", None if motors is None else torch.linalg.inv(motors))
 
     @property
@@ -215,5 +216,5 @@ class RigidBodyDynamics(PortHamiltonian):
         return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
 
     def input_force(self, cache: RigidConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
-        """Return G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
+        """Return the generalized force G (tau - torque_offset) + friction_compensation * qd, (..., n) [Nm, N]."""
         return super().input_force(cache, qd, tau - self.torque_offset) + self.friction_compensation * qd

@@ -192,9 +192,9 @@ def _error_at(location: Location, document: YamlDocument | None, got: str) -> Se
 
 
 def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
-    """Return the class of the group of keys at a location within `group`.
+    """Return the pydantic model of the settings at a location, from the model `group` of the document's root.
 
-    The location may contain keys of dicts and indices of lists, which are skipped.
+    Elements of the location that are no fields (keys of dicts, indices of lists) are skipped.
     """
     for key in map(str, location):
         if key in group.model_fields:

@@ -184,7 +184,10 @@ class Spans:
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
 
     def outside(self, joints: frozenset[int]) -> np.ndarray:
-        """Return rows (m, dim U) that span the changes of M caused by joints outside ``joints``, in the basis of U."""
+        """Return rows (m, dim U) that span the changes of M with the positions of joints not in ``joints``.
+
+        U is the span of all changes of M; the rows are coordinates in its basis `varying`.
+        """
         first, last = min(joints), max(joints)
         # The joints before `first` and after `last` have cached echelon forms, which saves most of the time.
         between = [self._coordinates[k] for k in range(first, last) if k not in joints]

@@ -263,7 +263,11 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
     freedom, offset = prior.widths.degrees_of_freedom, x - prior.mean
 
     def width(squares: torch.Tensor, gamma: torch.Tensor, group: str, center: float) -> torch.Tensor:
-        """Return the width s (...) for |x - mean|^2 = squares (...) and gamma (...), with center as s0."""
+        """Return the width of a group, sqrt((squares + c center^2) / (gamma + c)), at most its upper bound.
+
+        c: degrees of freedom of the hyperprior, whose width is `center`. squares: sum of squared offsets from the
+        prior mean. gamma: effective number of parameters, of the same shape.
+        """
         square = (squares + freedom * center**2) / (gamma.clamp(min=0.0) + freedom)
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 

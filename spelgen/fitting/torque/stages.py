@@ -150,7 +150,10 @@ def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
 
 
 def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> torch.Tensor:
-    """Return twice the log likelihood ratio of `estimate` to `other` per joint, (n,), with maximized noise."""
+    """Return 2 log(L(estimate) / L(other)) per joint, (n,), each likelihood L at its maximum-likelihood noise.
+
+    Positive values favour `estimate`.
+    """
     samples = estimate.problem.jacobian.samples
     # At the maximum-likelihood noise of each estimate, the result is the number of independent errors times the log
     # of the ratio of squared residuals.
