@@ -73,9 +73,9 @@ class PositionServo(nn.Module):
     """Position servos: tau = clip(kp d(u - q) - kd qd, -limit, limit), u commanded ``delay`` seconds earlier.
 
     d(x) reduces |x| by half the width of a dead zone and is zero within the zone, which is due to play
-    of gears or to the controller. A servo is a spring and a damper. The spring stores the energy 1/2 kp
-    d(q - u)^2, so that the arm with the input u is port-Hamiltonian. The trained parameters are
-    logarithms of the constants; a known kp is not trained.
+    of gears or to the controller. A servo is a spring and a damper. The spring
+    stores 1/2 kp d(q - u)^2, so that the arm with the input u is port-Hamiltonian. The trained
+    parameters are logarithms of the constants; a known kp is not trained.
     """
 
     parameter_groups = (
