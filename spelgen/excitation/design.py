@@ -185,7 +185,7 @@ def _start(
         if collisions is not None and collisions.contact_at(position):
             position = middle
     else:
-        position = _joint_values("start (--from)", start, arm, positive=False)
+        position = _joint_values("start", start, arm, positive=False)
     for joint, value, low, high in zip(arm.joint_names, position, limits.low, limits.high, strict=True):
         if not low <= value <= high:
             element = f"excite: start of {joint!r}"
