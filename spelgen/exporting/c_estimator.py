@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from spelgen.exporting.c_source import CFunction, c_function
-from spelgen.exporting.description import TrainedModel, read_entries
+from spelgen.exporting.description import TORQUE, EntryPoint, TrainedModel
 from spelgen.exporting.model_expressions import drive_friction, joint_mass, named_function
 from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics
@@ -23,13 +23,28 @@ from spelgen.templates import render
 CALLED = ("inverse_dynamics", "friction", "gravity")
 """Functions of the model that the estimator calls, in addition to its own."""
 
-_ENTRIES = read_entries("""
-momentum_balance(q, qd, tau, low, high) -> momentum [Nm s, N s], torque [Nm, N], friction [Nm, N], \
-uncertainty [Nm, N], load_momentum [SI], load_torque [SI], jacobian [m, 1]
-    the terms of d/dt (p + P load) = torque - friction + N load, of an arm with a payload, and the tip's Jacobian
-payload_torque(q, qd, qdd, load) -> tau [Nm, N]
-    the torques that move a payload with ten inertial parameters at the last body
-""")
+_ENTRIES = (
+    EntryPoint(
+        "momentum_balance",
+        "the terms of d/dt (p + P load) = torque - friction + N load, of an arm with a payload, and the tip's Jacobian",
+        ("q", "qd", "tau", "low", "high"),
+        {
+            "momentum": "Nm s, N s",
+            "torque": TORQUE,
+            "friction": TORQUE,
+            "uncertainty": TORQUE,
+            "load_momentum": "SI",
+            "load_torque": "SI",
+            "jacobian": "m, 1",
+        },
+    ),
+    EntryPoint(
+        "payload_torque",
+        "the torques that move a payload with ten inertial parameters at the last body",
+        ("q", "qd", "qdd", "load"),
+        {"tau": TORQUE},
+    ),
+)
 
 
 def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFunction]:
@@ -69,7 +84,7 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
         "payload_torque": (payload.torque(qd, qdd),),
     }  # fmt: skip
     functions = []
-    for entry in _ENTRIES.values():
+    for entry in _ENTRIES:
         functions.append(
             c_function(model, entry, named_function(entry, outputs[entry.name], inputs, residuals))
         )

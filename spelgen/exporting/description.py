@@ -1,6 +1,5 @@
 """A trained model as plain numbers, for exporters of source code, and the entry points: the functions of an export."""
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -137,50 +136,69 @@ class EntryPoint:
     outputs: dict[str, str]
 
 
-def read_entries(text: str) -> dict[str, EntryPoint]:
-    """Return entry points by name, from a text with ``name(inputs) -> output [unit], ...`` and a description each."""
-    entries = {}
-    lines = text.strip().splitlines()
-    for signature, about in zip(lines[::2], lines[1::2], strict=True):
-        start, outputs = signature.split(") -> ")
-        name, inputs = start.split("(")
-        units = dict(re.findall(r"(\w+) \[(.*?)\]", outputs))
-        entries[name] = EntryPoint(name, about.strip(), tuple(inputs.split(", ")), units)
-    return entries
+TORQUE = "Nm, N"
 
+_ENTRY_POINTS = (
+    EntryPoint(
+        "inverse_dynamics",
+        "the torques that give qdd, friction included",
+        ("q", "qd", "qdd", "z"),
+        {"tau": TORQUE},
+    ),
+    EntryPoint(
+        "forward_dynamics",
+        "the accelerations under the torques tau",
+        ("q", "qd", "tau", "z"),
+        {"qdd": "rad/s^2, m/s^2"},
+    ),
+    EntryPoint("mass_matrix", "M, armature included", ("q",), {"mass": "kg m^2, kg m, kg"}),
+    EntryPoint("bias", "Coriolis, centrifugal and gravity torques", ("q", "qd"), {"bias": TORQUE}),
+    EntryPoint("gravity", "the torques that hold the arm still, dV/dq", ("q",), {"gravity": TORQUE}),
+    EntryPoint("friction", "the torques of friction", ("q", "qd", "z"), {"friction": TORQUE}),
+    EntryPoint(
+        "friction_step",
+        "the friction state after a displacement dq of each joint",
+        ("z", "dq"),
+        {"z_next": "rad, m"},
+    ),
+    EntryPoint(
+        "friction_memory",
+        "the initial friction state of joints that have moved at constant qd",
+        ("qd",),
+        {"z_start": "rad, m"},
+    ),
+    EntryPoint("momentum", "M qd", ("q", "qd"), {"momentum": "Nm s, N s"}),
+    EntryPoint("energy", "kinetic energy, then potential", ("q", "qd"), {"energy": "J"}),
+    EntryPoint(
+        "tip_pose", "the tip's homogeneous transform in the root link's frame", ("q",), {"pose": "1, m"}
+    ),
+    EntryPoint(
+        "tip_jacobian",
+        "the tip's linear, then angular velocity by qd, in the root link's axes",
+        ("q",),
+        {"jacobian": "m, 1"},
+    ),
+    EntryPoint(
+        "inverse_dynamics_derivatives",
+        "the derivatives of inverse_dynamics; its derivative by qdd is the mass matrix",
+        ("q", "qd", "qdd", "z"),
+        {"dtau_dq": "Nm/rad", "dtau_dqd": "Nm s/rad"},
+    ),
+    EntryPoint(
+        "forward_dynamics_derivatives",
+        "the derivatives of forward_dynamics",
+        ("q", "qd", "tau", "z"),
+        {"dqdd_dq": "1/s^2", "dqdd_dqd": "1/s", "dqdd_dtau": "1/(kg m^2)"},
+    ),
+    EntryPoint(
+        "servo_torque",
+        "the torques of position servos under a command u, which the caller delays",
+        ("u", "q", "qd"),
+        {"tau": TORQUE},
+    ),
+)
 
-ENTRY_POINTS = read_entries("""
-inverse_dynamics(q, qd, qdd, z) -> tau [Nm, N]
-    the torques that give qdd, friction included
-forward_dynamics(q, qd, tau, z) -> qdd [rad/s^2, m/s^2]
-    the accelerations under the torques tau
-mass_matrix(q) -> mass [kg m^2, kg m, kg]
-    M, armature included
-bias(q, qd) -> bias [Nm, N]
-    Coriolis, centrifugal and gravity torques
-gravity(q) -> gravity [Nm, N]
-    the torques that hold the arm still, dV/dq
-friction(q, qd, z) -> friction [Nm, N]
-    the torques of friction
-friction_step(z, dq) -> z_next [rad, m]
-    the friction state after a displacement dq of each joint
-friction_memory(qd) -> z_start [rad, m]
-    the initial friction state of joints that have moved at constant qd
-momentum(q, qd) -> momentum [Nm s, N s]
-    M qd
-energy(q, qd) -> energy [J]
-    kinetic energy, then potential
-tip_pose(q) -> pose [1, m]
-    the tip's homogeneous transform in the root link's frame
-tip_jacobian(q) -> jacobian [m, 1]
-    the tip's linear, then angular velocity by qd, in the root link's axes
-inverse_dynamics_derivatives(q, qd, qdd, z) -> dtau_dq [Nm/rad], dtau_dqd [Nm s/rad]
-    the derivatives of inverse_dynamics; its derivative by qdd is the mass matrix
-forward_dynamics_derivatives(q, qd, tau, z) -> dqdd_dq [1/s^2], dqdd_dqd [1/s], dqdd_dtau [1/(kg m^2)]
-    the derivatives of forward_dynamics
-servo_torque(u, q, qd) -> tau [Nm, N]
-    the torques of position servos under a command u, which the caller delays
-""")
+ENTRY_POINTS = {entry.name: entry for entry in _ENTRY_POINTS}
 """All entry points by name."""
 
 
