@@ -12,7 +12,7 @@ from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, URDF, observed, share, t
 from spelgen.listing import Listing, number
 
 if TYPE_CHECKING:  # `spelgen --help` lists the figures; an import at run time would load torch
-    from spelgen.evaluation.results import Results
+    from spelgen.evaluation.measurements import Measurements
 
 OBSERVER = (
     "+ observer: with the constant disturbance that a momentum observer estimates from the 0.1 s before; "
@@ -84,7 +84,7 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
     return Table(title, tuple(map(Row, rows, rows.values())), note)
 
 
-def result_tables(results: Results) -> list[Table]:
+def result_tables(results: Measurements) -> list[Table]:
     """Return the tables of an evaluation: replays, errors per horizon and per joint, torques."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     if results.mass_errors:
@@ -103,7 +103,7 @@ def _without_empty_baselines(full: Table) -> Table:
     return replace(full, rows=tuple(rows))
 
 
-def joined(runs: Mapping[str, Results]) -> list[Table]:
+def joined(runs: Mapping[str, Measurements]) -> list[Table]:
     """Return the tables and rows that all runs have, with a column for the model of each run."""
     tables: dict[str, dict[str, dict[str, float | None]]] = {}
     for run, results in runs.items():
@@ -120,7 +120,7 @@ def joined(runs: Mapping[str, Results]) -> list[Table]:
     return common
 
 
-def csv_text(results: Results) -> str:
+def csv_text(results: Measurements) -> str:
     """Return the numbers of all tables as CSV, one line per number; an unknown number is an empty cell."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
@@ -131,7 +131,7 @@ def csv_text(results: Results) -> str:
     return file.getvalue()
 
 
-def summary(results: Results) -> Listing | None:
+def summary(results: Measurements) -> Listing | None:
     """Return the figures of URDF, least squares and model in one small table; None without torques."""
     if MODEL not in results.torque:
         return None
@@ -148,7 +148,7 @@ def summary(results: Results) -> Listing | None:
     return Listing(f"{results.robot} on the test logs", ("", *names), tuple(lines))
 
 
-def _horizon_tables(results: Results) -> list[Table]:
+def _horizon_tables(results: Measurements) -> list[Table]:
     """Return tables of the errors per horizon, and of the errors per joint at the last horizon."""
     if not results.horizons:
         return []
@@ -173,7 +173,7 @@ def _horizon_tables(results: Results) -> list[Table]:
     return [*tables, _by_joint(results, f"Velocity error{{}} after {head}", "velocity", qd)]
 
 
-def _torque_tables(results: Results) -> list[Table]:
+def _torque_tables(results: Measurements) -> list[Table]:
     """Return tables of the nMSE of the torques, and of the torque errors per joint."""
     if not results.torque:
         return []
@@ -191,7 +191,7 @@ def _torque_tables(results: Results) -> list[Table]:
     return [table(title, rows), by_joint]
 
 
-def _replay_tables(results: Results) -> list[Table]:
+def _replay_tables(results: Measurements) -> list[Table]:
     """Return the tables of replayed commands: per trajectory and per joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
@@ -209,7 +209,11 @@ def _replay_tables(results: Results) -> list[Table]:
 
 
 def _by_joint(
-    results: Results, title: str, quantity: str, errors: Mapping[str, Sequence[float | None]], note: str = ""
+    results: Measurements,
+    title: str,
+    quantity: str,
+    errors: Mapping[str, Sequence[float | None]],
+    note: str = "",
 ) -> Table:
     """Return a table with a row for each joint; the unit is in the title if all joints have the same."""
     units = [asdict(UNITS[joint_type])[quantity] for joint_type in results.joint_types]
@@ -245,7 +249,7 @@ class Figure:
         return f"{number(self.value)} {self.unit}"
 
 
-def figures(results: Results) -> list[Figure]:
+def figures(results: Measurements) -> list[Figure]:
     """Return the known figures of the model: nMSE of torques, errors of the longest rollout and of replays."""
     candidates: list[tuple[str, str, str, float | None]] = []
     if MODEL in results.torque:

@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from spelgen.errors import shortened
 from spelgen.evaluation.horizons import StateErrors
+from spelgen.evaluation.measurements import Measurements, Verdict
 from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import CONSTANT_VELOCITY, MODEL, listed, observed, share, thousandths
 from spelgen.listing import number
 from spelgen.logs.checks import ELASTIC
-
-if TYPE_CHECKING:
-    from spelgen.evaluation.results import Results
 
 SEEN = "tested-on-training-data"
 STANDSTILL = " near standstill"
@@ -32,17 +30,6 @@ Limits = Sequence[tuple[float, float] | None]
 """Lower and upper position limit of each joint [rad, m]; None for a joint without limits."""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """An assessment in words.
-
-    sentence: suitable uses, failures, and motions to record. because: figures that support the sentence.
-    """
-
-    sentence: str
-    because: str
-
-
 @dataclass
 class _Uses:
     """Uses for which a model is sufficient, uses for which it is not, and the figures that prove both."""
@@ -53,7 +40,7 @@ class _Uses:
 
 
 def verdict(
-    results: Results,
+    results: Measurements,
     identified: Mapping[str, Any] | None = None,
     limits: Limits = (),
     independent: Collection[str] = (),
@@ -97,7 +84,7 @@ def verdict(
     return Verdict(f"{sentence}.", " ".join(filter(None, because)))
 
 
-def _assess_torques(results: Results, uses: _Uses) -> None:
+def _assess_torques(results: Measurements, uses: _Uses) -> None:
     """Assess the torques by the joint of the largest error, since a mean over joints would hide this joint."""
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
@@ -116,7 +103,7 @@ def _assess_torques(results: Results, uses: _Uses) -> None:
     uses.proofs.append(proof)
 
 
-def _worst_torque(results: Results) -> tuple[str, float]:
+def _worst_torque(results: Measurements) -> tuple[str, float]:
     """Return the joint of the model's largest nMSE, and the nMSE; joints of coarsely quantised torque are omitted."""
     torque = results.torque.get(MODEL)
     pairs = [] if torque is None else zip(results.joints, torque.joint_nmse, strict=False)
@@ -127,7 +114,7 @@ def _worst_torque(results: Results) -> tuple[str, float]:
     return worst
 
 
-def _assess_motion(results: Results, uses: _Uses) -> None:
+def _assess_motion(results: Measurements, uses: _Uses) -> None:
     # Predictions may diverge over a long horizon and not over a shorter one.
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
     if results.horizons and not finite:
@@ -149,7 +136,7 @@ def _assess_motion(results: Results, uses: _Uses) -> None:
         uses.proofs.append(proof)
 
 
-def _assess_replays(results: Results, uses: _Uses) -> None:
+def _assess_replays(results: Measurements, uses: _Uses) -> None:
     # Only the first replay is assessed, which is over whole logs: windows of one second do not show drift.
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
@@ -165,7 +152,7 @@ def _relative(errors: StateErrors | None) -> float:
     return math.inf if error is None else error
 
 
-def _better_baselines(results: Results) -> list[str]:
+def _better_baselines(results: Measurements) -> list[str]:
     """Return sentences about the horizons at which constant velocity or another baseline has a smaller error."""
     times: list[str] = []
     better: dict[str, list[str]] = {}
@@ -191,7 +178,7 @@ def _better_baselines(results: Results) -> list[str]:
     return [*statements, f"But {listed(reasons)}."] if reasons else statements
 
 
-def _worst_joint(results: Results) -> tuple[str, str, str]:
+def _worst_joint(results: Measurements) -> tuple[str, str, str]:
     """Return the joint of the largest torque error, or of the largest motion error if only motion fails.
 
     Also return the word for the speed at which its torque error is larger, and a sentence about the joint.
@@ -209,7 +196,7 @@ def _worst_joint(results: Results) -> tuple[str, str, str]:
     return joint, speed, f"At {joint} the torque residual is {amount}."
 
 
-def _worst_motion(results: Results) -> tuple[str, float]:
+def _worst_motion(results: Measurements) -> tuple[str, float]:
     """Return the joint of the largest relative error at the longest horizon, and the error divided by the motion."""
     for last in results.horizons[-1:]:
         errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN
@@ -218,7 +205,7 @@ def _worst_motion(results: Results) -> tuple[str, float]:
     return "", math.inf
 
 
-def _slow_or_fast(results: Results, k: int) -> str:
+def _slow_or_fast(results: Measurements, k: int) -> str:
     """Return the words for slow or fast motion of joint k: for the larger torque residual, or "" if neither is."""
     if not results.traces.torques:
         return ""
@@ -238,7 +225,7 @@ def _slow_or_fast(results: Results, k: int) -> str:
 
 
 def _recommendations(
-    results: Results,
+    results: Measurements,
     identified: Mapping[str, Any],
     limits: Limits,
     independent: Collection[str],
