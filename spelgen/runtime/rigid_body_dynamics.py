@@ -216,5 +216,5 @@ class RigidBodyDynamics(PortHamiltonian):
         return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
 
     def input_force(self, cache: RigidConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
-        """Return the generalized force G (tau - torque_offset) + friction_compensation * qd, (..., n) [Nm, N]."""
+        """Return the force G (tau - torque_offset) + friction_compensation * qd, (..., n) [Nm, N]."""
         return super().input_force(cache, qd, tau - self.torque_offset) + self.friction_compensation * qd
