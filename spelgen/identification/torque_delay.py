@@ -116,8 +116,9 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     estimates = []
     # Dry friction with and without a state, with the same filter as the torques. A delay that only one of both models
     # shows is an error of this model.
+    _, qd, qdd = samples.motion
     for dry in (samples.bent, samples.direction[..., None]):
-        friction = FRICTION.columns(samples.qd, samples.qdd, dry, problem.speeds)
+        friction = FRICTION.columns(qd, qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
     # The model without a state is always used: its errors are symmetric and do not resemble a delay.
     # Errors of a friction state do.

@@ -34,6 +34,8 @@ class DriveHintTuning:
     # [1] Time shifts of the torque, in samples of 10 ms. They cover the delays of loggers and field buses; an apparent
     # delay of more than 30 ms may be due to friction.
     shifts: tuple[int, ...] = (-3, -2, -1, 0, 1, 2, 3)
+    # [samples] Largest time shift of the signals of one joint, 160 ms.
+    longest_offset: int = 16
     # [1] Number of samples that are used, which is ample for the about 70 parameters of six joints.
     samples: int = 1500
     # [1] Smallest number of samples for the detection of couplings; tests of the geometry need a quarter of it.
@@ -64,6 +66,8 @@ class LogGeometryTuning:
     min_angle: float = 0.09
     # [m] Zero offsets of prismatic joints below this bound are calibration errors.
     min_shift: float = 0.01
+    # [s] Delays of single joints below this bound are ascribed to friction, whose apparent delay is up to 30 ms.
+    min_delay: float = 0.03
     # Cost increase up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
     # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.

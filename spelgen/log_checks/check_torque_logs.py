@@ -12,9 +12,14 @@ import numpy as np
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic
 from spelgen.identification.drive_hints import Coupling, DriveLog, DriveSamples, drive_problem
-from spelgen.identification.geometry_search import Scaling, angle_scalings, compare_readings
+from spelgen.identification.geometry_search import (
+    POSITION_UNITS,
+    Scaling,
+    compare_readings,
+    position_scalings,
+)
 from spelgen.identification.least_squares import varying
-from spelgen.identification.log_geometry import GeometryProblem, HypothesisFit, MotionSamples
+from spelgen.identification.log_geometry import GeometryProblem, HypothesisFit, MotionSamples, joined_samples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.listing import Listing, number
@@ -60,12 +65,12 @@ class TorqueLogs:
         """Add a trajectory. Raises LogError if it has no torques."""
         require_torques([trajectory])
         inputs = self._drives.inputs.T
-        samples = []
+        pieces = []
         for x in split_at_gaps(trajectory, shortest=3):
-            samples.append(MotionSamples(x.q, x.qd, np.gradient(x.qd, x.t, axis=0), x.tau @ inputs))
-        if samples:
+            pieces.append(MotionSamples.of(x.q, x.qd, np.gradient(x.qd, x.t, axis=0), x.tau @ inputs))
+        if pieces:
             # 400 samples of a trajectory suffice, since gravity and friction change slowly
-            self._samples.append(MotionSamples.joined(samples).thinned(400))
+            self._samples.append(joined_samples(pieces).thinned(400))
         self._moving.add(trajectory)
         self._flat.append(FlatTops.of(trajectory.q, trajectory.tau @ inputs))
         self._declared.append(set(trajectory.accepted))
@@ -79,8 +84,8 @@ class TorqueLogs:
         """Return the reports of the joints completed by the fit of gravity, and tables; add findings to the summary."""
         # a check is omitted if the mapping accepts it, or if every trajectory does
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
-        chain, empty = self._arm.chain, np.zeros((0, len(reports)))
-        motion = MotionSamples.joined([MotionSamples(*[empty] * 4), *self._samples]).thinned(6000)
+        chain, empty = self._arm.chain, MotionSamples(np.zeros((0, len(reports), 4, 1)))
+        motion = joined_samples([empty, *self._samples]).thinned(6000)
         completed, evidence = [], []
         fits = fit_gravity(chain, motion)
         for coordinate, report, gravity in zip(chain.coordinates, reports, fits, strict=True):
@@ -148,8 +153,8 @@ class TorqueLogs:
         """
         samples = motion
         if moving is not None:
-            samples = MotionSamples(moving.q, moving.qd, moving.qdd, moving.tau)
-        if len(samples.q) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
+            samples = MotionSamples(moving.around)
+        if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
         reading = mapped_reading(self._arm.chain, self._mapping, self._drives)
         return GeometryProblem(self._arm.chain, samples, self._drives.speeds, self._seconds, reading)
@@ -185,16 +190,19 @@ class TorqueLogs:
         return False
 
     def _scalings(self, evidence: Sequence[JointEvidence]) -> list[Scaling]:
-        """Return the candidates for other units: of torques, from the magnitude of gravity, and of all angles.
+        """Return the candidates for other units: of torques, from the magnitude of gravity, and of all positions.
 
-        Units that the mapping states are not changed.
+        A unit of torques that the mapping states is not changed.
         """
         names, ones = self._arm.chain.joint_names, np.ones(len(evidence))
         scalings = []
         for factors in torque_factors(evidence, [not self._is_declared(name) for name in names]):
             scalings.append(Scaling("torque-unit", ones, factors))
-        if not any(self._mapping.unit("q", name) for name in names):
-            scalings += angle_scalings(self._arm.chain)
+        scale = np.array([self._mapping.scale("q", name) for name in names])
+        # the unit of velocities must be that of the positions, so that both are changed by the same factor
+        units = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
+        if units <= {(None, None), *((unit, f"{unit}/s") for unit in POSITION_UNITS.values())}:
+            scalings += position_scalings(self._arm.chain, scale)
         return scalings
 
     def _check_drives(self, moving: DriveSamples, summary: Findings) -> None:

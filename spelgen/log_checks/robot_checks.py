@@ -43,13 +43,14 @@ TUNING = RobotCheckTuning()
 def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
     """Return the fit of the gravity torque of the URDF to the torque of each joint in samples of motion."""
     # with fewer than 100 samples gravity and friction are confounded
-    if len(motion.q) < 100:
-        return [GravityFit()] * motion.q.shape[1]
-    still, qd = np.zeros_like(motion.q), motion.qd
-    rows = regressor(arm, motion.q, still, still)  # (S, n, 10 B)
+    q, qd, qdd = motion.motion
+    if len(q) < 100:
+        return [GravityFit()] * q.shape[1]
+    still = np.zeros_like(q)
+    rows = regressor(arm, q, still, still)  # (S, n, 10 B)
     load = rows @ urdf_parameters(arm)
     # friction and the joint's own inertia are removed, since in a slow swing they are correlated with gravity
-    friction = np.stack([np.ones_like(qd), qd, np.tanh(qd / SAMPLES.moving), motion.qdd], axis=2)
+    friction = np.stack([np.ones_like(qd), qd, np.tanh(qd / SAMPLES.moving), qdd], axis=2)
     fits = []
     for joint in range(qd.shape[1]):
         signals = np.column_stack([motion.tau[:, joint], load[:, joint], rows[:, joint]])

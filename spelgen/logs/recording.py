@@ -23,8 +23,8 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     """Return the trajectory of the rows `data` (T, C) in SI units, whose columns the layout describes.
 
     First wrapped angles and overflowed registers are unwrapped, and repeated rows are removed; with the setting
-    'dropouts: dropped' lost rows and outliers are removed, too. Velocities that were not logged are then computed by
-    differentiation, and torques are shifted by the mapping's delay. repairs: messages about earlier changes of rows.
+    'dropouts: dropped' lost rows and outliers are removed, too. Then the signals are shifted by the mapping's delays,
+    and velocities that were not logged are computed by differentiation. repairs: messages about changed rows.
     """
     mapping = layout.mapping
     signals = mapping.signals(layout.joints)
@@ -34,6 +34,7 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     if mapping.dropouts == "dropped":
         data, dropped = _without_outliers(data, signals)
         repairs += dropped
+    data = _without_delays(data, signals, mapping)
     t, *columns = np.split(data, [1 + len(layout.joints) * k for k in range(len(mapping.quantities))], axis=1)
     t, logged = t[:, 0], dict(zip(mapping.quantities, columns, strict=True))
     q = logged["q"]
@@ -41,7 +42,7 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     if "qd" not in logged:
         for rows in _pieces(t):
             qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # central differences
-    tau = earlier(t, logged.get("tau", np.zeros((len(t), 0))), mapping.torque_delay)
+    tau = logged.get("tau", np.zeros((len(t), 0)))
     return Trajectory(
         t, q, qd, tau, name, layout.file, layout.accepted, logged.get("u"), repairs, layout.remarks + wraps, mapping
     )  # fmt: skip
@@ -119,6 +120,24 @@ def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> R
         return data, ()
     message = f"{counted(int(outliers.sum()), 'row')} left out as dropouts: {'; '.join(dropped)}"
     return data[~outliers], (message,)
+
+
+def _without_delays(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> np.ndarray:
+    """Return rows (T, C) in which the signals are shifted back by their delays in the mapping.
+
+    Rows near the ends of a gap-free piece, for which a delayed signal was not logged, are removed.
+    """
+    delays = np.array([mapping.delay(*signal) for signal in signals])
+    if not delays.any():
+        return data
+    t, moved = data[:, 0], data.copy()
+    for column in np.flatnonzero(delays):
+        moved[:, [1 + column]] = earlier(t, data[:, [1 + column]], delays[column])
+    kept = np.zeros(len(t), bool)
+    for rows in _pieces(t):
+        first, last = t[rows][0] - delays.min(initial=0.0), t[rows][-1] - delays.max(initial=0.0)
+        kept[rows] = (t[rows] >= first - TUNING.shortest_step) & (t[rows] <= last + TUNING.shortest_step)
+    return moved[kept]
 
 
 def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
