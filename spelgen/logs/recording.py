@@ -12,7 +12,7 @@ from spelgen.logs.jumps import centred, is_outlier, is_stale, jump_count, repeat
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import TUNING
-from spelgen.logs.values import foreign_rows
+from spelgen.logs.values import foreign_rows, is_split
 from spelgen.settings.log_mapping import LogMapping
 
 Repaired = tuple[np.ndarray, tuple[str, ...]]
@@ -176,12 +176,15 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
 
     Rows are sorted by time if this makes the positions smoother. Of several rows with equal times the first is kept; if
     the resolution of the clock is too low for the rows, evenly spaced times are reconstructed instead. Rows of another
-    topic or publisher are removed.
+    topic or publisher are removed, and signals in separate rows are joined.
 
     data: (T, C) values in SI units. rows: (T,) row numbers in the file, for errors. Raises LogError for a clock that
     restarts, and for times that cannot be reconstructed.
     """
     repairs: tuple[str, ...] = ()
+    if is_split(data):
+        data, repairs = _joined_rows(data, layout)
+        rows = np.arange(len(data))
     foreign = foreign_rows(data, len(layout.joints))
     if foreign.any():
         data, rows = data[~foreign], np.asarray(rows)[~foreign]
@@ -212,6 +215,37 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
         data = data[~is_repeat]
         repairs += (f"{repeats} rows with the time of the row before were left out",)
     return data, repairs
+
+
+def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:
+    """Return the rows (T, C) of the rarest signal, with all other signals at their times, and a message.
+
+    If these rows are complete, the others are left out. Otherwise the other signals are interpolated between their own
+    samples; rows beyond the first or last sample of a signal, or within a gap of it, are left out.
+    """
+    finite = np.isfinite(data)
+    base = finite[:, 1 + int(finite[:, 1:].sum(axis=0).argmin())]
+    complete = finite.all(axis=1)
+    if complete.sum() > 0.9 * base.sum():
+        message = f"{counted(int((~complete).sum()), 'row')} without all signals left out: signals have different rates"
+        return data[complete], (message,)
+    data = data[np.argsort(data[:, 0], kind="stable")]
+    finite = np.isfinite(data)
+    base = finite[:, 1 + int(finite[:, 1:].sum(axis=0).argmin())]
+    joined, mapping = data[base], layout.mapping
+    times = joined[:, 0]
+    for k, signal in enumerate(mapping.signals(layout.joints), start=1):
+        rows = finite[:, k]
+        t, values = data[rows, 0], data[rows, k]
+        period = abs(mapping.scale(*signal)) * (mapping.word("period", *signal) or 0.0)
+        if period:  # an angle between two samples before and after a wrap is not between their values
+            values = unwrapped(values, period)
+        joined[:, k] = np.interp(times, t, values, left=np.nan, right=np.nan)
+        after = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
+        gaps = (t[after] - t[after - 1] > TUNING.gap * np.median(np.diff(t))) & ~np.isin(times, t)
+        joined[gaps, k] = np.nan
+    message = "signals in separate rows or messages: interpolated at the times of the rarest one"
+    return joined[np.isfinite(joined).all(axis=1)], (message,)
 
 
 def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:

@@ -21,7 +21,8 @@ Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows: Rows) -> np.ndarray:
     """Return the columns of a layout as numbers (T, C) in SI units.
 
-    Rows of another topic or publisher (see `foreign_rows`) contain NaN. Raises LogError, with row and column, for
+    Rows of another topic or publisher (see `foreign_rows`) and rows of a log whose signals are in separate rows (see
+    `is_split`) contain NaN. Raises LogError, with row and column, for
     values that are not numbers, and for values beyond the range of any arm.
 
     Args:
@@ -48,7 +49,9 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
     largest = np.array([TUNING.latest, *[TUNING.largest_value] * len(signals)])
     foreign = foreign_rows(data, len(layout.joints))
     bad = ~(np.abs(data) < largest)  # NaN included
-    if not foreign.all():
+    if is_split(data):
+        bad[:, 1:] &= ~np.isnan(data[:, 1:])
+    elif not foreign.all():
         bad &= ~foreign[:, None]
     if bad.any():
         first, k = np.argwhere(bad)[0]
@@ -58,8 +61,6 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         if not np.isfinite(value):
             got, expected = f"no finite number ({count} gap", "a number"
             do = "remove those rows; a gap in t is understood"
-            if foreign.all():
-                do = "no row has all quantities: log them together, or resample them to the same times"
         raise layout.row_error(f"{got}, this is the first)", rows[first], layout.columns[k], expected, do)
     return data
 
@@ -71,6 +72,15 @@ def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
     """
     empty = np.isnan(data[:, 1 + joints :])
     return np.asarray(empty.all(axis=1))
+
+
+def is_split(data: np.ndarray) -> bool:
+    """Return True if signals of a log (T, 1 + C) are in separate rows: at most half of the rows have the rarest signal.
+
+    Topics of different rates, or joints in different messages, have such rows.
+    """
+    rarest = int(np.isfinite(data[:, 1:]).sum(axis=0).min(initial=len(data)))
+    return TUNING.jump_window <= rarest <= len(data) / 2
 
 
 def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
