@@ -71,9 +71,13 @@ def test_joints_in_two_messages_are_joined(joints, topics, clocks, tmp_path):
             messages.append((time * 1_000_000, topic, names, *values[:, k]))
     (log,) = read_logs(write_bag(tmp_path / "bag", messages), joints)
     assert len(log) >= 398 and log.sample_rate == pytest.approx(100, rel=1e-3)
-    start = 0 if abs(log.q - signals(log.t)[0]).max() < 1e-3 else shift * 1e-3  # times count from the first message
+    start = (
+        0 if abs(log.q - signals(log.t)[0]).max() < 1e-3 else shift * 1e-3
+    )  # times count from the first message
     for name, values in zip(FIELDS, signals(log.t + start), strict=True):
-        np.testing.assert_allclose(getattr(log, name), values, atol=0.0 if clocks == "equal" else 1e-3, rtol=1e-9)
+        np.testing.assert_allclose(
+            getattr(log, name), values, atol=0.0 if clocks == "equal" else 1e-3, rtol=1e-9
+        )
     assert any("separate rows" in x for x in log.repairs) or clocks == "equal"
 
 
@@ -112,7 +116,9 @@ def test_topics_in_rows_of_one_file_are_joined(joints, form, tmp_path):
     assert log.sample_rate == pytest.approx(100, rel=1e-3)
     for name, values in zip(FIELDS, signals(log.t), strict=True):
         np.testing.assert_allclose(getattr(log, name), values, atol=2e-3)
-    assert log.repairs == ("signals in separate rows or messages: interpolated at the times of the rarest one",)
+    assert log.repairs == (
+        "signals in separate rows or messages: interpolated at the times of the rarest one",
+    )
     # torques in every third row only
     kept = np.arange(len(times[0])) % 3 == rng.integers(3)
     columns = {"t": times[0]}
@@ -122,7 +128,9 @@ def test_topics_in_rows_of_one_file_are_joined(joints, form, tmp_path):
     (pa.csv.write_csv if form == "csv" else pa.parquet.write_table)(pa.table(columns), path)
     (log,) = read_logs(path, joints)
     np.testing.assert_allclose(log.q, signals(times[0][kept])[0], rtol=1e-9)
-    assert log.repairs == (f"{np.sum(~kept)} rows without all signals left out: signals have different rates",)
+    assert log.repairs == (
+        f"{np.sum(~kept)} rows without all signals left out: signals have different rates",
+    )
 
 
 def test_a_joint_that_no_message_contains_is_named(joints, tmp_path):

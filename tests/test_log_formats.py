@@ -479,7 +479,7 @@ def test_of_several_topics_one_is_named(bag):
         read_logs([folder], JOINTS)
     assert str(caught.value) == (
         f"{folder}: got joint states on the topics /joint_states, /other, expected one of them; "
-        "name it by 'topic' under 'logs'"
+        "write 'topic: /joint_states' under 'logs' in the robot's YAML, or the other topic"
     )
     check(read_logs([folder], JOINTS, mapping=LogMapping(topic="/joint_states"))[0], "bag", rtol=1e-12)
     with pytest.raises(
@@ -507,8 +507,8 @@ def test_a_pipe_in_a_bag_is_not_waited_for(bag):
 BAD_BAGS = {
     "part": (
         [("/a", JOINTS[:1], [0.0], [0.0], [0.0])],
-        "{}: message 1: got a message with the joints shoulder, expected elbow in it too; "
-        "record one message with the states of all joints of the arm, as joint_state_broadcaster publishes",
+        "{}: got joint states without elbow, expected states of all joints of the arm; write "
+        "'moving_joints: [shoulder]' into the robot's YAML if the others do not move, or map their names",
     ),
     "lengths": (
         [STATES[0], ("/joint_states", JOINTS, [0.0], [0.0, 0.0], [0.0, 0.0])],

@@ -100,7 +100,10 @@ def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ())
     for _ in range(3):
         best = min(fits, key=_rank)
         tried = single_changes(coarse, best, scalings)
-        if best is unchanged and min(tried, key=_rank).cost < unchanged.cost - GEOMETRY.needed:
+        better = min(tried, key=_rank)
+        # orders are searched only if a single change does not explain the torques, since the search takes seconds
+        is_open = better.cost < unchanged.cost - GEOMETRY.needed and better.errors.max() > GEOMETRY.explained
+        if best is unchanged and is_open:
             tried += reordered(coarse, unchanged)
         if min(tried, key=_rank).cost > best.cost - GEOMETRY.needed:
             break

@@ -60,6 +60,8 @@ class LogGeometryTuning:
     ambiguous: float = 8.0
     # Unit of the penalties for changes that are rarer than a wrong sign or order.
     rare: float = 1.0
+    # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
+    explained: float = 0.05
     # [1] Largest number of samples for the final comparison of the best hypotheses.
     confirming_samples: int = 800
     # [rad] Zero offsets and tilts of the base below this bound are calibration errors.

@@ -100,14 +100,14 @@ def _of_one_arm(
     for message in of_arm:
         joints_of.setdefault(message.topic, set()).update(arm.intersection(message.state.name))
     if sum(map(len, joints_of.values())) > len(set.union(*joints_of.values())):
-        topics = f"joint states on the topics {', '.join(sorted(joints_of))}"
-        raise LogError(topics, file=path, expected="one of them", do="name it by 'topic' under 'logs'")
+        topics = sorted(joints_of)
+        got, do = f"joint states on the topics {', '.join(topics)}", mapping_line({"topic": topics[0]})
+        raise LogError(got, file=path, expected="one of them", do=f"{do}, or the other topic")
     missing = [name for name in names if name not in set.union(*joints_of.values())]
     if missing:
         got, expected = f"joint states without {', '.join(missing)}", "states of all joints of the arm"
-        do = (
-            "write 'moving_joints' without them into the robot's YAML if they do not move, or map their names"
-        )
+        present = ", ".join(name for name in names if name not in missing)
+        do = f"write 'moving_joints: [{present}]' into the robot's YAML if the others do not move, or map their names"
         raise LogError(got, file=path, expected=expected, do=do)
     complete = [x for x in of_arm if arm.issubset(x.state.name)]
     if len(complete) > len(of_arm) / 2:

@@ -16,7 +16,7 @@ import numpy as np
 from spelgen.logs.joint_signals import Advice, JointSignals
 from spelgen.logs.jumps import held_samples
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.logs.tuning import SIGNALS, shows_accelerations
+from spelgen.logs.tuning import SIGNALS, TUNING, shows_accelerations
 from spelgen.settings.log_mapping import SCALES, TIMES
 
 TURNS = 4 * np.pi  # [rad] largest range of a joint with limits: a larger range of q shows another unit
@@ -149,6 +149,25 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         columns = {"q": mapping.column("qd", signals.joint), "qd": mapping.column("q", signals.joint)}
         return Advice(f"{message}; q is the derivative of qd", {"columns": columns})
     return message
+
+
+def find_copied(signals: JointSignals) -> str | None:
+    """Find torques that are proportional to another signal of the log without any noise: one column is a copy."""
+    trajectory, k = signals.trajectory, signals.number
+    if not trajectory.tau.size or np.ptp(trajectory.tau[:, k]) == 0 or len(signals.q) < TUNING.jump_window:
+        return None
+    columns = np.concatenate([trajectory.tau, trajectory.q, trajectory.qd], axis=1)
+    centred = columns - columns.mean(axis=0)
+    lengths = np.linalg.norm(centred, axis=0)
+    correlations = np.abs(centred[:, k] @ centred) / np.where(lengths > 0, lengths[k] * lengths, np.inf)
+    correlations[k] = 0.0
+    # noise of two sensors of 18 bits would lower the correlation by 1e-11
+    copies = np.flatnonzero(correlations > 1 - 1e-12)
+    if not copies.size:
+        return None
+    quantity, other = divmod(int(copies[0]), len(signals.joints))
+    source = f"{('tau', 'q', 'qd')[quantity]} of joint {signals.joints[other]!r}"
+    return f"tau that is proportional to {source}, without noise: one column is a copy"
 
 
 def find_held(signals: JointSignals) -> str | None:

@@ -1,5 +1,6 @@
 """Conversion of logged columns to numbers in SI units, with the URDF's signs."""
 
+import re
 from collections.abc import Sequence
 from itertools import starmap
 from typing import TypeAlias
@@ -13,6 +14,8 @@ from spelgen.logs.jumps import signed
 from spelgen.logs.tables import Layout, list_element
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import TIMES
+
+NUMBER = r"[+-]?\d+(?:[.,]\d*)?(?:[eE][+-]?\d+)?"
 
 Rows: TypeAlias = "Sequence[int] | np.ndarray"
 Column: TypeAlias = "pa.ChunkedArray | pa.Array"
@@ -104,6 +107,10 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
     """
     name = layout.columns[0]
     times = _column(table, name)
+    if pa.types.is_string(times.type) or pa.types.is_large_string(times.type):
+        nanoseconds = _nanoseconds(times)
+        if nanoseconds is not None:
+            return nanoseconds, TIMES["ns"]
     if not pa.types.is_temporal(times.type):
         return times, TIMES[layout.mapping.units.t]
     counted: pa.DataType = pa.timestamp("ns")
@@ -118,6 +125,40 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
             f"dates beyond what nanoseconds count ({times.type})", file=layout.file, element=f"column {name}",
             expected="years from 1678 to 2262", do="check the unit of the stamps",
         ) from error  # fmt: skip
+
+
+def _nanoseconds(texts: Column) -> pa.Array | None:
+    """Return times [ns] from texts of a clock ("10:00:00.123", also with a date) or with a unit ("10 ms").
+
+    Times of day that start again at midnight continue. Returns None for other texts.
+    """
+    texts = pa.compute.utf8_trim_whitespace(pa.compute.replace_substring(texts.cast(pa.string()), "µ", "u"))
+    first = next((x for x in texts.slice(0, 1).to_pylist() if x), "")
+    if re.fullmatch(rf"{NUMBER} ?({'|'.join(TIMES)})", first):
+        parts = pa.compute.extract_regex(texts, rf"^(?P<number>{NUMBER}) ?(?P<unit>[mun]?s)$")
+        numbers, units = (pa.compute.struct_field(parts, name) for name in ("number", "unit"))
+        factors = [TIMES.get(unit, np.nan) for unit in units.to_pylist()]
+        return pa.array(_numbers(numbers) * factors / TIMES["ns"])
+    clock = r"^(?P<date>\d{4}-\d\d-\d\d[T ])?(?:(?P<h>\d+):)?(?P<m>\d+):(?P<s>\d+(?:[.,]\d*)?)$"
+    if not re.match(clock, first):
+        return None
+    parts = pa.compute.extract_regex(texts, clock)
+    hours, minutes, seconds = (_numbers(pa.compute.struct_field(parts, name)) for name in "hms")
+    times = 3600 * np.nan_to_num(hours) + 60 * minutes + seconds
+    dates = pa.compute.struct_field(parts, "date").to_numpy(zero_copy_only=False)
+    if dates[0]:
+        days = np.array([x[:10] if x else "NaT" for x in dates], dtype="datetime64[D]")
+        times = times + 86400 * days.astype(float)
+    else:
+        times = times + 86400 * np.cumsum(np.diff(times, prepend=times[:1]) < -43200)
+    return pa.array(times / TIMES["ns"])
+
+
+def _numbers(texts: Column) -> np.ndarray:
+    """Return the numbers in texts (T,), with a decimal point or comma; NaN for an empty text or null."""
+    texts = pa.compute.replace_substring(texts, ",", ".")
+    texts = pa.compute.if_else(pa.compute.equal(texts, ""), None, texts)
+    return np.asarray(texts.cast(pa.float64()).to_numpy(zero_copy_only=False))
 
 
 def _column(table: pa.Table, name: str) -> Column:
