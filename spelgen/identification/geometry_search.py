@@ -92,7 +92,7 @@ def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ())
     scalings: candidates for wrong units.
     """
     # the many hypotheses are compared on few samples, and the best ones below on more
-    coarse = problem.thinned(200)
+    coarse = problem.thinned(GEOMETRY.coarse_samples)
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
     # At most three changes are combined, where an order of all joints is one change: more changes could explain any
@@ -304,16 +304,18 @@ def _with_offset(
 def _with_delays(problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
     """Yield the fits for delays of one joint's motion, torque, or both, and of all torques.
 
-    Delays as short as the apparent ones that friction causes are omitted. Samples without their neighbours show none.
+    Delays as short as the apparent ones that friction causes are omitted, and a second delay. Samples without their
+    neighbours show none.
     """
     reading = base.hypothesis
-    if problem.samples.values.shape[3] == 1:
+    if problem.samples.values.shape[3] == 1 or "joint-delay" in reading.codes:
         return
     units = np.eye(len(reading.offset))
     still = np.zeros(len(units))
     candidates = [(still, still + 1.0), *((unit, still) for unit in units)]
     candidates += [(still, unit) for unit in units] + [(unit, unit) for unit in units]
-    longest = OFFSETS[-1] / FREQUENCY
+    longest, stateful = OFFSETS[-1] / FREQUENCY, problem.with_hysteresis()
+    errors, stateful_errors = base.errors, stateful.fit(reading).errors
     for motion, torque in candidates:
 
         def delayed(
@@ -331,7 +333,13 @@ def _with_delays(problem: GeometryProblem, base: HypothesisFit) -> Iterator[Hypo
             allowed=lambda x: np.clip(x, -longest, longest),
         )  # fmt: skip
         if abs(delay[0]) >= GEOMETRY.min_delay:
-            yield problem.fit(delayed(delay.round(3)))
+            fit = problem.fit(delayed(delay.round(3)))
+            # Friction with a history also resembles a delay. A delay explains a joint's residual with both friction
+            # models.
+            is_better = fit.errors < GEOMETRY.delay_gain * errors
+            is_better &= stateful.fit(fit.hypothesis).errors < GEOMETRY.delay_gain * stateful_errors
+            if is_better.any():
+                yield fit
 
 
 def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[HypothesisFit]:

@@ -31,15 +31,17 @@ class MotionSamples:
     """S samples of motion and joint torques of n joints.
 
     values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at E times around each sample, see `DriveSamples`;
-    E = 1 for samples without their neighbours.
+    E = 1 for samples without their neighbours. bent: (S, n, K) bristle deflections of the unchanged log; K = 0 for
+    samples without a history of motion.
     """
 
     values: np.ndarray
+    bent: np.ndarray
 
     @classmethod
     def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
         """Return the samples of signals, (S, n) each, without their neighbours."""
-        return cls(np.stack([q, qd, qdd, tau], axis=2)[..., None])
+        return cls(np.stack([q, qd, qdd, tau], axis=2)[..., None], np.zeros((*q.shape, 0)))
 
     @property
     def motion(self) -> np.ndarray:
@@ -64,12 +66,16 @@ class MotionSamples:
 
     def thinned(self, count: int) -> MotionSamples:
         """Return at most `count` samples, evenly spaced."""
-        return MotionSamples(self.values[:: -(-len(self.values) // count) or 1])
+        stride = -(-len(self.values) // count) or 1
+        return MotionSamples(self.values[::stride], self.bent[::stride])
 
 
 def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
     """Return the concatenation of several sets of samples."""
-    return MotionSamples(np.concatenate([x.values for x in samples]))
+    values, bent = (
+        np.concatenate(columns) for columns in zip(*((x.values, x.bent) for x in samples), strict=True)
+    )
+    return MotionSamples(values, bent)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,18 +123,17 @@ class Hypothesis:
         """Return the samples of the joints, in SI units, for logged samples under this hypothesis."""
         of_joint = _permuted(samples.values, self.motion_source, self.torque_source)
         delays = np.stack([*[self.motion_delay] * 3, self.torque_delay], axis=1)
-        signals = MotionSamples(of_joint).at(delays) * self._scales
+        signals = MotionSamples(of_joint, samples.bent).at(delays) * self._scales
         signals[..., 0] += self.offset
-        return MotionSamples(signals[..., None])
+        return MotionSamples(signals[..., None], samples.bent)
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
         """Return the logged samples for `samples` of the joints: the inverse of `signals` without delays."""
         signals = samples.values.copy()
         signals[:, :, 0] -= self.offset[:, None]
         signals /= self._scales[..., None]
-        return MotionSamples(
-            _permuted(signals, np.argsort(self.motion_source), np.argsort(self.torque_source))
-        )
+        signals = _permuted(signals, np.argsort(self.motion_source), np.argsort(self.torque_source))
+        return MotionSamples(signals, samples.bent)
 
 
 def _permuted(values: np.ndarray, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
@@ -190,6 +195,7 @@ class GeometryProblem:
         self.prior_mean = np.append(mean, np.zeros(drives))
         self._precision = block_diag(precision, np.zeros((drives, drives)))
         self._counted: np.ndarray | None = None
+        self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
 
     def thinned(self, count: int) -> GeometryProblem:
@@ -207,6 +213,15 @@ class GeometryProblem:
         fewer._equations, fewer._counted = {}, counted[..., None]
         return fewer
 
+    def with_hysteresis(self) -> GeometryProblem:
+        """Return the problem with a friction model whose dry friction has a history, the bristles' deflections."""
+        extended = copy(self)
+        extended._equations, extended._has_hysteresis = {}, True
+        added = self.samples.bent.shape[2] * len(self.speeds)
+        extended.prior_mean = np.append(self.prior_mean, np.zeros(added))
+        extended._precision = block_diag(self._precision, np.zeros((added, added)))
+        return extended
+
     def without_gravity(self, joint: int) -> GeometryProblem:
         """Return the problem of the unchanged log with a model in which one joint's torque contains no gravity."""
         weightless = replace(self.unchanged, gravity=(0.0, 0.0, 0.0))
@@ -215,6 +230,13 @@ class GeometryProblem:
         other = copy(self)
         other._equations = {self.unchanged.motion_key: (rows, block_products(rows, 1)[:, 0])}
         return other
+
+    def gravity_ratio(self, fit: HypothesisFit) -> float:
+        """Return the least-squares ratio of the gravity torques of a fit to those of the URDF; 0 without gravity."""
+        weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
+        columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
+        fitted, stated = columns @ fit.parameters, columns @ self.prior_mean
+        return float((fitted * stated).sum() / max(float(np.square(stated).sum()), 1e-12))
 
     def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
         """Return the standard deviation (S, n) [Nm, N] of the model's torques due to the parameters' covariance."""
@@ -240,6 +262,10 @@ class GeometryProblem:
         if key not in self._equations:
             q, qd, qdd = hypothesis.signals(self.samples).motion
             rows = drive_rows(body_chain(self.arm, hypothesis.gravity), q, qd, qdd, self.speeds)
+            if self._has_hysteresis:
+                # the deflections of drive j act on joint i with the factor C_ji, like its other friction
+                bristles = self.samples.bent[:, None] * self.speeds.T[:, :, None]
+                rows = np.concatenate([rows, bristles.reshape(*q.shape, -1)], axis=2)
             rows = rows if self._counted is None else rows * self._counted
             if len(self._equations) >= 30:  # bounds the memory of the cache: an entry has about 1 MB
                 self._equations.pop(next(iter(self._equations)))

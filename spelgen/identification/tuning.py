@@ -62,6 +62,8 @@ class LogGeometryTuning:
     rare: float = 1.0
     # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
     explained: float = 0.05
+    # [1] Largest number of samples for the comparison of all hypotheses.
+    coarse_samples: int = 200
     # [1] Largest number of samples for the final comparison of the best hypotheses.
     confirming_samples: int = 800
     # [rad] Zero offsets and tilts of the base below this bound are calibration errors.
@@ -70,6 +72,8 @@ class LogGeometryTuning:
     min_shift: float = 0.01
     # [s] Delays of single joints below this bound are ascribed to friction, whose apparent delay is up to 30 ms.
     min_delay: float = 0.03
+    # [1] Largest ratio of a joint's squared residuals with and without a delay of its signals.
+    delay_gain: float = 0.5
     # Cost increase up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
     # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.

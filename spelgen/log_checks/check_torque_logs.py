@@ -33,6 +33,7 @@ from spelgen.log_checks.robot_checks import (
     JointEvidence,
     find_no_gravity,
     fit_gravity,
+    rounded_factor,
     torque_factors,
 )
 from spelgen.logs.bags import BAG
@@ -84,7 +85,7 @@ class TorqueLogs:
         """Return the reports of the joints completed by the fit of gravity, and tables; add findings to the summary."""
         # a check is omitted if the mapping accepts it, or if every trajectory does
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
-        chain, empty = self._arm.chain, MotionSamples(np.zeros((0, len(reports), 4, 1)))
+        chain, empty = self._arm.chain, MotionSamples.of(*np.zeros((4, 0, len(reports))))
         motion = joined_samples([empty, *self._samples]).thinned(6000)
         completed, evidence = [], []
         fits = fit_gravity(chain, motion)
@@ -153,7 +154,7 @@ class TorqueLogs:
         """
         samples = motion
         if moving is not None:
-            samples = MotionSamples(moving.around)
+            samples = MotionSamples(moving.around, moving.bent)
         if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
         reading = mapped_reading(self._arm.chain, self._mapping, self._drives)
@@ -176,7 +177,7 @@ class TorqueLogs:
         if limits.errors and CLIPPED not in accepted:
             summary.errors.extend(limits.errors)
             return False
-        comparison = compare_readings(problem, self._scalings(evidence))
+        comparison = compare_readings(problem, self._scalings(evidence, problem))
         if not comparison.better:
             summary.notes.extend(_link_notes(problem, comparison.unchanged))
         if not comparison.better or set(comparison.codes) <= accepted:
@@ -189,15 +190,20 @@ class TorqueLogs:
             summary.errors.append(finding)
         return False
 
-    def _scalings(self, evidence: Sequence[JointEvidence]) -> list[Scaling]:
+    def _scalings(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> list[Scaling]:
         """Return the candidates for other units: of torques, from the magnitude of gravity, and of all positions.
 
         A unit of torques that the mapping states is not changed.
         """
         names, ones = self._arm.chain.joint_names, np.ones(len(evidence))
         scalings = []
-        for factors in torque_factors(evidence, [not self._is_declared(name) for name in names]):
-            scalings.append(Scaling("torque-unit", ones, factors))
+        undeclared = [self._mapping.unit("tau", name) in (None, "mNm") for name in names]
+        candidates = torque_factors(evidence, undeclared)
+        coarse = problem.thinned(GEOMETRY.coarse_samples)
+        ratio = coarse.gravity_ratio(coarse.fit(coarse.unchanged))
+        if all(undeclared) and ratio > 0 and not 1 / 5 < ratio < 5:
+            candidates.append(rounded_factor(1 / ratio) * ones)
+        scalings += [Scaling("torque-unit", ones, factors) for factors in candidates]
         scale = np.array([self._mapping.scale("q", name) for name in names])
         # the unit of velocities must be that of the positions, so that both are changed by the same factor
         units = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}

@@ -130,8 +130,16 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     # times in a wrong unit also make dq/dt wrong; the check of times reports this cause
     if signals.step > SIGNALS.slowest_step:
         return None
-    if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
+    if np.isnan(correlation):
         return None
+    if correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance:
+        lag = _velocity_lag(signals)
+        if abs(lag) < SIGNALS.longest_lag:
+            return None
+        order = "later" if lag > 0 else "earlier"
+        return Advice(
+            f"qd that is {1e3 * abs(lag):.3g} ms {order} than dq/dt", keys={"velocity": "differentiated"}
+        )
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
         return message  # too few increments for evidence: two samples always have a correlation of 1 or -1
@@ -149,6 +157,27 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         columns = {"q": mapping.column("qd", signals.joint), "qd": mapping.column("q", signals.joint)}
         return Advice(f"{message}; q is the derivative of qd", {"columns": columns})
     return message
+
+
+def _velocity_lag(signals: JointSignals) -> float:
+    """Return the delay [s] of a joint's velocity relative to dq/dt, by least squares; 0 if it is not visible.
+
+    The integral of a delayed velocity differs from q by minus the delay times the velocity, and by a slow drift.
+    """
+    from scipy.integrate import cumulative_trapezoid
+
+    piece = max(split_at_gaps(signals.trajectory), key=len)
+    t, q, qd = piece.t, piece.q[:, signals.number], piece.qd[:, signals.number]
+    if signals.trajectory.mapping.velocity == "differentiated" or len(t) < 100:
+        return 0.0
+    drift = np.stack([np.ones_like(t), t, t**2], axis=1)
+    columns = np.stack([qd, q - cumulative_trapezoid(qd, t, initial=0)], axis=1)
+    speed, difference = (columns - drift @ np.linalg.lstsq(drift, columns, rcond=None)[0]).T
+    power = float(speed @ speed)
+    lag = float(speed @ difference) / power if power else 0.0
+    residual = difference - lag * speed
+    # integrated noise drifts, too: the lag must explain most of the difference
+    return lag if residual @ residual < 0.25 * difference @ difference else 0.0
 
 
 def find_copied(signals: JointSignals) -> str | None:

@@ -196,7 +196,12 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
         for index, text in enumerate(texts):
             if text and not is_number(text):
-                raise layout.row_error(repr(text[:60]), rows[index], name, "a number") from error
+                do = "remove that row"
+                if text.strip() == name:
+                    do += ", the header of a second file; joined recordings need a column 'trajectory'"
+                elif re.match(NUMBER, text):
+                    do = "write numbers only, and the unit as 'units' under 'logs' in the robot's YAML"
+                raise layout.row_error(repr(text[:60]), rows[index], name, "a number", do) from error
         got = f"values of type {values.type}"
         raise LogError(got, file=layout.file, element=f"column {name}", expected="numbers") from error
 
