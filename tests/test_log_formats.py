@@ -1,6 +1,7 @@
 """Each log format and each naming of columns gives the same trajectories, or one clear error."""
 
 import csv
+import datetime as dt
 import os
 import re
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv
 import pyarrow.parquet
 import pytest
 import yaml
@@ -796,3 +798,60 @@ def test_a_joint_that_is_not_logged_is_named_with_what_to_write(tmp_path):
     (tmp_path / "log.csv").write_text("t,q_a,qd_a,tau_a\n0,0,0,0\n0.1,0,0,0\n")
     with pytest.raises(LogError, match="moving_joints"):
         read_logs([tmp_path / "log.csv"], ("a", "gripper"))
+
+
+def clock_texts(kind, seconds):
+    hours = 10 if kind != "midnight" else 23.9995
+    texts = []
+    for x in seconds.tolist():
+        time = dt.datetime(2026, 2, 28) + dt.timedelta(hours=hours, seconds=round(x, 3))
+        fraction = f"{time.microsecond // 1000:03d}"
+        texts.append(
+            {
+                "clock": f"{time:%H:%M:%S}.{fraction}",
+                "midnight": f"{time:%H:%M:%S}.{fraction}",
+                "date": f"{time:%Y-%m-%d %H:%M:%S}.{fraction}",
+                "minutes": f"{time:%M:%S}.{fraction}",
+                "ms": f"{1000 * x:.0f} ms",
+                "us": f"{1e6 * x:.0f}µs",
+                "s": f"{x:.2f} s",
+            }[kind]
+        )
+    return texts
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+@pytest.mark.parametrize("kind", ["clock", "midnight", "date", "minutes", "ms", "us", "s"])
+def test_times_as_texts_of_a_clock_or_with_a_unit_are_read(tmp_path, kind, form):
+    seconds = 0.01 * np.arange(400)
+    values = {f"{name}_a": np.sin(seconds + k) for k, name in enumerate(("q", "qd", "tau"))}
+    path = tmp_path / f"log.{form}"
+    table = pa.table({"t": clock_texts(kind, seconds), **values})
+    (pa.csv.write_csv if form == "csv" else pa.parquet.write_table)(table, path)
+    (log,) = read_logs(path, ["a"])
+    np.testing.assert_allclose(log.t - log.t[0], seconds, atol=1e-6)
+    np.testing.assert_allclose(log.q[:, 0], np.sin(seconds), rtol=1e-12)
+
+
+def test_cells_with_units_and_a_second_header_are_errors_with_what_to_do(tmp_path):
+    rows = ["t,q_a,qd_a,tau_a", "0,0.1,0,1", "0.1,0.2 rad,0,1"]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    with pytest.raises(
+        LogError, match=r"row 2, column q_a: got '0.2 rad', .*; write numbers only, and the unit as"
+    ):
+        read_logs(tmp_path / "log.csv", ["a"])
+    (tmp_path / "log.csv").write_text("\n".join([*rows[:2], rows[0], rows[1]]) + "\n")
+    with pytest.raises(LogError, match=r"got 't', .*remove that row, the header of a second file"):
+        read_logs(tmp_path / "log.csv", ["a"])
+
+
+def test_the_encoding_of_a_long_file_is_found_in_its_head(tmp_path):
+    rows = [f"{0.01 * k:.2f},0.1,0.2,1.0" for k in range(8000)]
+    (tmp_path / "log.csv").write_bytes("\n".join(["t,q °,qd,tau", *rows, ""]).encode("latin-1"))
+    mapping = LogMapping.model_validate({"columns": {"q": "q °", "qd": "qd", "tau": "tau"}})
+    assert len(read_logs(tmp_path / "log.csv", ["a"], mapping)[0]) == 8000
+
+
+def test_columns_separated_by_spaces_are_read(tmp_path):
+    (tmp_path / "log.csv").write_text("t q_a qd_a tau_a\n0 0.1 0 1\n0.1 0.2 0 1\n")
+    np.testing.assert_array_equal(read_logs(tmp_path / "log.csv", ["a"])[0].q[:, 0], [0.1, 0.2])

@@ -76,10 +76,10 @@ class DriveSamples(NamedTuple):
 
 
 class DriveLog:
-    """Collector of the samples of successive trajectories, which keeps at most twice `DriveHintTuning.samples`.
+    """Collector of the samples of successive trajectories.
 
-    If there are more samples, every second one is removed. If there are many trajectories, only every second, fourth,
-    ... trajectory is used, since filtering all of a long log takes minutes.
+    Whenever it has more than twice `DriveHintTuning.samples` samples, every second one is removed. If there are many
+    trajectories, only every second, fourth, ... trajectory is used, since filtering all of a long log takes minutes.
     """
 
     def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
@@ -123,8 +123,11 @@ class DriveLog:
         self._every *= 2
 
     def _shifted(self, samples: DynamicsSamples) -> DriveSamples:
-        """Return every `_every`-th sample of the moving arm, with the time-shifted signals."""
-        inner = samples[STEPS:-STEPS]  # the shifted torques do not exist at both ends
+        """Return every `_every`-th sample at which the arm moves, with the time-shifted signals.
+
+        Samples at both ends are omitted, because shifted torques are not available there.
+        """
+        inner = samples[STEPS:-STEPS]
         assert inner.z is not None and inner.direction is not None
         moving = np.flatnonzero(is_moving(inner.qd))
         while (
@@ -319,7 +322,7 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
 
 
 def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
-    """Return True if a candidate lowers the errors per block (B,) significantly, and below the fraction `gain`.
+    """Return True if a candidate lowers the errors per block (B,) significantly, and their mean by the factor `gain`.
 
     logged: (B,) errors without the candidate. mended: (B,) errors with it. candidates: number of candidates of which
     this is the best.

@@ -19,8 +19,8 @@ from spelgen.logs.dynamics_samples import FREQUENCY
 from spelgen.settings.log_mapping import SCALES
 
 RIGHT_ANGLE = np.pi / 2
-# Numbers of penalties `GEOMETRY.rare` that are added to the cost of changes which are rarer than a wrong sign or order.
-# They decide between changes that explain the torques equally well.
+# Code of a change -> penalty on its cost, in multiples of `GEOMETRY.rare`, for changes that are rarer than a wrong sign
+# or order. The penalty decides between changes that explain the torques equally well.
 RARE = {
     "gravity": 1,
     "joint-zero": 2,
@@ -132,7 +132,7 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
 def _rescaled(
     problem: GeometryProblem, unchanged: HypothesisFit, scalings: Sequence[Scaling]
 ) -> tuple[HypothesisFit, ...]:
-    """Return a tuple with the fit of the best torque unit if its cost is below the unchanged log's cost, else ().
+    """Return the fit for the best candidate for another torque unit, as a tuple; () if the unchanged log has less cost.
 
     No significant cost decrease is required: light bodies can explain torques that are too small, so that the cost
     shows little. The evidence for the factor is the magnitude of gravity, from which the candidates were computed.
@@ -199,10 +199,11 @@ def _scaled(base: Hypothesis, scalings: Sequence[Scaling]) -> Iterator[Hypothesi
 
 
 def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[HypothesisFit]:
-    """Return the fits of the best orders of joints, for all columns, for the torques and for the motion.
+    """Return fits with the best order of the joints: of all columns, of the torque columns, and of the motion columns.
 
-    An order is improved by exchanging two joints at a time. The search also starts at random orders, since the cost has
-    local minima for arms with many joints.
+    Each start of the search gives one fit, unless it ends at the present order. An order is improved by exchanging two
+    joints at a time. The search also starts at random orders, since the cost has local minima for arms with many
+    joints.
     """
     joints = problem.arm.joint_names
     starts = [np.arange(len(joints)), np.arange(len(joints))[::-1]]
@@ -294,8 +295,8 @@ def _with_offset(
         is_right_angle = bool(right.any()) and exact.cost < best.cost + GEOMETRY.right_angle
         if is_right_angle:
             best, offset = exact, right
-    # Without a decrease of the misfit the offset has the same effect as other masses, and is as uncertain as the masses
-    # of the URDF.
+    # An offset must also lower the torque residual (misfit), and not only the prior term: otherwise it only replaces a
+    # change of the masses, whose values in the URDF are uncertain.
     if abs(offset[0]) < min_offset or best.misfit > base.misfit - GEOMETRY.needed / 2:
         return []
     return [best if is_right_angle else problem.fit(shifted(offset.round(4)))]

@@ -276,8 +276,8 @@ class GeometryProblem:
         """Return the fit that minimises the cost under a hypothesis, by iteratively reweighted least squares.
 
         The noise variance of each joint is marginalised: the joint's negative log likelihood is N / 2 log(sum of
-        squared residuals). The prior of the inertial parameters is a Student t distribution: `scale` is its weight in
-        an iteration.
+        squared residuals). The prior of the inertial parameters is a Student t distribution, so that its precision
+        is reweighted in each iteration.
         """
         rows, normal = self.equations(hypothesis)
         tau = hypothesis.signals(self.samples).tau
@@ -325,8 +325,8 @@ class GeometryProblem:
 
         A violation adds half of its squared standard score to the cost, up to a bound. The bound is needed since a
         drive may compensate friction, and since errors of the friction model may resemble inertia: fits of recorded
-        arms have friction that drives the motion (shanghai, joint 6) or a negative rotor inertia (airbot), but not
-        both.
+        arms have friction that drives the motion (joint 6 of one arm of benchmarks/recordings.py) or a negative rotor
+        inertia (another arm), but not both.
 
         Args:
             x: (K,) parameters.

@@ -29,7 +29,8 @@ class DriveHintTuning:
     # [1] Number of blocks of time in the cross-validation; each block is held out once.
     blocks: int = 10
     # [1] A coupling is accepted if its squared residual is below this fraction of the squared residual without the
-    # coupling and, in each block, of the squared torque. For the wrist of the TX40 these fractions are 0.05 and 0.03.
+    # coupling and, in each block, of the squared torque. For the
+    # coupled wrist joints of a Staubli TX40 these fractions are 0.05 and 0.03.
     coupling_gain: float = 0.5
     # [1] Time shifts of the torque, in samples of 10 ms. They cover the delays of loggers and field buses; an apparent
     # delay of more than 30 ms may be due to friction.

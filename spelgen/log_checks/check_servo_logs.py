@@ -186,7 +186,10 @@ class ServoLogs:
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports of the joints completed by their tracking, and tables; add findings to the summary."""
+        """Return the joint reports with the tracking of the commands added, and the tables for display.
+
+        The findings are added to `summary`.
+        """
         names = self._arm.chain.joint_names
         saturation = np.full(len(names), np.inf)
         for k, coordinate in enumerate(self._arm.chain.coordinates):
@@ -247,10 +250,10 @@ def _odd_command(
     is_copy: bool,
     mapping: LogMapping,
 ) -> LogError | Diagnostic | None:
-    """Return the finding about the command of joint k; None if there is none.
+    """Return the finding about the logged command of joint k, or None.
 
-    It is an error if the logged command cannot be the command of this joint. is_copy: True if the logged command
-    equals the logged position in all samples.
+    The finding is an error if the column cannot contain the commands of this joint, otherwise a warning. is_copy: True
+    if the logged command equals the logged position in all samples.
     """
     where = f"joint {joints[k]!r}"
     # correlation and gain at the delay with the largest correlation, so that a slow servo is not reported as a fault

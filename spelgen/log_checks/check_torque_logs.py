@@ -82,7 +82,10 @@ class TorqueLogs:
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports of the joints completed by the fit of gravity, and tables; add findings to the summary."""
+        """Return the joint reports with the fit of gravity added, and the tables for display.
+
+        The findings are added to `summary`.
+        """
         # a check is omitted if the mapping accepts it, or if every trajectory does
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         chain, empty = self._arm.chain, MotionSamples.of(*np.zeros((4, 0, len(reports))))
@@ -109,9 +112,12 @@ class TorqueLogs:
         has_errors, faults = bool(summary.errors), dict[Check[JointEvidence], dict[str, str]]()
         for joint in evidence:
             passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
-            if has_errors:  # one message per cause
+            # if the log has an error, torques beyond the limits of the drive are a consequence of the same fault
+            if has_errors:
                 passed.add("torque-beyond-drive")
-            if joint not in weightless:  # wrong masses in the URDF may explain a torque without gravity
+            # If the masses of a joint are wrong in the URDF, its torque may also be uncorrelated with the URDF's
+            # gravity: only joints whose torques fit better without gravity are reported.
+            if joint not in weightless:
                 passed.add(WITHOUT_GRAVITY)
             for check, found in run_checks(CHECKS, joint, passed):
                 if check.severity == "error":
@@ -167,10 +173,10 @@ class TorqueLogs:
         accepted: set[str],
         summary: Findings,
     ) -> bool:
-        """Return True if the torques agree with the arm's geometry, without clipping; otherwise add the finding.
+        """Return True if the torques are not clipped and no hypothesis about the log fits significantly better.
 
-        False is returned for clipped torques, and if a hypothesis such as other signs, orders or zeros of the joints
-        fits significantly better. Warnings about mechanical stops and about inertials of the URDF are added, too.
+        Hypotheses are, for example, other signs, orders or zeros of the joints. Otherwise the finding is added, and
+        False is returned. Warnings about mechanical stops and about inertials of the URDF are added, too.
         """
         limits = find_limits(problem, FlatTops.joined(self._flat))
         summary.notes.extend(limits.notes)
@@ -191,7 +197,7 @@ class TorqueLogs:
         return False
 
     def _scalings(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> list[Scaling]:
-        """Return the candidates for other units: of torques, from the magnitude of gravity, and of all positions.
+        """Return candidate unit corrections: factors on torques, from the magnitude of gravity, and on all positions.
 
         A unit of torques that the mapping states is not changed.
         """
@@ -230,8 +236,8 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointEvidence]) 
     confirmed = []
     for k in suspicious:
         cost = problem.without_gravity(k).fit(problem.unchanged).cost
-        # also confirmed if the residual with gravity has a tenth of the torque's variance: then the URDF's gravity is
-        # not in this torque
+        # A torque without gravity is reported if the model without gravity has the lower cost, or if the residual of
+        # the model with gravity has more than 10 % of the torque's variance.
         if fit.errors[k] > 0.1 or cost < fit.cost:
             confirmed.append(joints[k])
     return confirmed

@@ -21,9 +21,9 @@ RIGHT = "joints, zeros, units and gravity as the URDF and the settings state the
 
 
 def mapped_reading(arm: Chain, mapping: LogMapping, drives: Drives) -> Hypothesis:
-    """Return the hypothesis of the unchanged log, with the scales and offsets of the mapping.
+    """Return the `Hypothesis` without changes: signs, scales and offsets of the joints are those of the mapping.
 
-    The torque scale includes the gear ratio of the drives if each motor drives one joint.
+    The torque scale includes the gear ratios of the drives if each motor drives one joint.
     """
     joints = arm.joint_names
     gears = np.diag(drives.inputs) if np.count_nonzero(drives.inputs) == len(joints) else np.ones(len(joints))

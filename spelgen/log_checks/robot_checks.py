@@ -49,7 +49,7 @@ def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
     if len(q) < 100:
         return [GravityFit()] * q.shape[1]
     still = np.zeros_like(q)
-    rows = regressor(arm, q, still, still)  # (S, n, 10 B)
+    rows = regressor(arm, q, still, still)  # (S, n, 10 B) for S samples and B bodies
     load = rows @ urdf_parameters(arm)
     # friction and the joint's own inertia are removed, since in a slow swing they are correlated with gravity
     friction = np.stack([np.ones_like(qd), qd, np.tanh(qd / SAMPLES.moving), qdd], axis=2)
@@ -63,8 +63,8 @@ def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
 def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
     """Return the fit of gravity to the torque of one joint.
 
-    signals: (S, 2 + K), the torque, the gravity torque of the URDF, and the K regressor columns of gravity. friction:
-    (S, F) columns of friction and inertia, which are removed from the signals by projection.
+    signals: (S, 2 + K) for S samples, the torque, the gravity torque of the URDF, and the K regressor columns of
+    gravity. friction: (S, F) columns of friction and inertia, which are removed from the signals by projection.
     """
     remainders = _without(friction, signals)
     lengths = np.linalg.norm(remainders, axis=0)
@@ -87,7 +87,10 @@ def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
 
 
 def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the residual of values (S,) or (S, K) after projection onto the span of the columns (S, C)."""
+    """Return the residual of values after projection onto the span of the columns.
+
+    columns: (S, C) for S samples. values: (S,) or (S, K).
+    """
     basis = orth(columns, rcond=TUNING.dependent)
     return np.asarray(values - basis @ (basis.T @ values))
 

@@ -181,12 +181,11 @@ def _velocity_lag(signals: JointSignals) -> float:
 
 
 def find_copied(signals: JointSignals) -> str | None:
-    """Find torques that are proportional to another signal of the log without any noise: one column is a copy."""
+    """Find torques that are proportional to the torque of another joint without any noise: one column is a copy."""
     trajectory, k = signals.trajectory, signals.number
     if not trajectory.tau.size or np.ptp(trajectory.tau[:, k]) == 0 or len(signals.q) < TUNING.jump_window:
         return None
-    columns = np.concatenate([trajectory.tau, trajectory.q, trajectory.qd], axis=1)
-    centred = columns - columns.mean(axis=0)
+    centred = trajectory.tau - trajectory.tau.mean(axis=0)
     lengths = np.linalg.norm(centred, axis=0)
     correlations = np.abs(centred[:, k] @ centred) / np.where(lengths > 0, lengths[k] * lengths, np.inf)
     correlations[k] = 0.0
@@ -194,9 +193,8 @@ def find_copied(signals: JointSignals) -> str | None:
     copies = np.flatnonzero(correlations > 1 - 1e-12)
     if not copies.size:
         return None
-    quantity, other = divmod(int(copies[0]), len(signals.joints))
-    source = f"{('tau', 'q', 'qd')[quantity]} of joint {signals.joints[other]!r}"
-    return f"tau that is proportional to {source}, without noise: one column is a copy"
+    other = signals.joints[copies[0]]
+    return f"tau that is proportional to the torque of joint {other!r}, without noise: one column is a copy"
 
 
 def find_held(signals: JointSignals) -> str | None:

@@ -117,7 +117,9 @@ class LogUnits(JointUnits):
 
 
 class JointWords(Group):
-    """Period, or sign bit, of the register words of one joint, in logged units; default: plain numbers, no words.
+    """Decoding of register values of one joint, in logged units; default: values are plain numbers.
+
+    The value is the period after which logged values wrap around, or the value of the sign bit.
 
     Attributes:
         q: Position.
@@ -307,7 +309,7 @@ class LogMapping(Group):
     def in_si(self) -> LogMapping:
         """Return the mapping for a file in SI units with default names of columns.
 
-        From this mapping it has `input`, `accept`, and a period of one turn for each joint with a period.
+        `input` and `accept` are copied. The positions of a joint with a period get the period of one turn.
         """
         # Positions of joints without limits may be in any interval of one turn, also in files that spelgen writes.
         turning = [name for name in self.joints if self.word("period", "q", name)]
