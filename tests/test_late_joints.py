@@ -80,9 +80,9 @@ def test_a_unit_that_the_mapping_states_wrongly_is_named(arm, stated, logged):  
 
 def test_torques_in_ticks_are_named_although_inertia_dominates(robots):
     """Gravity is a small part of the torque: the ratio of the gravity of a fit to the URDF's shows the unit."""
-    arm = load_arm(robots / "two_link.urdf")
-    log = recorded(arm, 1, noise=0.01)
-    error = told(arm, replace(log, tau=log.tau * 1000 / 30))
+    small = load_arm(robots / "two_link.urdf")
+    log = recorded(small, 1, noise=0.01)
+    error = told(small, replace(log, tau=log.tau * 1000 / 30))
     gains = list(map(float, re.findall(r"gain: ([\d.e-]+)", error)))
     np.testing.assert_allclose(np.log(gains), np.log(0.03), atol=np.log(1.6))
 
