@@ -1,4 +1,4 @@
-"""Base inertial parameters of an arm: the minimal set of combinations in which M and V are linear, exactly.
+"""Base inertial parameters of an arm, in exact arithmetic: the minimal set of combinations in which M, V are linear.
 
 Each entry of M(q), and V(q) - V(q0), is linear in the ten inertial parameters of each body; its coefficients are a row
 of a matrix (the energy regressor). Rows at random rational configurations span the row space of this matrix; the
