@@ -30,7 +30,7 @@ def quaternion(rotation: object) -> np.ndarray:
     matrix = np.array(rotation, dtype=float)
     # scipy has the order (x, y, z, w)
     result: np.ndarray = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
-    result[np.abs(result) < 1e-16] = 0.0  # rounding
+    result[np.abs(result) < 1e-16] = 0.0  # Smaller elements are rounding errors.
     return result
 
 
@@ -54,8 +54,8 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
         q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     count = len(chain.parents)
-    # The columns of a body's homogeneous transform replace points of the body: the kinetic energy is then
-    # linear in its pseudo-inertia.
+    # With the homogeneous transform T (4 x 4) and the pseudo-inertia J of a body, the kinetic energy is
+    # 1/2 tr(T' J T'^T), which is linear in J. The identity in place of point masses gives the columns of T.
     pose = chain.forward(q, torch.eye(4 * count).to(q))
     rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
     rises = torch.unflatten(rises, -1, (3, count, 4))
@@ -103,7 +103,7 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     shape = (3, 2 * len(order) // n + 1, n)  # twice as many equations as parameters
     motion = torch.from_numpy(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
     columns = constants_regressor(chain, motors, *motion).flatten(0, 1)
-    # norm of each column after projection onto the complement of all columns before it
+    # Norm of each column after projection onto the orthogonal complement of all preceding columns.
     remainder = torch.linalg.qr(columns[:, order]).R.diagonal().abs()
     # A column is linearly dependent if its part orthogonal to all preceding columns is shorter than 1e-8 times
     # the column. Rounding errors are smaller than this.

@@ -107,7 +107,10 @@ def tip_kinematics(
 
 
 def last_link(robot: Robot, joints: Sequence[str]) -> str:
-    """Return the link after the last of the given joints, or the end of the fixed links that follow this link."""
+    """Return the child link of the last of the given joints, or the end of a chain of links fixed to this link.
+
+    The chain ends at a link with no fixed joint, or with several fixed joints, to its children.
+    """
     link = robot.joint[joints[-1]].child
     while True:
         fixed = [joint.child for joint in robot.joints_below[link] if joint.type == "fixed"]
