@@ -179,7 +179,7 @@ def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     # The angle is split into quarter turns, which are exact, and a remainder, which is approximated; 45 and 135 degrees
     # then have approximations that differ by exactly a right angle. The remainder is in -0.7 .. 0.87 rad and not in
     # +-45 degrees: rounding of the common angles +-45 degrees would otherwise change the number of quarter turns.
-    eighth = 0.7  # [rad] just below pi/4
+    eighth = 0.7  # [rad] somewhat less than pi/4
     quarter, angle = divmod(atan2(sine, cosine) + eighth, pi / 2)
     tangent = tan((angle - eighth) / 2)
     t = Fraction(0)

@@ -35,7 +35,7 @@ class Axes:
         self.arm = arm
         self.assume = assume
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
-        generator = random.Random(0)  # a fixed seed, for reproducible reports
+        generator = random.Random(0)  # The seed is fixed, so that reports are reproducible.
         # For each configuration, the directions (n, 3) and the twists (n, 6) of the axes. Two configurations suffice:
         # at one, a false relation holds by chance with a probability of about its polynomial degree divided by 1e6.
         self._configurations = [_configuration(arm, generator) for _ in range(2)]
@@ -79,7 +79,7 @@ class Axes:
         axis of ``slider``. The test includes the motion of all joints between ``hinge`` and the tip.
         """
         if not all(self.prismatic[hinge + 1 : slider]):
-            return False  # a revolute joint between the two joints may rotate the plane
+            return False  # A revolute joint between the two joints may rotate the plane.
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]
         for axes, twists in self._configurations:
             normal = np.cross(axes[slider], axes[hinge])

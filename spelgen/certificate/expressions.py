@@ -23,7 +23,7 @@ from spelgen.certificate.axes import Axes, is_plain
 from spelgen.structure.recursion import base_denominators
 
 FLOAT_DIGITS = 17  # significant decimal digits that determine a double
-_FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at it
+_FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at this character.
 Terms = dict[Expr, fmpq]
 """A linear combination {product of distances, cosines and sines: coefficient}, with nonzero coefficients."""
 
@@ -122,7 +122,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
         for quarter in [1] * sines + [0] * cosines:
             products: dict[tuple[Expr, int], fmpq] = {}
             for (total, quarters), value in waves.items():
-                # cos a cos b = (cos(a + b) + cos(a - b)) / 2
+                # The product is a sum by cos a cos b = (cos(a + b) + cos(a - b)) / 2.
                 for sign in (1, -1):
                     wave = (total + sign * angle, (quarters + sign * quarter) % 4)
                     products[wave] = products.get(wave, fmpq(0)) + value / 2

@@ -79,7 +79,7 @@ class _Sentences:
         for entry in self.structure.entries:
             if entry.kind == kind:
                 groups.setdefault(self._reason(why, entry), []).append(entry)
-        # entries without a reason come last
+        # Entries without a reason are listed last.
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
                 # The placeholders get the joint of the column of each entry, which is closer to the root. If this joint

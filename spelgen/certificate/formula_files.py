@@ -84,7 +84,7 @@ def _parameters(formulas: Formulas, width: int) -> list[str]:
     lines = ["Base parameters, and the URDF's values" if values else "Base parameters"]
     for symbol, definition in formulas.base_parameters.items():
         value = f" [{float(values[symbol]):.6g}]" if symbol in values else ""
-        # a base parameter that equals an inertial parameter needs no equation
+        # A base parameter that equals an inertial parameter needs no equation.
         name = "" if definition.is_Symbol else f"{symbol.name} = "
         lines += expressions.lines(expressions.text(definition), f"  {name}", width, value)
     return lines

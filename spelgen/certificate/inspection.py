@@ -21,7 +21,7 @@ from spelgen.structure.servo_rank import servo_rank
 from spelgen.structure.structure import MassEntry, Structure, derive
 from spelgen.urdf.robot import Assume
 
-if TYPE_CHECKING:  # not imported at run time, since these modules import SymPy, which is slow
+if TYPE_CHECKING:  # These modules are not imported at run time, since they import SymPy, which is slow.
     from spelgen.certificate.formulas import Entry as PlaceOfEntry
     from spelgen.certificate.formulas import Formulas
 

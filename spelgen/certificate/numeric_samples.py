@@ -82,7 +82,8 @@ def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
     dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
     n, bodies = len(arm.coordinates), len(arm.bodies)
     rows = []
-    for _ in range(10 * bodies // n + 10):  # more rows than columns
+    # There are more rows than columns, so that the samples do not limit the rank.
+    for _ in range(10 * bodies // n + 10):
         q = dynamics.configuration(_positions(arm, rng))
         qd = dynamics.jacobian @ rng.normal(size=n)
         qdd = dynamics.jacobian @ rng.normal(size=n)

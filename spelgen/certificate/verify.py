@@ -167,7 +167,7 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
     """Yield checks that compare the chain with the reading of the URDF by Pinocchio."""
     try:
         differences = differences_of_reading(robot, arm, seed)
-    except Exception as problem:  # a failure of Pinocchio is no evidence about the chain
+    except Exception as problem:  # A failure of Pinocchio is no evidence about the chain.
         text = " ".join(str(problem).split())[:120]
         result = f"Pinocchio cannot read it ({type(problem).__name__}: {text})"
         yield FactCheck("reading of the file", "the moving bodies", result, "undecided")

@@ -79,7 +79,8 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
         at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
-    size = 2**14  # samples computed at a time, to limit the memory of temporary arrays
+    # Number of samples that are computed together; it limits the memory of temporary arrays.
+    size = 2**14
     for start in range(0, len(q), size):
         block = slice(start, start + size)
         corner = latest[block], drives

@@ -94,7 +94,7 @@ def runge_kutta(
 
     qd1 = qd = pd = torch.zeros_like(p)
     moved = pushed = torch.zeros_like(p)
-    # time of each stage as a fraction of the step, and weight of the stage
+    # For each stage, its time as a fraction of the step, and its weight in the mean.
     for fraction, weight in ((0.0, 1), (0.5, 2), (0.5, 2), (1.0, 1)):
         stage = fraction * step
         # The friction state of a stage is z, the state at the start of the step, after the displacement from the

@@ -162,9 +162,9 @@ class FrictionModel:
             dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
         effects = [rise, speed, *dry, np.ones_like(speed)]
         if self.stribeck:
-            # the Stribeck effect falls to 1/e at 0.1 rad/s or m/s
+            # The Stribeck effect falls to 1/e at 0.1 rad/s or m/s.
             effects.append(sign * np.exp(-((speed / 0.1) ** 2)))
         if self.polynomial:
             effects += [speed * np.abs(speed), speed**3]
-        # in the order of the property `effects`
+        # The columns have the order of the property `effects`.
         return np.stack(effects, axis=-2)

@@ -134,7 +134,7 @@ class PreparedModel:
         """
         n = self.n
         z = self.memory(qd) if z is None else z
-        # torch.func cannot differentiate compiled functions
+        # torch.func cannot differentiate compiled functions, so the copy has the method that is not compiled.
         plain = copy.copy(self)
         vars(plain).pop("forward_dynamics", None)
 

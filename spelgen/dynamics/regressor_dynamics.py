@@ -117,9 +117,8 @@ class RegressorDynamics:
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the accelerations qdd, (..., n), under the inputs tau (..., n)."""
         equations = self.equations_at(q)
-        force = equations.force(qd, tau, z).unsqueeze(
-            -1
-        )  # (..., n, 1), so that M and tau may have different batch dimensions
+        # With a last dimension of 1, M and tau may have different batch dimensions.
+        force = equations.force(qd, tau, z).unsqueeze(-1)
         qdd: Tensor = torch.linalg.solve(equations.mass, force)
         return qdd.squeeze(-1)
 

@@ -55,7 +55,7 @@ class LinkShapes(NamedTuple):
 
     @property
     def unread_text(self) -> str:
-        """Text that lists the links with unread shapes: the first two with their files, and the number of the others."""
+        """Text that lists the links with unread shapes: the first two with their files, and the number of others."""
         named = [f"{link} ({', '.join(names)})" for link, names in self.unread.items()]
         if len(named) > 2:
             named[2:] = [counted(len(named) - 2, "more link")]
@@ -115,7 +115,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
 
     link: name of the link. A mesh has no triangles yet; see `_meshes`.
     """
-    import yourdfpy  # imports trimesh, which takes long
+    import yourdfpy  # The import is here, because yourdfpy imports trimesh, which takes long.
 
     # Each shape is parsed as a URDF of its own, so that an invalid shape does not affect the others.
     root = etree.Element("robot", name=link)
@@ -138,7 +138,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
             scale, file_name = geometry.mesh.scale, geometry.mesh.filename
             size = 1.0 if scale is None else scale
         numbers = np.broadcast_to(np.asarray(size, dtype=float), COUNTS[kind])
-    except Exception as error:  # absent or malformed attributes raise many types of errors
+    except Exception as error:  # Absent or malformed attributes raise many types of errors.
         raise ValueError("a shape that is not valid") from error
     if not (np.isfinite(pose).all() and np.isfinite(numbers).all()) or (kind != "mesh" and numbers.min() < 0):
         raise ValueError(f"a {kind} of negative or infinite size or place")
