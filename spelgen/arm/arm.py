@@ -323,7 +323,7 @@ def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], joint: UrdfJoin
     axis = rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis)
     parallel = []
     for body in (moving.body for moving in moved):
-        # `beside`, the axis of the moving joint in the frame of the parent body, is the z axis of the joint's frame.
+        # Axis of the moving joint, the z axis of its frame, as a vector in the frame of the parent body.
         beside = np.array(body.rotation, dtype=float)[:, 2]
         # [rad] Largest angle between axes that count as parallel, since URDFs have rounded axes.
         is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2

@@ -55,7 +55,7 @@ def rounded_angle(angle: float, tolerance: float) -> float:
     """
     if tolerance == 0.0:
         return angle
-    # Divisors of pi, with the tolerance of each. These are the special angles that occur in the URDFs of 189 arms. The
+    # Divisors of pi, with the tolerance of each: the special angles in the URDFs of 189 arms are multiples of them. The
     # tolerance of pi/12, pi/8 and pi/5 is small, because 0.26, 0.39 and 0.63 rad also occur as exact values.
     limits = {2: tolerance, 12: 2e-5, 8: 2e-5, 5: 2e-5}
     for divisor, limit in limits.items():

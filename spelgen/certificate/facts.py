@@ -212,7 +212,9 @@ def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
     """Return the reason that entries of one row of M are equal or opposite.
 
     Unit velocities of the joints of the columns give the bodies that the joint of the row carries the same velocity
-    field, or, if these are one balanced body, the same angular velocity. entries: (row, column) of each entry, 0-based.
+    field; for a single balanced body, the same angular velocity suffices.
+
+    entries: (row, column) of each entry, 0-based.
     """
     # Entries of different rows are integrals over different loads, for whose equality there is no simple reason.
     rows, columns = map(sorted, zip(*entries, strict=True))

@@ -104,7 +104,7 @@ Magnitude = tuple[str, float, bool]
 
 @dataclass(frozen=True)
 class _DerivedFact:
-    """A derived fact, with the sampled numbers that must be zero, and those that must be nonzero, if it is true.
+    """A derived fact, with the sampled numbers that must be zero, and the numbers that must not, if it is true.
 
     fact: name of the fact. derived: result of the derivation, as text.
     """

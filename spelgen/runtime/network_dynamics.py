@@ -108,8 +108,8 @@ class NetworkDynamics(PortHamiltonian):
 class DenseInputDynamics(NetworkDynamics):
     """A model of networks with a diagonal G(q).
 
-    The network of G has three outputs per joint, one per axis. Only the output of the z axis, along
-    which the joint moves, is used.
+    The network of G has three outputs per joint, one per axis. Only the output of the z axis, about
+    or along which the joint moves, is used.
     """
 
     def __init__(self, *, input_network: MaskedNetwork, **parts: Any) -> None:
