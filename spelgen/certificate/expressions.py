@@ -122,7 +122,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
         for quarter in [1] * sines + [0] * cosines:
             products: dict[tuple[Expr, int], fmpq] = {}
             for (total, quarters), value in waves.items():
-                # The product is a sum by cos a cos b = (cos(a + b) + cos(a - b)) / 2.
+                # Each product becomes a sum: cos a cos b = (cos(a + b) + cos(a - b)) / 2.
                 for sign in (1, -1):
                     wave = (total + sign * angle, (quarters + sign * quarter) % 4)
                     products[wave] = products.get(wave, fmpq(0)) + value / 2

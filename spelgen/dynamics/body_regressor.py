@@ -54,8 +54,8 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
         q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     count = len(chain.parents)
-    # With the homogeneous transform T (4 x 4) and the pseudo-inertia J of a body, the kinetic energy is
-    # 1/2 tr(T' J T'^T), which is linear in J. The identity in place of point masses gives the columns of T.
+    # With the homogeneous transform T (4 x 4), its time derivative T', and the pseudo-inertia J of a body, the kinetic
+    # energy is 1/2 tr(T' J T'^T), which is linear in J. The identity in place of point masses gives the columns of T.
     pose = chain.forward(q, torch.eye(4 * count).to(q))
     rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
     rises = torch.unflatten(rises, -1, (3, count, 4))

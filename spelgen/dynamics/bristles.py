@@ -93,8 +93,8 @@ def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the samples at which each column of a path (T, n) starts or reverses.
 
     Returns:
-        Indices of these samples, (R, n), of up to R - 1 reversals: first the start, then the reversals. Columns with
-        fewer reversals are padded with zeros.
+        Indices of these samples, (R, n): first the start, then the reversals, where R - 1 is the largest number of
+        reversals of a column. Columns with fewer reversals are padded with zeros.
         For each sample, the row of this array with the latest start or reversal, (T, n).
     """
     steps = np.diff(path, axis=0, prepend=path[:1])

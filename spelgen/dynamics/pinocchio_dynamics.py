@@ -36,7 +36,7 @@ def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
         result = method(self, *np.broadcast_arrays(*map(np.asarray, states)))
         if isinstance(first, np.ndarray):
             return result
-        # torch is not imported, since this file must be importable without torch: the argument makes the tensor.
+        # A method of the argument makes the tensor, since this file must be importable without torch.
         return first.new_tensor(result)
 
     return on_arrays

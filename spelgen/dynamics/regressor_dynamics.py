@@ -101,7 +101,8 @@ class RegressorDynamics:
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
         """Return the configuration cache of the B bodies at q, and their momenta per joint velocity, (..., n, 12 B).
 
-        The momentum of a body is T' J, 3 x 4 elements, with its homogeneous transform T and pseudo-inertia J.
+        The momentum of a body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and
+        its pseudo-inertia J.
         """
         # The kinetic energy of a body is 1/2 tr(T' J T'^T), linear in J, so that J may be physically inconsistent. The
         # identity in place of point masses gives the columns of T.

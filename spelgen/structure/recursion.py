@@ -296,7 +296,7 @@ def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
 
 
 def _terms(row: Sequence[Fraction], number: Number) -> Terms:
-    # The numbers 1 and -1 are not converted, because `_dot` multiplies by other elements only.
+    # The numbers 1 and -1 remain integers, so that `_dot` can add or subtract in place of a multiplication.
     return tuple((i, int(x) if abs(x) == 1 else number(x)) for i, x in enumerate(row) if x)
 
 
