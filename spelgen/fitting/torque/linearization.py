@@ -26,7 +26,8 @@ class JointRows(NamedTuple):
 class LinearTerms:
     """Linear terms of one joint's torque, whose weights are eliminated by variable projection.
 
-    features: F, (T, P). penalty: diagonal D of the penalty on squared weights, (P,), in squares of the torque.
+    features: F, (T, P). penalty: diagonal D of the penalty on squared weights, (P,); its unit is the square of the unit
+    of the torque.
 
     Let r be the torque residual of all other parameters. The weights are the ridge solution w(r) = (F^T F + D)^-1 F^T
     r. The cost |r - F w(r)|^2 + |D^1/2 w(r)|^2 then depends only on the other parameters. It is the square of a vector
@@ -166,9 +167,9 @@ class BayesianRidge(NamedTuple):
     """Result of `bayesian_ridge` for P weights in G groups.
 
     coef: weights, which are the ridge solution for `penalty`, (P,). penalty: penalty on the squared weights, (P,),
-    equal to lambda / alpha times the correlation length, in squares of the target. alpha: precision of the noise.
-    lambda_: precision of the weights of each group, (G,). gamma: effective number of weights of each group, (G,).
-    n_iter, converged: number of fixed-point iterations, and whether they converged.
+    equal to lambda / alpha times the correlation length; its unit is the square of the unit of the target. alpha:
+    precision of the noise. lambda_: precision of the weights of each group, (G,). gamma: effective number of weights of
+    each group, (G,). n_iter, converged: number of fixed-point iterations, and whether they converged.
     """
 
     coef: torch.Tensor

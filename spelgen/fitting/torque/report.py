@@ -108,7 +108,10 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
 
 
 def _few_data(samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray) -> Diagnostic:
-    """Return the warning that the samples do not support a fit of some joints; nmse: see `_likely_nmse`, (n,)."""
+    """Return the warning that the logs have too little motion for the parameters of some joints.
+
+    nmse: median-unbiased nMSE of held-out segments, (n,).
+    """
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
     # The nMSE due to parameter errors is inversely proportional to the duration of the motion.
     enough = math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported)
