@@ -86,7 +86,10 @@ class Fit:
 
     @property
     def torque_nmse(self) -> dict[str, float]:
-        """Joint name -> mean squared torque error / variance of the torque; joints with constant torque are omitted."""
+        """Mean squared torque error divided by the variance of the torque, by joint name.
+
+        Joints with constant torque are omitted.
+        """
         by_joint = zip(self.model.joint_names, self.checkpoint.torque_nmse, strict=False)
         return {joint: nmse for joint, nmse in by_joint if math.isfinite(nmse)}
 
@@ -178,7 +181,8 @@ class Fit:
         for x in samples:
             squares = np.square(self._torque(x.q, x.qd, x.qdd, x.z, x.direction) - x.tau).mean(axis=0)
             variance = x.tau.var(axis=0)
-            varies = variance > 0  # a constant torque cannot be explained
+            # The nMSE of a constant torque is undefined (division by zero), so joints of constant torque are omitted.
+            varies = variance > 0
             scores.append(1 - (squares[varies] / variance[varies]).mean())
         return float(np.mean(scores))
 

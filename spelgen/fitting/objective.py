@@ -73,7 +73,10 @@ class Objective(ABC):
 
 
 def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -> Record:
-    """Return the record of a fit before it runs. It contains only the options that apply to the model, resolved."""
+    """Return the record of a fit before it runs.
+
+    The record contains only the options that apply to the model, with their defaults filled in.
+    """
     model, spec, options = request.model, spec_of(request.model), request.options
     notes = [note for note in (*prepared.diagnostics, *options.notes) if note.severity == "warning"]
     record = Record(

@@ -81,7 +81,7 @@ class MiniBatchAdamW(WindowOptimizer):
         )
 
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
-        """See `WindowOptimizer`."""
+        """Take AdamW steps on random batches of windows; return the mean loss, NaN if a loss is not finite."""
         rows, size = steps * self._batch, len(windows)
         # Batches are cut from passes over all windows in random order, so that windows are used about equally often.
         passes = [torch.randperm(size, generator=self._generator) for _ in range(-(-rows // size))]
@@ -141,7 +141,7 @@ class LBFGS(WindowOptimizer):
         self._optimizer.param_groups[0].update(last=(math.inf, math.inf), waits=0)
 
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
-        """Return the loss at the end; NaN if no evaluation was finite. See `WindowOptimizer`."""
+        """Minimise the loss of all windows; return the loss at the end, NaN if no evaluation was finite."""
         return self.minimise(lambda: [loss(windows)], steps)
 
     def minimise(self, summands: Summands, steps: int) -> float:
@@ -174,7 +174,10 @@ class LBFGS(WindowOptimizer):
         return waits > 1
 
     def _evaluated(self, summands: Summands) -> Tensor:
-        """Compute the gradients and return the penalised loss, (); a large number if they are not finite."""
+        """Compute the gradients and return the penalised loss, ().
+
+        The result is a large number if the loss or a gradient is not finite.
+        """
         self._optimizer.zero_grad()
         try:
             value = torch.zeros((), dtype=torch.float64)
@@ -204,7 +207,7 @@ def minimise(model: torch.nn.Module, summands: Summands, evaluations: int, weigh
         model: model whose weights are fitted, if they require a gradient.
         summands: function that yields the terms of the loss.
         evaluations: maximum number of evaluations of the loss, rounded up to a multiple of `TUNING.lbfgs_call`.
-        weight_decay: see `LBFGS`.
+        weight_decay: factor of half the sum of squares of all matrices, which is added to the loss.
     """
     optimizer, count = LBFGS(model, weight_decay), 0
     while count < evaluations and not optimizer.stalled:

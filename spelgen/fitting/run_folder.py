@@ -107,7 +107,10 @@ class RunFolder:
         return RunError("no such run", file=self.path, expected=expected, do="make one with `spelgen train`")
 
     def read_record(self) -> Record:
-        """Return config.json. Raises RunError if it is absent, broken, or has a key absent or of another type."""
+        """Return config.json.
+
+        Raises RunError if the file is absent or broken, lacks a key, or has a key of another type.
+        """
         return require(Record, self.read_json(self.config), self.config)
 
     def read_baselines(self) -> Content:
@@ -115,7 +118,10 @@ class RunFolder:
         return self.read_json(self.baseline) if self.baseline.exists() else {}
 
     def load_checkpoint(self) -> Checkpoint:
-        """Return checkpoint.pt. Raises RunError if it is absent, broken, or has a key absent or of another type."""
+        """Return checkpoint.pt.
+
+        Raises RunError if the file is absent or broken, lacks a key, or has a key of another type.
+        """
         checkpoint = require(Checkpoint, self.load_state(self.checkpoint), self.checkpoint)
         _require_finite(checkpoint.best_weights, self.checkpoint)
         return checkpoint
