@@ -163,7 +163,8 @@ def find_levels(
     """
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    # These levels have no noise yet: they are needed to compute the samples from which the noise is estimated.
+    # These `NoiseLevels` have limits and no noise values: the samples from which the noise is estimated depend on the
+    # limits.
     levels = NoiseLevels.model_construct(
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
@@ -185,9 +186,10 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
     """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
 
     The logs are without payload, so each estimated payload is an error. Windows of consecutive blocks are independent
-    trials. Two normalised squared errors are averaged over the trials together with the prior: of the mass, and of mass
-    and first moments. The factor is the largest average over both errors and all window lengths: errors of the model
-    average out slowly, so that longer windows may have larger normalised errors.
+    trials. Each trial has two normalised squared errors: of the mass, and of the mass and first moments. Each error is
+    averaged over the trials; the prior value counts as `prior_trials` more trials. The factor is the largest average
+    over both errors and all window lengths: errors of the model average out slowly, so that longer windows may have
+    larger normalised errors.
     """
     factors = []
     for window in TUNING.trial_blocks:
