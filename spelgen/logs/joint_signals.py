@@ -193,13 +193,14 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
     if signals.kind != "prismatic" and name in ("q", "u"):
         # candidates for the size of a revolution in logged units: angles without a stated unit may be in degrees
         turns = [2 * np.pi / abs(scale), *([360.0] if unit is None else [])]
-    # lost samples and outliers are removed: their jumps are not due to a register
+    # Lost samples and outliers are removed, because their jumps are not due to a register.
     values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
     for turn in turns:
         word = read_as_words((values - offset) / scale, turn)
         if word is None:
             continue
-        # commands may jump by themselves, so that decoding must bring them closer to the positions
+        # Commands may have genuine jumps. A decoding of commands is therefore accepted only if it brings the commands
+        # closer to the measured positions.
         if name == "u":
             q = signals.q[~is_lost(signals.signal("u"))]
             if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
@@ -293,7 +294,8 @@ def _apparent_inertia(
 def _relative_error(columns: Sequence[np.ndarray], values: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the relative RMS residual of a least-squares fit, and the coefficients (C,).
 
-    columns: C regressor columns (B,). values: (B,) the fitted values, whose RMS is the reference.
+    columns: C columns of the regressor, (B,) each for B frequency bands. values: (B,) dependent variable, whose RMS is
+    the reference of the residual.
     """
     matrix = np.stack(columns, axis=1)
     x = np.linalg.lstsq(matrix, values, rcond=None)[0]

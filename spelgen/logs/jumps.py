@@ -125,11 +125,12 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
-    """Return a mask (T,) of the rows of a log (T, C) that are repeated although the arm moves, and the copies per row.
+    """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
     positions: number of leading columns that are positions. A block of k equal rows consists of repeats if the arm
     moved meanwhile: then the step at its end is as large as k steps of the motion that follows. Equal rows of an arm at
-    rest are no repeats, unless the rows of motions occur n times each: then only every n-th row at rest is kept.
+    rest are no repeats, with one exception: if the rows during motion occur m times each, the logger writes each row m
+    times, so that of the rows at rest only every m-th is kept.
     """
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
     lengths = np.diff(np.append(starts, len(columns)))
@@ -202,7 +203,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        # words that overflow have a range of one period (plus 1 % for noise); negative words exceed the sign bit
+        # The decoding of words that overflow needs a range of at most one period (plus 1 % for noise). The decoding of
+        # a sign bit needs values above the sign bit, which represent the negative numbers.
         readings = []
         if np.ptp(values) < 1.01 * size:
             readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))

@@ -87,14 +87,16 @@ def _read(
 ) -> list[Trajectory]:
     """Return the trajectories of all files, collected in `segments`; raise the first error of each file, as one error.
 
-    source: joints and mapping. role, joint_types: see `read_logs`.
+    source: joints and mapping. role: "train" or "test", if only the files of a folder with this name are read; None:
+    all files. joint_types: types of the joints, for the check of the units in the mapping.
     """
     collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))
     files, errors = log_files(paths, role)
     for file in files:
         try:
             tables = read_tables(file, source.joints, source.mapping)
-            while tables:  # a table is removed from the list, so that its memory is free after it was added
+            # A table is removed from the list before it is added, so that its memory can be freed afterwards.
+            while tables:
                 segments.add(*tables.pop(0))
         except LogError as error:
             errors.append(error)

@@ -161,7 +161,9 @@ def _column_name(name: str) -> ColumnName:
 def _by_quantity(
     columns: Sequence[ColumnName], commands: bool, joints: Sequence[str]
 ) -> dict[str, list[ColumnName]]:
-    """Return the columns per quantity, which the words in a column's name determine, or else its unit.
+    """Return the columns of each quantity, by the name of the quantity.
+
+    The quantity of a column is determined by the words in its name or, if these do not determine it, by its unit.
 
     commands: True for logs with commanded positions "u" instead of velocities and torques. joints: names of the joints;
     a joint's name in a column's name does not count as a word for commands, even if it is one.

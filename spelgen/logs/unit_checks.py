@@ -28,13 +28,17 @@ UNITS = {
 
 
 def velocity_products(trajectory: Trajectory) -> np.ndarray:
-    """Return the Gram matrix (2n, 2n) of increments over ten samples: of the integrals of qd (n), then of q (n)."""
+    """Return the Gram matrix (2n, 2n) of the increments of 2n signals over ten samples.
+
+    Rows 0 to n-1 are the integrals of qd, rows n to 2n-1 are q.
+    """
     # imported here, since the import takes half a second
     from scipy.integrate import cumulative_trapezoid
 
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
     for piece in split_at_gaps(trajectory, shortest=2):
-        # increments over several samples: between neighbours the quantisation step may be larger than the change of q
+        # Increments over several samples are used, because between neighbouring samples the quantisation step may be
+        # larger than the change of q.
         span = min(SIGNALS.increments, len(piece) - 1)
         integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
         positions = np.concatenate([integral, piece.q], axis=1)
@@ -47,7 +51,8 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the factors (n,) between dq/dt and qd of each joint, and the correlations (n, n) of all qd and dq/dt.
 
     A factor times qd is dq/dt in the least-squares sense. Correlation (i, j) is between qd of joint i and dq/dt of
-    joint j; it is NaN if one of these joints is at rest. products: see `velocity_products`.
+    joint j; it is NaN if one of these joints is at rest. products: (2n, 2n) Gram matrix of the increments of the
+    integrals of qd, then of q.
     """
     n = len(products) // 2
     qd_squares, q_squares = np.split(products.diagonal(), 2)
@@ -59,8 +64,9 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def find_units(signals: JointSignals) -> str | Advice | None:
     """Find wrong units of q or qd: a range of q of more than two turns, or dq/dt that is a multiple of qd."""
     mapping, joint = signals.trajectory.mapping, signals.joint
+    # dq/dt is wrong because the times are in another unit, which another check reports.
     if signals.step > SIGNALS.slowest_step:
-        return None  # the times are in another unit
+        return None
     is_far = np.ptp(signals.q) > TURNS and signals.kind != "prismatic" and not signals.turns
     is_far &= mapping.unit("q", joint) is None
     message = f"q that changes {signals.factor:.3g} times as fast as qd"
