@@ -71,7 +71,7 @@ def evaluate(
         logs: test logs of the same arm.
         arm: result of ``load_arm``, or the path of a URDF; by default the arm of the fit. It is needed for the URDF as
             a baseline, and for tip errors.
-        baselines: name -> dynamics, evaluated in addition to the baselines of `baselines.registry`, for example
+        baselines: dynamics by name, evaluated in addition to the baselines of `baselines.registry`, for example
             ``{"truth": identify(...).dynamics}``.
         preprocessing: filter and delay of states and torques; by default the preprocessing of the fit.
         steps: prediction horizons [samples].

@@ -20,7 +20,7 @@ OBSERVER = (
 )
 
 Numbers = Mapping[str, float | None]
-"""Column -> number; None for an unknown number."""
+"""Numbers of a row, by the name of the column; None for an unknown number."""
 MASS_TITLE = "Error of the mass matrix, relative to the true one (at positions of the test logs)"
 CSV_HEAD = ("table", "row", "predictor", "value")
 LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")

@@ -193,7 +193,8 @@ def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Traj
     q = joined_column(pieces, "q")
     # The quantile excludes the fastest samples, which are often spikes of differentiated positions.
     fast = np.quantile(np.abs(joined_column(pieces, "qd")), 0.995, axis=0)
-    grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense near zero, where friction reverses
+    # The speeds are dense near zero, where friction reverses.
+    grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)
     speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n)
     alone = torch.diag_embed(speeds)  # (81, n, n): only one joint moves at a time
     positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)

@@ -135,7 +135,8 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
     return TrainingData(
         training=training,
         validation=validation,
-        # scales of the training windows only: validation logs must not change the loss function
+        # The scales are computed from the training windows only, since validation logs must not change the loss
+        # function.
         scales=loss_scales(training, model.joint_types),
         preprocessing=resolved,
         training_names=[x.name for x in split.training],

@@ -142,7 +142,8 @@ class _Fitting:
         status = self._run()
         model, checkpoint = request.model, Checkpoint.model_validate(objective.checkpoint())
         model.load_state_dict(checkpoint.best_weights)
-        model.requires_grad_(True)  # the objective may have disabled gradients of some parameters
+        # The objective may have disabled the gradients of some parameters.
+        model.requires_grad_(True)
         return Fit(
             model=model,
             history=objective.history,
@@ -261,7 +262,8 @@ def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rat
     objective, defaults = chosen.objective, chosen.defaults
     if objective is None:
         objective = default_objective(model, rates)
-        if rigid_bodies and objective == "rollout":  # for rigid bodies the regularizer is off by default
+        # If the objective was chosen from the logs, rigid bodies have no regularizer by default.
+        if rigid_bodies and objective == "rollout":
             defaults = {"urdf_weight": 0.0, **defaults}
     return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.options, defaults=defaults)
 

@@ -128,7 +128,8 @@ class Posterior:
             inverse = torch.linalg.inv(inputs + torch.diag((~inputs.any(dim=1)).double()))
         variance = (inverse.square() @ torch.from_numpy(self.torque_std).square()).expand_as(q).clone()
         samples = DynamicsSamples("", motion[0], motion[1], motion[2], np.zeros_like(motion[0]), *motion[3:])
-        size = 2048  # samples per block: the Jacobian of all samples of a log may not fit into memory
+        # Samples are processed in blocks, since the Jacobian of all samples of a log may not fit into memory.
+        size = 2048
         for first in range(0, len(q), size):
             block = TorqueSamples.of([samples[first : first + size]])
             rows = torch.zeros(block.count, model.n, root.shape[1]).double()

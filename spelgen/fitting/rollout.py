@@ -73,7 +73,7 @@ def _adaptive_step(
     Dormand and Prince, J. Comput. Appl. Math. 6 (1980), differentiated through the solver. All windows are solved
     together, with time in units of their own intervals.
     """
-    from torchdiffeq import odeint  # imported only if needed: the import takes half a second
+    from torchdiffeq import odeint  # imported only if needed, since the import takes half a second
 
     def rate(t: Tensor, state: Tensor) -> Tensor:
         """Return the derivative of the state (q, p), (W, 2 n), with respect to time in units of the interval."""

@@ -62,7 +62,8 @@ class RunFolder:
             content[self.urdf] = urdf_bytes(urdf)  # a xacro file is expanded
         if urdf is not None and (settings := urdf.with_suffix(".yaml")).is_file():
             content[self.settings] = settings.read_bytes()
-        # config.json, the first of the files, is removed first: after an interruption the folder is no run
+        # config.json, the first of the files, is removed first. A folder without this file is not treated as a run if
+        # the removal is interrupted.
         for file in vars(self).values():
             if file != self.path:
                 remove(file)

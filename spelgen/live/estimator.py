@@ -159,7 +159,8 @@ class Estimator:
         with torch.no_grad():
             torque = self.model.inverse_dynamics(*at, *past)
             friction = self.model.friction_torque(*at[:2], *past)
-            # the payload is fixed to the last body
+            # The payload is fixed to the last body, whose ten inertial parameters are the last columns of the
+            # regressor.
             regressor = regressor_of(self.model.chain, *at)[..., -10:]
             load = regressor @ torch.from_numpy(self.payload.parameters)
             decay = np.zeros(1)

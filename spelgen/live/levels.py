@@ -86,7 +86,8 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
         tested.append((fitted_to(fit, others), fold))
     levels = find_levels(tested, effort, tip)
-    # Serialization rounds the numbers: return the same numbers as a later read of the run folder.
+    # Serialization rounds the numbers. The rounded numbers are returned, so that a later read of the run folder gives
+    # the same ones.
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
 
@@ -236,7 +237,7 @@ def _likelihood(
 
     Args:
         segments: consecutive blocks of each log.
-        grid: time constant [s] and ratio at each of G points, (G, 2); see `block_noise`.
+        grid: time constant of d [s], and ratio of the standard deviations of d and w, at each of G points, (G, 2).
         scale: standard deviations of white noise, (G, n) [Nm, N].
     """
     constant, ratio = grid.T[:, :, None]

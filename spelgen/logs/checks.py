@@ -103,7 +103,7 @@ def run_checks(
     """Return the checks that find a fault of `subject`, with their findings. accepted: codes of checks to omit."""
     results: dict[str, tuple[Check[Subject], Advice]] = {}
     for check in checks:
-        # one message per cause: velocities in degrees would also fail the check of derivatives
+        # Each cause has one message. Velocities in degrees, for example, would also fail the check of derivatives.
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         advice = check.find(subject)
@@ -115,7 +115,7 @@ def run_checks(
 def find_no_torques(signals: JointSignals) -> str | None:
     """Find recordings in which the torques of all joints are always 0."""
     trajectory = signals.trajectory
-    # reported for the first joint only, since the finding concerns all joints
+    # The finding is reported for the first joint only, since it concerns all joints.
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"

@@ -184,7 +184,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
     values: (T,) in logged units. turn: one revolution in logged units; None for a joint that does not rotate.
     """
-    if len(values) < 4:  # the median step might itself be a jump
+    # The median step of so few values might itself be a jump.
+    if len(values) < 4:
         return None
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
@@ -212,7 +213,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
             jumps = np.abs(np.diff(reading.values))
-            # a wrong decoding is rejected: it shortens large steps of motion by one period, but they remain large
+            # A wrong decoding is rejected: it shortens large steps of the motion by one period, but the steps remain
+            # large.
             if np.median(jumps[rows]) > TUNING.jump * usual:
                 continue
             bends = np.abs(np.diff(reading.values, 2))

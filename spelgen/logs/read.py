@@ -114,8 +114,9 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     """Write trajectories to one Parquet or CSV file, as the suffix of the path states; return the path.
 
     The file is complete, or not written if an error occurs. The column `trajectory` contains the names of the
-    trajectories. `read_logs` returns the same numbers from both formats. arm: see `read_logs`. Raises LogError for
-    another suffix, if there are no trajectories, and for trajectories whose number of joints differs from the arm's.
+    trajectories. `read_logs` returns the same numbers from both formats. arm: result of `load_arm`, a model, or the
+    names of the joints. Raises LogError for another suffix, if there are no trajectories, and for trajectories whose
+    number of joints differs from the arm's.
     """
     path, joints = Path(path), log_source(arm).joints
     if path.suffix not in (".parquet", ".csv"):

@@ -58,7 +58,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         columns = ("t", *self.quantities)
         for column in columns:
-            # converts lists and tensors; the frozen dataclass does not allow a normal assignment
+            # This converts lists and tensors to arrays. The frozen dataclass does not allow a normal assignment.
             object.__setattr__(self, column, self._as_array(column))
         if self.t.ndim != 1 or not self.t.size:
             raise self.error(f"an array of shape {self.t.shape}", "(T,), a time for each sample", column="t")
@@ -244,7 +244,7 @@ LogRows = tuple[Trajectory, slice]
 
 def steps_between(trajectory: Trajectory, longest: float = 3.4e-3) -> int:
     """Return the number of integration steps per sample interval, so that a step is at most ``longest`` [s]."""
-    # default of 3.4 ms: with longer steps, fits of position servos had armatures biased by a few per cent
+    # The default is 3.4 ms: with longer steps, fits of position servos had armatures biased by a few per cent.
     return max(1, math.ceil(1 / (trajectory.sample_rate * longest) - 1e-6))
 
 

@@ -32,7 +32,7 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
 
     Rows 0 to n-1 are the integrals of qd, rows n to 2n-1 are q.
     """
-    # imported here, since the import takes half a second
+    # SciPy is imported here, since the import takes half a second.
     from scipy.integrate import cumulative_trapezoid
 
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
@@ -114,7 +114,8 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
         message = f"q that changes {signals.factor:.3g} times as fast as qd"
         unit = next((x for x in TIMES if x != "s" and signals.changes_by(TIMES[x])), None)
     elif signals.number:
-        return None  # reported for the first joint only, since all joints share the times
+        # The finding is reported for the first joint only, since all joints share the times.
+        return None
     elif unit is not None:
         message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
     if unit is None or is_stated:
@@ -140,7 +141,8 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         return None
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
-        return message  # too few increments for evidence: two samples always have a correlation of 1 or -1
+        # The increments are too few for advice: two samples always have a correlation of 1 or -1.
+        return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
         return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
@@ -184,7 +186,8 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
 
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Find velocities without sign: qd is |dq/dt|."""
-    # share: qd has no sign if its extreme velocity of one sign is below 5 % of its extreme velocity of the other sign
+    # `share` is a threshold: qd has no sign if its extreme velocity of one sign is below 5 % of its extreme velocity of
+    # the other sign.
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
     lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
     # velocities of both signs are not magnitudes, and differentiated ones cannot lack their sign

@@ -55,7 +55,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
     p, n = x.joints.shape
     for _ in range(TUNING.joint_steps):
         normal = problem.normal_equations(x, errors)
-        # the Hessian and the negative gradient of each joint's own parameters: (n, p, p) and (n, p)
+        # Hessian and negative gradient with respect to the p parameters of each joint, (n, p, p) and (n, p)
         blocks = normal.curvature[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)
         joints = NormalEquations(blocks.permute(2, 0, 1), normal.descent[: p * n].view(p, n).mT)
         steps = joints.step(damping).clamp(-TUNING.max_step, TUNING.max_step)
@@ -99,7 +99,8 @@ def sliding_friction(friction: FrictionLaws, qd: Tensor, gravity: Tensor) -> Ten
         qd: velocities, (..., n) [rad/s, m/s].
         gravity: gravity torques, (..., n) [Nm, N].
     """
-    speed = qd.abs() + 1e-9  # without 1e-9, the mean of a joint at rest would be 0 / 0
+    # Without the term 1e-9 the mean of a joint at rest would be 0 / 0.
+    speed = qd.abs() + 1e-9
     dry = friction.prepare().dry(qd, gravity) * speed
     mean: Tensor = dry.flatten(0, -2).sum(dim=0) / speed.flatten(0, -2).sum(dim=0)
     return mean

@@ -67,7 +67,7 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
     """
     matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, M, 5)
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
-    # gelsd, since torch's default driver chooses its pivots differently in each run
+    # The driver gelsd is used, because torch's default driver chooses its pivots differently in each run.
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution
     residual = target - matrix @ solution
     unscaled = torch.linalg.pinv(matrix.mT @ matrix).diagonal(dim1=-2, dim2=-1)

@@ -106,7 +106,7 @@ class ServoObjective(Objective):
         """Return the parameters that minimize the cost of the current outer iteration."""
         problem, number = self._problem, len(self._iterates)
         show = partial(_show_progress, progress, number)
-        # smaller damping in the second and third outer iteration, which start near the minimum
+        # The damping is smaller in the second and third outer iteration, which start near the minimum.
         damping = DAMPING.initial_damping if number == 1 else TUNING.later_damping
         result = levenberg_marquardt(
             problem,

@@ -69,7 +69,7 @@ class ServoSolution:
     @property
     def quantile(self) -> float:
         """Half the width of a 95 % interval, in standard deviations."""
-        # the 97.5 % quantile of Student's t instead of the Gaussian, since there are few blocks
+        # The 97.5 % quantile is of Student's t distribution and not of the Gaussian, since there are few blocks.
         return float(stdtrit(max(1, len(self.blocks.curvature) - 1), 0.975))
 
 
@@ -87,14 +87,15 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     blocks = NormalEquations(*(_sums(x, numbers) for x in problem.window_equations(free, errors)))
     precision = problem.parameters.precision(free)
     step = problem.with_prior(blocks, x).step()
-    # gradients after the step: the gradients of all blocks and of the prior then add up to zero
+    # The gradients are updated to the parameters after the step, so that the gradients of all blocks and of the prior
+    # add up to zero.
     blocks = blocks._replace(descent=blocks.descent - blocks.curvature @ step)
     end = x.after(step)
     # The step may raise the cost if a joint is at its break-away torque: errors are then not linear in the parameters.
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # the step, the effect of the integration error, is included as one standard deviation
+    # The step is the effect of the integration error. It is added to the covariance as one standard deviation.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
@@ -199,7 +200,8 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
             if ratio == "dead_zone" and not value:
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
-            factor = math.exp(min(half, 50.0))  # bounded: exp must not overflow
+            # The bound 50 avoids an overflow of exp.
+            factor = math.exp(min(half, 50.0))
             # The static error, the sum of dry friction and dead zone, may be determined even if its two terms are not.
             determined = factor < TUNING.max_factor and (distinct[joint] or ratio not in ("dry", "dead_zone"))
             record[ratio] = {

@@ -202,7 +202,8 @@ def bayesian_ridge(
     gram, moment, square = products[:-1, :-1], products[:-1, -1], float(products[-1, -1])
     member = F.one_hot(groups.long()).double()  # (P, G)
     excited = gram.diagonal() > 0
-    size, variance = member.sum(dim=0), square / count  # variance: 1 / alpha
+    # `size` is the number k of weights of each group, `variance` is 1 / alpha.
+    size, variance = member.sum(dim=0), square / count
     feature_square = (member.mT @ gram.diagonal() / count / size).clamp(min=1e-300)
     # Zero weights would be a fixed point. Initially each group therefore explains 10 % of the variance of the target.
     lambda_ = 10 * feature_square * size / max(variance, 1e-300)
@@ -217,7 +218,8 @@ def bayesian_ridge(
         lambda_ = (gamma / (member.mT @ coef.square()).clamp(min=1e-300)).clamp(max=1e14)
         residual_square = square - float(2 * coef @ moment - coef @ gram @ coef)
         previous, variance = variance, max(residual_square, 1e-12 * square) / count
-        converged = abs(variance - previous) < 1e-3 * previous  # three digits of the noise suffice
+        # Three digits of the noise variance suffice.
+        converged = abs(variance - previous) < 1e-3 * previous
     return BayesianRidge(coef, penalty, 1 / max(variance, 1e-300), lambda_, gamma, n_iter, converged)
 
 

@@ -42,13 +42,13 @@ def fit_networks(
         model: model whose weights that require a gradient are fitted.
         samples: samples with torques as logged, (T, n) [Nm, N]; errors are divided by the standard deviation of each
             joint's torque.
-        weight_decay: see `LBFGS`.
+        weight_decay: factor of half the sum of squares of all weight matrices, which is added to the loss.
         penalty: function that returns a term added to the loss, for example the distance from a URDF.
         evaluations: maximum number of evaluations of the loss.
     """
     count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
-    # joints of constant torque would have an infinite weight
+    # The errors of a joint of constant torque would have an infinite weight.
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def summands() -> Iterator[torch.Tensor]:

@@ -32,7 +32,7 @@ from spelgen.logs.windows import thinned
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import TorqueFit
 
-SAMPLES = 5  # number of samples per validation window
+SAMPLES = 5  # number of samples of a validation window
 FITTED = {
     "load": "only a load at the tip fitted",
     "friction": "only friction and torque offsets fitted",

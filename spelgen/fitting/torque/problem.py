@@ -181,8 +181,8 @@ class TorqueProblem:
         step: (k,) step of the free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
-        # x + step is cheaper, and as good near the optimum. Far from the optimum the curved step may have a lower
-        # cost.
+        # The parameters x + step need less time and are as good near the optimum. Far from the optimum the curved step
+        # may have a lower cost.
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
@@ -320,7 +320,7 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # weighted mean of the estimate and the prior mean; weights: numbers of independent errors
+    # The result is the weighted mean of the estimate and the prior mean, with numbers of independent errors as weights.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

@@ -102,7 +102,7 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
     is assumed to be chi-squared with S degrees of freedom; the median of this distribution is below S.
     """
     segments = samples.count * samples.interval / TUNING.segment
-    # the correction is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve
+    # The correction is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve seconds.
     median = 2 * float(gammaincinv(segments / 2, 0.5))
     return np.asarray(solution.held_out_nmse * segments / median)
 

@@ -243,7 +243,7 @@ def significant_reduction(
         standard_errors: value of t that the mean of g over the blocks must exceed.
     """
     negligible = 2 * SELECTION.min_reduction * before.mean()
-    # g is antisymmetric: halving and doubling an error have opposite values
+    # g is antisymmetric: for halved and for doubled squared errors it has opposite values.
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:
