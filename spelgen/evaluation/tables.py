@@ -80,7 +80,7 @@ class Table:
 
 
 def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
-    """Return a table of ranked rows. rows: numbers of each row by column, by the label of the row."""
+    """Return a table of ranked rows. rows: label of each row, and the numbers of the row per column."""
     return Table(title, tuple(map(Row, rows, rows.values())), note)
 
 
@@ -226,7 +226,7 @@ def _by_joint(
 
 
 def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | None]]) -> dict[str, Numbers]:
-    """Return the errors of all predictors in each row, by label. errors: errors of all joints, by predictor."""
+    """Return a row per label with the errors of all predictors. errors: errors of all joints per predictor."""
     return {label: {name: values[k] for name, values in errors.items()} for k, label in enumerate(labels)}
 
 

@@ -106,7 +106,7 @@ def _mean(nmse: np.ndarray) -> float | None:
 def coarse_torques(
     logs: Sequence[Trajectory], joints: Sequence[str], notes: list[Diagnostic]
 ) -> dict[str, float]:
-    """Return the quantisation step [Nm, N] of the joints whose torque varies by only a few steps, by joint name.
+    """Return the quantisation step [Nm, N] of the joints whose torque varies by only a few steps, per joint.
 
     A note about each of these joints is appended to `notes`.
     """

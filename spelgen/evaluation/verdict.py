@@ -61,7 +61,7 @@ def verdict(
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
     elastic = next((x for x in results.diagnostics if x.code == ELASTIC), None)
     if elastic is not None:
-        # A rigid model is wrong near the resonance of an elastic joint, whatever its errors on these logs are. The
+        # A rigid model is wrong near the resonance of an elastic joint, even if its errors on these logs are small. The
         # sentence therefore does not begin with "Good enough".
         band = f"; below it, usable for {listed(uses.good)}" if uses.good else ""
         sentence = f"Not valid near the resonance of an elastic joint{band}"

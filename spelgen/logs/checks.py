@@ -275,7 +275,7 @@ class LogChecks:
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
         """Return settings of the group `logs` that correct a fault. entries: keys per faulty joint.
 
-        A unit that most joints of a type need is also set for those joints of the type whose motion is too small to
+        A unit that most joints of a type need is also set for the joints of this type whose motion is too small to
         determine the unit.
         """
         first, *_ = entries
