@@ -45,8 +45,8 @@ class Quantiles:
 class Growth:
     """Quantiles of the prediction error over the time of a prediction [s], per predictor.
 
-    relative: errors of q and qd divided by their RMS change [1] (see `_relative_errors`). tip_mm: position error of the
-    tip [mm], empty without a URDF. windows: number of predictions.
+    relative: errors of q and qd, divided by the RMS change of q and qd since the start of a window [1]. tip_mm:
+    position error of the tip [mm], empty without a URDF. windows: number of predictions.
     """
 
     seconds: Curve
@@ -127,10 +127,10 @@ def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
 
 
 def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> dict[str, Tensor]:
-    """Return the RMS over joints of the position and velocity errors of each predictor, (W, K-1) [1].
+    """Return the RMS over joints of the relative errors of position and velocity of each predictor, (W, K-1) [1].
 
-    Each error is divided by its RMS change since the start of a window (see `loss_scales`). There are W windows of K
-    samples; the first sample, the initial state, has no error.
+    An error is divided by the RMS change of the position or velocity since the start of a window (see `loss_scales`).
+    There are W windows of K samples; the first sample, the initial state, has no error.
     """
     windows = predictions.windows
     scales = loss_scales(windows, joint_types)

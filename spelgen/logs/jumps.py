@@ -130,7 +130,7 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     positions: number of leading columns that are positions. A block of k equal rows consists of repeats if the arm
     moved meanwhile: then the step at its end is as large as k steps of the motion that follows. Equal rows of an arm at
     rest are no repeats, with one exception: if the rows during motion occur m times each, the logger writes each row m
-    times, so that of the rows at rest only every m-th is kept.
+    times, and only every m-th of the rows at rest is kept.
     """
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
     lengths = np.diff(np.append(starts, len(columns)))
