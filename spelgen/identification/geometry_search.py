@@ -101,9 +101,11 @@ def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ())
         best = min(fits, key=_rank)
         tried = single_changes(coarse, best, scalings)
         better = min(tried, key=_rank)
-        # orders are searched only if a single change does not explain the torques, since the search takes seconds
-        is_open = better.cost < unchanged.cost - GEOMETRY.needed and better.errors.max() > GEOMETRY.explained
-        if best is unchanged and is_open:
+        # orders are searched only if no single change explains the torques, since the search takes seconds
+        is_wrong = (
+            better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
+        )
+        if best is unchanged and is_wrong and better.errors.max() > GEOMETRY.explained:
             tried += reordered(coarse, unchanged)
         if min(tried, key=_rank).cost > best.cost - GEOMETRY.needed:
             break
@@ -329,8 +331,10 @@ def _with_delays(problem: GeometryProblem, base: HypothesisFit) -> Iterator[Hypo
                 torque_delay=reading.torque_delay + delay * torque,
             )
 
+        # a step from 0 would be too short for noisy torques, whose derivative is mostly noise
+        starts = GEOMETRY.delay_start * np.array([[0.0], [1.0], [-1.0]])
         delay, _ = _descend(
-            problem, delayed, np.zeros(1), largest=0.05, smallest=0.002,
+            problem, delayed, min(starts, key=lambda x: problem.fit(delayed(x)).cost), largest=0.05, smallest=0.002,
             allowed=lambda x: np.clip(x, -longest, longest),
         )  # fmt: skip
         if abs(delay[0]) >= GEOMETRY.min_delay:

@@ -63,6 +63,8 @@ class LogGeometryTuning:
     rare: float = 1.0
     # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
     explained: float = 0.05
+    # [1] Mean relative residual variance of the joints above which a log is probably in another order.
+    unexplained: float = 0.3
     # [1] Largest number of samples for the comparison of all hypotheses.
     coarse_samples: int = 200
     # [1] Largest number of samples for the final comparison of the best hypotheses.
@@ -73,8 +75,11 @@ class LogGeometryTuning:
     min_shift: float = 0.01
     # [s] Delays of single joints below this bound are ascribed to friction, whose apparent delay is up to 30 ms.
     min_delay: float = 0.03
-    # [1] Largest ratio of a joint's squared residuals with and without a delay of its signals.
-    delay_gain: float = 0.5
+    # [s] Delay, late or early, from which the search for a delay starts if it fits better than no delay.
+    delay_start: float = 0.06
+    # [1] Largest ratio of a joint's squared residuals with and without a delay of its signals; wrong delays have
+    # ratios from 0.78 on, on recordings of seven arms.
+    delay_gain: float = 0.65
     # Cost increase up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
     # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.
