@@ -96,3 +96,13 @@ def test_velocities_that_are_later_or_earlier_than_positions_are_named(arm, late
     size, order = re.search(r"qd that is ([\d.]+) ms (later|earlier) than dq/dt", error).groups()
     assert abs(float(size) - 70) < 10 and order == ("later" if late == "qd" else "earlier")
     assert "write 'velocity: differentiated'" in error and repr(arm.chain.joint_names[k]) in error
+
+
+@pytest.mark.parametrize(("stated", "logged"), [("mm", "m"), ("m", "mm")])
+def test_a_wrong_unit_of_a_prismatic_joint_is_named(robots, stated, logged):
+    rpr = load_arm(robots / "rpr.urdf")
+    log, size = recorded(rpr, 3, noise=0.01), {"m": 1.0, "mm": 1e-3}
+    factor = np.array([1.0, size[stated] / size[logged], 1.0])
+    mapping = LogMapping.model_validate({"joints": {"joint2": {"units": {"q": stated, "qd": f"{stated}/s"}}}})
+    error = told(rpr, replace(log, q=log.q * factor, qd=log.qd * factor, mapping=mapping), mapping)
+    assert f"'joints: {{joint2: {{units: {{q: {logged}, qd: {logged}/s}}}}}}'" in error

@@ -51,7 +51,11 @@ class Scaling(NamedTuple):
 
 
 UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
-POSITION_UNITS = {SCALES.get(unit, 1.0): unit for unit in ("rad", "deg", "turns", "mm")}
+
+
+def position_unit(joint_type: str, scale: float) -> str:
+    """Return the unit of positions whose factor to SI units is nearest to the magnitude of `scale`."""
+    return min(UNITS[joint_type], key=lambda unit: abs(np.log(abs(scale) / SCALES.get(unit, 1.0))))
 
 
 def position_scalings(arm: Chain, scale: np.ndarray) -> list[Scaling]:

@@ -13,7 +13,7 @@ from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic
 from spelgen.identification.drive_hints import Coupling, DriveLog, DriveSamples, drive_problem
 from spelgen.identification.geometry_search import (
-    POSITION_UNITS,
+    UNITS,
     Scaling,
     compare_readings,
     position_scalings,
@@ -213,7 +213,10 @@ class TorqueLogs:
         scale = np.array([self._mapping.scale("q", name) for name in names])
         # the unit of velocities must be that of the positions, so that both are changed by the same factor
         units = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
-        if units <= {(None, None), *((unit, f"{unit}/s") for unit in POSITION_UNITS.values())}:
+        if units <= {
+            (None, None),
+            *((unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])),
+        }:
             scalings += position_scalings(self._arm.chain, scale)
         return scalings
 

@@ -7,7 +7,7 @@ import numpy as np
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
 from spelgen.errors import Diagnostic, LogError
-from spelgen.identification.geometry_search import POSITION_UNITS, HypothesisComparison
+from spelgen.identification.geometry_search import HypothesisComparison, position_unit
 from spelgen.identification.log_geometry import Hypothesis, HypothesisFit
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.joint_signals import joint_keys, plain_number, settings_line
@@ -103,7 +103,7 @@ class Remedies:
         if sign < 0:
             keys["sign"] = -present.sign
         if abs(factor) != 1:
-            unit = POSITION_UNITS[abs(reading.motion_scale[k])]
+            unit = self._unit(k, reading)
             keys["units"] = {"q": unit, "qd": f"{unit}/s"}
         gain = float(reading.torque_scale[k] / unchanged.torque_scale[k]) * sign
         if gain != 1.0:
@@ -136,11 +136,7 @@ class Remedies:
         if not (torque[motion < 0] < 0).all():
             sense = "positions and velocities of the opposite sense, and torques of the right one"
         largest = torque[np.abs(np.log(np.abs(torque))).argmax()]
-        units = {
-            POSITION_UNITS.get(abs(reading.motion_scale[j]), "SI units"): None
-            for j in order
-            if abs(motion[j]) != 1
-        }
+        units = dict.fromkeys(self._unit(int(j), reading) for j in order if abs(motion[j]) != 1)
         delay = np.where(reading.motion_delay, reading.motion_delay, reading.torque_delay)
         shown = 1e3 * float(delay[np.abs(delay).argmax()])
         late = "torques" if not reading.motion_delay.any() else "positions and velocities"
@@ -164,6 +160,9 @@ class Remedies:
             "joint-zero": (shifts != 0, f"positions with another zero, by {shift}"),
         }
         return changes.get(code) or (order >= 0, self._gravity_text(code, reading))
+
+    def _unit(self, k: int, reading: Hypothesis) -> str:
+        return position_unit(self.arm.coordinates[k].joint_type, float(reading.motion_scale[k]))
 
     def _place(self, joints: np.ndarray) -> str:
         """Return a text that names the joints in a mask (n,), for a finding."""
