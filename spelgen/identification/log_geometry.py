@@ -232,7 +232,7 @@ class GeometryProblem:
         return other
 
     def gravity_ratio(self, fit: HypothesisFit) -> float:
-        """Return the least-squares ratio of the gravity torques of a fit to those of the URDF; 0 without gravity."""
+        """Return the least-squares ratio of gravity torques, of a fit to the URDF; 0 without gravity."""
         weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
         columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
         fitted, stated = columns @ fit.parameters, columns @ self.prior_mean

@@ -236,7 +236,7 @@ class ServoLogs:
         if finding is None:
             return
         check = UNIT if finding.keys else NORMALISED
-        # the general doubt about degrees of LeRobot is no news beside this error
+        # the reader's general doubt about degrees of LeRobot is omitted if this error is found
         summary.notes[:] = [x for x in summary.notes if "unless they are LeRobot's" not in x.message]
         if check.code not in self._logs[0].accepted:
             summary.add(check, finding.message, "all joints", keys=finding.keys)

@@ -211,7 +211,7 @@ class TorqueLogs:
             candidates.append(rounded_factor(1 / ratio) * ones)
         scalings += [Scaling("torque-unit", ones, factors) for factors in candidates]
         scale = np.array([self._mapping.scale("q", name) for name in names])
-        # the unit of velocities must be that of the positions, so that both are changed by the same factor
+        # velocities must have the unit of the positions per second, so that both are changed by the same factor
         units = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         if units <= {
             (None, None),

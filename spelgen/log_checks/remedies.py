@@ -21,7 +21,7 @@ RIGHT = "joints, zeros, units and gravity as the URDF and the settings state the
 
 
 def mapped_reading(arm: Chain, mapping: LogMapping, drives: Drives) -> Hypothesis:
-    """Return the `Hypothesis` without changes: signs, scales and offsets of the joints are those of the mapping.
+    """Return the `Hypothesis` without changes: signs, scales and offsets of the joints as in the mapping.
 
     The torque scale includes the gear ratios of the drives if each motor drives one joint.
     """

@@ -220,8 +220,8 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
 def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:
     """Return the rows (T, C) of the rarest signal, with all other signals at their times, and a message.
 
-    If these rows are complete, the others are left out. Otherwise the other signals are interpolated between their own
-    samples; rows beyond the first or last sample of a signal, or within a gap of it, are left out.
+    If these rows are complete, the others are omitted. Otherwise the other signals are interpolated between their own
+    samples; rows beyond the first or last sample of a signal, or within a gap of the signal, are omitted.
     """
     finite = np.isfinite(data)
     base = finite[:, 1 + int(finite[:, 1:].sum(axis=0).argmin())]
