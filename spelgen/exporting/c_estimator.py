@@ -104,7 +104,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     for name, level in levels:
         if isinstance(level, BlockNoise):
             tables |= {f"{name}_{key}": row for key, row in level}
-        elif name not in ("minutes", "point", "load_freedom"):
+        elif name not in ("minutes", "point", "peak_count", "load_quantile"):
             tables[name] = np.ravel(level)
     values = {
         "name": model.name,
@@ -113,6 +113,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "tuning": TUNING,
         "supported": f"{levels.supported_alarms:.2g} per minute",
         "windows": repr(levels.tail_peaks),
+        "peaks": repr(float(levels.peak_count)),
         "evidence": repr(TUNING.evidence),
         "quantile": repr(levels.load_quantile),
         "iterations": TUNING.iterations,

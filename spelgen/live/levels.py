@@ -5,10 +5,12 @@ which a model was fitted would be too small.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.registry import arm_of_model
@@ -30,7 +32,7 @@ from spelgen.live.filters import Block, Blocks, JointFilters, LoadFilter
 from spelgen.live.intake import Intake, balance_along
 from spelgen.live.momentum import Balance
 from spelgen.live.noise import BlockNoise, NoiseLevels
-from spelgen.live.payload import NO_REPORT
+from spelgen.live.payload import NO_REPORT, find_payload, prior_mean
 from spelgen.live.tuning import TUNING
 from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.trajectory import Trajectory, joined_column
@@ -176,38 +178,67 @@ def find_levels(
     segments = [[x.block for x in samples if x.block is not None] for samples in tested]
     pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
-    factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
-    levels = levels.model_copy(update={"load_variance": factor, "load_freedom": freedom})
+    levels = levels.model_copy(update=load_scale(list(itertools.chain(*pairs)), levels))
     return _with_observer(levels, tested)
 
 
-def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
-    """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
+def load_scale(blocks: Sequence[Block], levels: NoiseLevels) -> dict[str, float]:
+    """Return the factor on the covariance of estimated payloads, and the half width of their 95 % intervals.
 
     The logs are without payload, so each estimated payload is an error. Windows of consecutive blocks are independent
-    trials. Two normalised squared errors are averaged over the trials together with the prior: of the mass, and of mass
-    and first moments. The factor is the largest average over both errors and all window lengths: errors of the model
-    average out slowly, so that longer windows may have larger normalised errors.
+    trials. The factor is the mean of normalised squared errors: of the mass, or of mass and first moments. The half
+    width is calibrated with a light payload, whose torque is added to each window: the prior of payloads makes its
+    interval narrow. Each mean includes `TUNING.prior_trials` trials with a prior value. The largest one over both
+    lengths of windows is used: errors of the model average out slowly.
     """
-    factors = []
-    for window in TUNING.trial_blocks:
-        squares = np.zeros(2)
-        trials = len(blocks) // window
-        for start in range(0, trials * window, window):
-            load = LoadFilter(levels.load, levels.effort)
-            for block in blocks[start : start + window]:
-                load.predict(block.duration)
-                for joint in range(load.n):
-                    load.update(block, joint)
-            theta, covariance = load.x[:4], load.P[:4, :4]
-            squares += (
-                theta[0] ** 2 / covariance[0, 0],
-                theta @ np.linalg.solve(covariance, theta) / len(theta),
-            )
-        freedom = trials + TUNING.prior_trials
-        prior = TUNING.prior_trials * TUNING.prior_variance
-        factors.append((float(squares.max() + prior) / freedom, freedom))
-    return max(factors)
+    tested = [load_trials(blocks, levels, window) for window in TUNING.trial_blocks]
+    factor = max(
+        _averaged([x[:k] @ np.linalg.solve(P[:k, :k], x[:k]) / k for x, P in trials], TUNING.prior_variance)
+        for trials in tested
+        for k in (1, 4)
+    )
+    # Friction and its errors are larger with a payload: the variance in the intervals is at least the prior value.
+    with_load = math.sqrt(max(TUNING.prior_variance / factor, 1.0))
+    quantiles = []
+    for trials in tested:
+        errors = _averaged([_squared_error_with_load(x, P, factor) for x, P in trials], 1.0)
+        freedom = len(trials) + TUNING.prior_trials
+        width = max(with_load, TUNING.other_days * math.sqrt(errors))
+        quantiles.append(float(stdtrit(freedom, 0.975)) * width)
+    return {"load_variance": factor, "load_quantile": max(quantiles)}
+
+
+def load_trials(
+    blocks: Sequence[Block], levels: NoiseLevels, window: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the estimate and the covariance of the payload filter, (10,) and (10, 10), of each window of blocks."""
+    trials = []
+    for start in range(0, len(blocks) // window * window, window):
+        load = LoadFilter(levels.load, levels.effort)
+        for block in blocks[start : start + window]:
+            load.predict(block.duration)
+            for joint in range(load.n):
+                load.update(block, joint)
+        trials.append((load.x[:10], load.P[:10, :10]))
+    return trials
+
+
+def _averaged(squares: Sequence[float], prior: float) -> float:
+    trials = TUNING.prior_trials
+    return float(sum(squares) + trials * prior) / (len(squares) + trials)
+
+
+def _squared_error_with_load(theta: np.ndarray, covariance: np.ndarray, factor: float) -> float:
+    """Return the normalised squared error of the mass, for the lightest payload that would be reported; 1 for none.
+
+    theta, covariance: estimate of the payload filter without a payload. The filter is linear: a payload adds its
+    parameters to the estimate.
+    """
+    for mass in TUNING.scales:
+        found = find_payload(theta + prior_mean(mass), covariance, factor, 1.0)
+        if found.status == "payload":
+            return float((found.mass - mass) / (found.mass_interval[1] - found.mass)) ** 2
+    return 1.0
 
 
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
@@ -254,30 +285,53 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
-    """Return the levels with the noise of the momentum observer and the exponential tail of its peaks added."""
-    columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    times = np.array([sample.t for samples in tested for sample in samples])
-    for samples in tested:
-        observer, drift = (
-            ContactObserver(levels, TUNING.alarms_per_minute),
-            JointFilters.of_drift(levels.drift),
-        )
-        for t, qd, at, is_resumed, block in samples:
-            if is_resumed:
-                observer.restart()
-            columns.append((*observer.residual(t, at, NO_REPORT, drift.x), qd))
-            if block is not None:
-                drift.update(block, block.y)
-    signal, variance, qd = (np.array(column) for column in zip(*columns, strict=True))
+    """Return the levels with the noise of the momentum observer, and the tail of its peaks, added."""
+    residuals = [_observer_residuals(levels, samples) for samples in tested]
+    signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))
     levels = levels.model_copy(update=_observer_noise(signal, qd, levels))
-    beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
-    ratio = beyond / np.sqrt(variance + np.square(levels.observer))
-    # Large values at neighbouring samples are one event, so only the largest value of each time window counts.
-    starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
-    peaks = np.maximum.reduceat(ratio, starts, axis=0)
-    start = np.quantile(peaks, 1 - TUNING.tail, axis=0)
-    tail = np.where(peaks > start, peaks - start, np.nan)
-    return levels.model_copy(update={"peak_start": start, "peak_scale": np.nanmean(tail, axis=0)})
+    peaks = []
+    for samples, (signal, variance, qd) in zip(tested, residuals, strict=True):
+        beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
+        ratio = beyond / np.sqrt(variance + np.square(levels.observer))
+        # Large values at neighbouring samples are one event, so only the largest value of each time window counts.
+        times = np.array([sample.t for sample in samples])
+        starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
+        peaks.append(np.maximum.reduceat(ratio, starts, axis=0))
+    # A log has larger peaks than the other logs predict. Thresholds of the other logs, multiplied by one factor, give
+    # at most as many alarms as the rate allows. The factor is common to all joints: the joint with the largest factor
+    # differs between logs.
+    excess: list[float] = []
+    for k, peaks_of_log in enumerate(peaks):
+        others = levels.model_copy(update=_peak_tail([*peaks[:k], *peaks[k + 1 :]]))
+        excess += (peaks_of_log / others.thresholds(TUNING.alarms_per_minute)).max(axis=1).tolist()
+    allowed = int(TUNING.alarms_per_minute * levels.minutes)
+    factor = max(sorted(excess, reverse=True)[allowed], TUNING.other_days)
+    return levels.model_copy(update=_peak_tail(peaks, factor))
+
+
+def _observer_residuals(
+    levels: NoiseLevels, samples: Sequence[HeldOutSample]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the residual of the momentum observer, its variance and the velocities, (T, n) each."""
+    observer = ContactObserver(levels, TUNING.alarms_per_minute)
+    drift = JointFilters.of_drift(levels.drift)
+    columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for t, qd, at, is_resumed, block in samples:
+        if is_resumed:
+            observer.restart()
+        columns.append((*observer.residual(t, at, NO_REPORT, drift.x), qd))
+        if block is not None:
+            drift.update(block, block.y)
+    signal, variance, speed = (np.array(column) for column in zip(*columns, strict=True))
+    return signal, variance, speed
+
+
+def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, object]:
+    """Return the exponential tail of the peaks of logs, (W, n) each, after multiplication by a factor."""
+    together = factor * np.concatenate(peaks)
+    start = np.quantile(together, 1 - TUNING.tail, axis=0)
+    scale = np.nanmean(np.where(together > start, together - start, np.nan), axis=0)
+    return {"peak_start": start, "peak_scale": scale, "peak_count": math.ceil(TUNING.tail * len(together))}
 
 
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:

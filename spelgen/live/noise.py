@@ -1,11 +1,9 @@
 """Noise levels of an arm, which are estimated from the training logs and stored in the run folder as estimator.json."""
 
-import math
 from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
-from scipy.special import stdtrit
 
 from spelgen.live.tuning import TUNING
 
@@ -44,8 +42,9 @@ class NoiseLevels(BaseModel):
     momentum observer for a moving joint [Nm, N]. resting: additional threshold for a joint at rest, which is three
     standard deviations of the additional noise [Nm, N] and decreases with exp(-|qd| / resting_speed). resting_speed:
     [rad/s, m/s]. peak_start, peak_scale: start and scale of the exponential tail of the normalised observer's peaks;
-    the tail is the largest fifth of the peaks. load_variance: factor on the covariance of estimated payloads, an
-    estimate with load_freedom degrees of freedom. speed: largest speed of the training logs [rad/s, m/s]. encoder:
+    the tail is the largest fifth of the peaks, of which there are peak_count per joint. load_variance:
+    factor on the covariance of estimated payloads. load_quantile: half width of 95 % intervals of a payload, in
+    standard deviations. speed: largest speed of the training logs [rad/s, m/s]. encoder:
     encoder step of positions [rad, m]. effort: torque limit [Nm, N]. minutes: duration of the training logs [min].
     point: position of the tip in the frame of the last body, (3,) [m].
     """
@@ -59,8 +58,9 @@ class NoiseLevels(BaseModel):
     resting_speed: Vector
     peak_start: Vector
     peak_scale: Vector
+    peak_count: int
     load_variance: float
-    load_freedom: float
+    load_quantile: float
     speed: Vector
     encoder: Vector
     effort: Vector
@@ -71,16 +71,6 @@ class NoiseLevels(BaseModel):
     def rest_speed(self) -> np.ndarray:
         """Speed below which a joint is at rest, (n,) [rad/s, m/s]."""
         return TUNING.rest * self.speed
-
-    @property
-    def load_quantile(self) -> float:
-        """Half width of 95 % intervals of a payload, in standard deviations: Student's t, for an estimated variance.
-
-        `load_variance` was estimated without a payload, and is used as is to decide whether there is one. With a
-        payload, friction and its errors are larger, so that the variance in the intervals is at least the prior value.
-        """
-        with_load = max(TUNING.prior_variance / self.load_variance, 1.0)
-        return float(stdtrit(self.load_freedom, 0.975)) * math.sqrt(with_load)
 
     @property
     def supported_alarms(self) -> float:
@@ -104,7 +94,12 @@ class NoiseLevels(BaseModel):
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the thresholds of the normalised observer, (n,) [1].
 
+        The scale of an exponential tail, estimated from m = peak_count peaks, is uncertain. With the prior 1 / scale a
+        further peak exceeds the start by more than x with the probability (1 + x / (m scale))^-m.
+
         alarms_per_minute: rate of false alarms of all joints together [1/min].
         """
-        tail = self.peak_start + self.peak_scale * math.log(self.tail_peaks / alarms_per_minute)
-        return TUNING.other_days * np.maximum(tail, 1.0)
+        odds = self.tail_peaks / alarms_per_minute
+        excess = self.peak_count * (odds ** (1 / self.peak_count) - 1)
+        thresholds: np.ndarray = np.maximum(self.peak_start + self.peak_scale * excess, 1.0)
+        return thresholds

@@ -94,6 +94,13 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     return inverse
 
 
+def prior_mean(mass: float) -> np.ndarray:
+    """Return the parameters of a ball whose centre is at a distance from the origin along z, (10,)."""
+    height, about_z = TUNING.distance, 2 / 5 * TUNING.radius**2
+    about_x = about_z + height**2
+    return mass * np.array([1, 0, 0, height, about_x, 0, 0, about_x, 0, about_z])
+
+
 def _at_scale(
     precision: np.ndarray, linear: np.ndarray, scale: float, start: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
@@ -105,10 +112,7 @@ def _at_scale(
     of consistent parameters, at whose boundary Newton's method would stall (Boyd and Vandenberghe, Convex Optimization,
     2004, 11.3). Twice the cost is self-concordant, so that steps damped by the Newton decrement are feasible (9.6.4).
     """
-    # The prior mean is a ball whose centre is at a distance from the origin along z.
-    height, about_z = TUNING.distance, 2 / 5 * TUNING.radius**2
-    about_x = about_z + height**2
-    mean = scale * np.array([1, 0, 0, height, about_x, 0, 0, about_x, 0, about_z])
+    mean = prior_mean(scale)
     width = np.einsum("i,iab->ab", mean, _UNITS) / TUNING.degrees
     pull = 0.5 * np.einsum("iab,ba->i", _UNITS, _inverse(width))
     theta = mean if start is None else start
