@@ -125,12 +125,14 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
     The estimator of the source run computes it, with noise levels of that run; None if that run has no noise levels.
     A new fit gets noise levels of its own, an adapted run keeps the noise levels of its source run.
     """
-    from spelgen.live.levels import keep_levels, stored_levels
+    from spelgen.live.levels import cross_validated_levels, keep_levels, stored_levels
     from spelgen.live.replay import carried_payload
+    from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
     if source is None:
         try:
-            keep_levels(fit)
+            if isinstance(fit.config, TorqueFit) and isinstance(fit.model, RigidBodyDynamics):
+                keep_levels(fit, cross_validated_levels(fit))
         except LogError as error:
             note(f"info: no estimator: {error}")
         return None

@@ -83,12 +83,10 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
         ),
         "payload_torque": (payload.torque(qd, qdd),),
     }  # fmt: skip
-    functions = []
-    for entry in _ENTRIES:
-        functions.append(
-            c_function(model, entry, named_function(entry, outputs[entry.name], inputs, residuals))
-        )
-    return functions
+    return [
+        c_function(model, entry, named_function(entry, outputs[entry.name], inputs, residuals))
+        for entry in _ENTRIES
+    ]
 
 
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
@@ -104,20 +102,14 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     for name, level in levels:
         if isinstance(level, BlockNoise):
             tables |= {f"{name}_{key}": row for key, row in level}
-        elif name not in ("minutes", "point", "peak_count", "load_quantile"):
+        elif name not in ("minutes", "point", "peak_count", "load_freedom"):
             tables[name] = np.ravel(level)
     values = {
         "name": model.name,
         "upper": model.name.upper(),
         "n": model.n,
         "tuning": TUNING,
-        "supported": f"{levels.supported_alarms:.2g} per minute",
-        "windows": repr(levels.tail_peaks),
-        "peaks": repr(float(levels.peak_count)),
-        "evidence": repr(TUNING.evidence),
-        "quantile": repr(levels.load_quantile),
-        "iterations": TUNING.iterations,
-        "weights": TUNING.weights,
+        "levels": levels,
         "tables": {name: _numbers(row) for name, row in tables.items()},
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, model.input_inverse)),

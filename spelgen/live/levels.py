@@ -10,9 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
-from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.registry import arm_of_model
 from spelgen.dynamics.bristles import bristle_reach, encoder_step
 from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
@@ -32,35 +30,30 @@ from spelgen.live.filters import Block, Blocks, JointFilters, LoadFilter
 from spelgen.live.intake import Intake, balance_along
 from spelgen.live.momentum import Balance
 from spelgen.live.noise import BlockNoise, NoiseLevels
-from spelgen.live.payload import NO_REPORT, find_payload, prior_mean
+from spelgen.live.payload import NO_REPORT
 from spelgen.live.tuning import TUNING
 from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.trajectory import Trajectory, joined_column
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-from spelgen.settings.fits import TorqueFit
 
 
 def noise_levels(fit: Fit) -> NoiseLevels:
     """Return the stored or estimated noise levels of a fit. Raises RunError if they cannot be read or estimated."""
     levels = stored_levels(fit)
-    if levels is not None:
-        return levels
-    if not fit.logs:
-        raise RunError(
-            "no noise levels of the estimator", file=fit.folder, expected="a run with estimator.json",
-            do=f"fit it again by `spelgen train` to torques, with at least {TUNING.min_samples} samples of motion",
-        )  # fmt: skip
-    levels = cross_validated_levels(fit)
-    keep_levels(fit, levels)
+    if levels is None:
+        if not fit.logs:
+            raise RunError(
+                "no noise levels of the estimator", file=fit.folder, expected="a run with estimator.json",
+                do=f"fit it again by `spelgen train` to torques, with at least {TUNING.min_samples} samples of motion",
+            )  # fmt: skip
+        levels = cross_validated_levels(fit)
+        keep_levels(fit, levels)
     return levels
 
 
-def keep_levels(fit: Fit, levels: NoiseLevels | None = None) -> None:
-    """Write noise levels into the run folder of a fit; levels None: estimate them if the fit is to torques."""
-    of_torques = isinstance(fit.config, TorqueFit) and isinstance(fit.model, RigidBodyDynamics)
-    if levels is None and of_torques and fit.logs:
-        levels = cross_validated_levels(fit)
-    if levels is not None and fit.folder is not None:
+def keep_levels(fit: Fit, levels: NoiseLevels) -> None:
+    """Write noise levels into the run folder of a fit, if it has one."""
+    if fit.folder is not None:
         write_json(RunFolder(fit.folder).estimator, levels.model_dump(mode="json"))
 
 
@@ -80,14 +73,18 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         ends = np.linspace(0, len(logs[0]), count + 1).astype(int)
         logs = [logs[0][start:stop] for start, stop in itertools.pairwise(ends)]
     folds = [logs[k::count] for k in range(min(count, len(logs)))]
-    effort, tip = np.full(fit.model.n, np.inf), np.zeros(3)
+    effort, point = np.full(fit.model.n, np.inf), np.zeros(3)
     if fit.urdf is not None and fit.urdf.exists():
-        effort, tip = limits(arm_of_model(fit.model, fit.urdf))
+        arm = arm_of_model(fit.model, fit.urdf)
+        effort, tip = np.array([joint.effort or np.inf for joint in arm.chain.coordinates]), tip_frame(arm)
+        # The contact force is estimated at the tip, or at the origin of the last body if another body carries the tip.
+        if tip.carrier == len(arm.chain.bodies) - 1:
+            point = tip.pose[:3, 3]
     tested = []
     for k, fold in enumerate(folds):
         others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
         tested.append((fitted_to(fit, others), fold))
-    levels = find_levels(tested, effort, tip)
+    levels = find_levels(tested, effort, point)
     # Serialization rounds the numbers: return the same numbers as a later read of the run folder.
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
@@ -112,17 +109,6 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
     fitted = model.requires_grad_(False).eval()
     assert isinstance(fitted, RigidBodyDynamics)
     return fitted
-
-
-def limits(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
-    """Return the torque limits of an arm, (n,) [Nm, N], infinite if unknown, and the position of the tip, (3,) [m].
-
-    The position is in the frame of the last body; it is zero if another body carries the tip.
-    """
-    effort = np.array([joint.effort or np.inf for joint in arm.chain.coordinates])
-    tip = tip_frame(arm)
-    is_last = tip.carrier == len(arm.chain.bodies) - 1
-    return effort, tip.pose[:3, 3] if is_last else np.zeros(3)
 
 
 class HeldOutSample(NamedTuple):
@@ -178,67 +164,38 @@ def find_levels(
     segments = [[x.block for x in samples if x.block is not None] for samples in tested]
     pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
-    levels = levels.model_copy(update=load_scale(list(itertools.chain(*pairs)), levels))
+    factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
+    levels = levels.model_copy(update={"load_variance": factor, "load_freedom": freedom})
     return _with_observer(levels, tested)
 
 
-def load_scale(blocks: Sequence[Block], levels: NoiseLevels) -> dict[str, float]:
-    """Return the factor on the covariance of estimated payloads, and the half width of their 95 % intervals.
+def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
+    """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
 
     The logs are without payload, so each estimated payload is an error. Windows of consecutive blocks are independent
-    trials. The factor is the mean of normalised squared errors: of the mass, or of mass and first moments. The half
-    width is calibrated with a light payload, whose torque is added to each window: the prior of payloads makes its
-    interval narrow. Each mean includes `TUNING.prior_trials` trials with a prior value. The largest one over both
-    lengths of windows is used: errors of the model average out slowly.
+    trials. Two normalised squared errors are averaged over the trials together with the prior: of the mass, and of mass
+    and first moments. The factor is the largest average over both errors and all window lengths: errors of the model
+    average out slowly, so that longer windows may have larger normalised errors.
     """
-    tested = [load_trials(blocks, levels, window) for window in TUNING.trial_blocks]
-    factor = max(
-        _averaged([x[:k] @ np.linalg.solve(P[:k, :k], x[:k]) / k for x, P in trials], TUNING.prior_variance)
-        for trials in tested
-        for k in (1, 4)
-    )
-    # Friction and its errors are larger with a payload: the variance in the intervals is at least the prior value.
-    with_load = math.sqrt(max(TUNING.prior_variance / factor, 1.0))
-    quantiles = []
-    for trials in tested:
-        errors = _averaged([_squared_error_with_load(x, P, factor) for x, P in trials], 1.0)
-        freedom = len(trials) + TUNING.prior_trials
-        width = max(with_load, TUNING.other_days * math.sqrt(errors))
-        quantiles.append(float(stdtrit(freedom, 0.975)) * width)
-    return {"load_variance": factor, "load_quantile": max(quantiles)}
-
-
-def load_trials(
-    blocks: Sequence[Block], levels: NoiseLevels, window: int
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the estimate and the covariance of the payload filter, (10,) and (10, 10), of each window of blocks."""
-    trials = []
-    for start in range(0, len(blocks) // window * window, window):
-        load = LoadFilter(levels.load, levels.effort)
-        for block in blocks[start : start + window]:
-            load.predict(block.duration)
-            for joint in range(load.n):
-                load.update(block, joint)
-        trials.append((load.x[:10], load.P[:10, :10]))
-    return trials
-
-
-def _averaged(squares: Sequence[float], prior: float) -> float:
-    trials = TUNING.prior_trials
-    return float(sum(squares) + trials * prior) / (len(squares) + trials)
-
-
-def _squared_error_with_load(theta: np.ndarray, covariance: np.ndarray, factor: float) -> float:
-    """Return the normalised squared error of the mass, for the lightest payload that would be reported; 1 for none.
-
-    theta, covariance: estimate of the payload filter without a payload. The filter is linear: a payload adds its
-    parameters to the estimate.
-    """
-    for mass in TUNING.scales:
-        found = find_payload(theta + prior_mean(mass), covariance, factor, 1.0)
-        if found.status == "payload":
-            return float((found.mass - mass) / (found.mass_interval[1] - found.mass)) ** 2
-    return 1.0
+    factors = []
+    for window in TUNING.trial_blocks:
+        squares = np.zeros(2)
+        trials = len(blocks) // window
+        for start in range(0, trials * window, window):
+            load = LoadFilter(levels.load, levels.effort)
+            for block in blocks[start : start + window]:
+                load.predict(block.duration)
+                for joint in range(load.n):
+                    load.update(block, joint)
+            theta, covariance = load.x[:4], load.P[:4, :4]
+            squares += (
+                theta[0] ** 2 / covariance[0, 0],
+                theta @ np.linalg.solve(covariance, theta) / len(theta),
+            )
+        freedom = trials + TUNING.prior_trials
+        prior = TUNING.prior_trials * TUNING.prior_variance
+        factors.append((float(squares.max() + prior) / freedom, freedom))
+    return max(factors)
 
 
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
@@ -339,23 +296,22 @@ def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> 
 
     signal: torque residual of the observer, (T, n) [Nm, N]. qd: velocities, (T, n).
     """
-    best: dict[str, np.ndarray] = {}
-    lowest = np.full(len(levels.speed), np.inf)
-    for speed, ratio in itertools.product(TUNING.resting_speeds, TUNING.resting_ratios):
+    grid = np.array(list(itertools.product(TUNING.resting_speeds, TUNING.resting_ratios)))
+    noise, costs = np.zeros((2, len(grid), len(levels.speed)))
+    for k, (speed, ratio) in enumerate(grid):
         shape = 1 + np.square(ratio * np.exp(-np.abs(qd) / (speed * levels.speed)))
         # The median is used because peaks are modelled separately; 0.455 is the median of a squared standard normal
         # variable.
         level = np.sqrt(np.median(signal**2 / shape, axis=0) / 0.455)
-        level = np.maximum(level, TUNING.min_observer_noise * levels.effort)
-        normalised = np.abs(signal) / (level * np.sqrt(shape))
+        noise[k] = np.maximum(level, TUNING.min_observer_noise * levels.effort)
+        normalised = np.abs(signal) / (noise[k] * np.sqrt(shape))
         # Huber's cost is quadratic for residuals up to TUNING.outlier, and linear beyond.
         inner = np.minimum(normalised, TUNING.outlier)
-        cost = np.mean(np.log(level**2 * shape) + inner * (2 * normalised - inner), axis=0)
-        found = {
-            "observer": level,
-            "resting": TUNING.outlier * ratio * level,
-            "resting_speed": speed * levels.speed,
-        }
-        best = {key: np.where(cost < lowest, x, best.get(key, x)) for key, x in found.items()}
-        lowest = np.minimum(cost, lowest)
-    return best
+        costs[k] = np.mean(np.log(noise[k] ** 2 * shape) + inner * (2 * normalised - inner), axis=0)
+    best = costs.argmin(axis=0)
+    observer, (speed, ratio) = noise[best, np.arange(len(best))], grid[best].T
+    return {
+        "observer": observer,
+        "resting": TUNING.outlier * ratio * observer,
+        "resting_speed": speed * levels.speed,
+    }

@@ -79,12 +79,10 @@ def balance(
         samples: q, qd and tau, (T, n).
         bounds: lower and upper bound of the friction state, (T, n, K) [rad, m].
     """
-    blocks: list[list[np.ndarray]] = []
     with torch.no_grad():
-        for start in range(0, len(samples[0]), _BLOCK):
-            tensors = [torch.from_numpy(x[start : start + _BLOCK]) for x in (*samples, *bounds)]
-            blocks.append([x.numpy() for x in _terms(model, torch.from_numpy(point), *tensors)])
-    return Balance(*map(np.concatenate, zip(*blocks, strict=True)))
+        columns = [torch.from_numpy(x).split(_BLOCK) for x in (*samples, *bounds)]
+        blocks = [_terms(model, torch.from_numpy(point), *block) for block in zip(*columns, strict=True)]
+        return Balance(*(torch.cat(term).numpy() for term in zip(*blocks, strict=True)))
 
 
 def _terms(

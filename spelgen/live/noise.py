@@ -1,9 +1,11 @@
 """Noise levels of an arm, which are estimated from the training logs and stored in the run folder as estimator.json."""
 
+import math
 from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
+from scipy.special import stdtrit
 
 from spelgen.live.tuning import TUNING
 
@@ -42,11 +44,10 @@ class NoiseLevels(BaseModel):
     momentum observer for a moving joint [Nm, N]. resting: additional threshold for a joint at rest, which is three
     standard deviations of the additional noise [Nm, N] and decreases with exp(-|qd| / resting_speed). resting_speed:
     [rad/s, m/s]. peak_start, peak_scale: start and scale of the exponential tail of the normalised observer's peaks;
-    the tail is the largest fifth of the peaks, of which there are peak_count per joint. load_variance:
-    factor on the covariance of estimated payloads. load_quantile: half width of 95 % intervals of a payload, in
-    standard deviations. speed: largest speed of the training logs [rad/s, m/s]. encoder:
-    encoder step of positions [rad, m]. effort: torque limit [Nm, N]. minutes: duration of the training logs [min].
-    point: position of the tip in the frame of the last body, (3,) [m].
+    the tail is the largest fifth of the peaks, of which there are peak_count per joint. load_variance: factor on the
+    covariance of estimated payloads, an estimate with load_freedom degrees of freedom. speed: largest speed of the
+    training logs [rad/s, m/s]. encoder: encoder step of positions [rad, m]. effort: torque limit [Nm, N]. minutes:
+    duration of the training logs [min]. point: position of the tip in the frame of the last body, (3,) [m].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -60,7 +61,7 @@ class NoiseLevels(BaseModel):
     peak_scale: Vector
     peak_count: int
     load_variance: float
-    load_quantile: float
+    load_freedom: float
     speed: Vector
     encoder: Vector
     effort: Vector
@@ -71,6 +72,16 @@ class NoiseLevels(BaseModel):
     def rest_speed(self) -> np.ndarray:
         """Speed below which a joint is at rest, (n,) [rad/s, m/s]."""
         return TUNING.rest * self.speed
+
+    @property
+    def load_quantile(self) -> float:
+        """Half width of 95 % intervals of a payload, in standard deviations: Student's t, for an estimated variance.
+
+        `load_variance` was estimated without a payload, and is used as is to decide whether there is one. Errors are
+        larger on other days, and with a payload, which increases friction: the variance in the intervals is larger.
+        """
+        width = max(TUNING.other_days, math.sqrt(TUNING.prior_variance / self.load_variance))
+        return float(stdtrit(self.load_freedom, 0.975)) * width
 
     @property
     def supported_alarms(self) -> float:

@@ -61,20 +61,15 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
         factor: factor by which the covariance of the likelihood is multiplied (`NoiseLevels.load_variance`).
         quantile: half width of the 95 % intervals in standard deviations.
     """
+    found: list[tuple[np.ndarray, np.ndarray, float]] = []
     try:
-        return _found_payload(mean, covariance, factor, quantile)
+        precision = _inverse(covariance)
+        linear = precision @ mean / factor
+        precision = (precision - np.diag(TUNING.load_prior**-2.0)) / factor
+        for scale in TUNING.scales:
+            found.append(_at_scale(precision, linear, scale, found[-1][0] if found else None))
     except np.linalg.LinAlgError:
         return NO_REPORT
-
-
-def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quantile: float) -> Payload:
-    """Return the payload; arguments: see `find_payload`. Raises LinAlgError if a matrix is not positive definite."""
-    precision = _inverse(covariance)
-    linear = precision @ mean / factor
-    precision = (precision - np.diag(TUNING.load_prior**-2.0)) / factor
-    found: list[tuple[np.ndarray, np.ndarray, float]] = []
-    for scale in TUNING.scales:
-        found.append(_at_scale(precision, linear, scale, found[-1][0] if found else None))
     thetas, inverses, evidence = (np.array(column) for column in zip(*found, strict=True))
     log_odds = float(math.log(len(found)) - logsumexp(evidence))
     weights = softmax(evidence)
@@ -94,13 +89,6 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def prior_mean(mass: float) -> np.ndarray:
-    """Return the parameters of a ball whose centre is at a distance from the origin along z, (10,)."""
-    height, about_z = TUNING.distance, 2 / 5 * TUNING.radius**2
-    about_x = about_z + height**2
-    return mass * np.array([1, 0, 0, height, about_x, 0, 0, about_x, 0, about_z])
-
-
 def _at_scale(
     precision: np.ndarray, linear: np.ndarray, scale: float, start: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
@@ -112,7 +100,10 @@ def _at_scale(
     of consistent parameters, at whose boundary Newton's method would stall (Boyd and Vandenberghe, Convex Optimization,
     2004, 11.3). Twice the cost is self-concordant, so that steps damped by the Newton decrement are feasible (9.6.4).
     """
-    mean = prior_mean(scale)
+    # The prior mean is a ball whose centre is at a distance from the origin along z.
+    height, about_z = TUNING.distance, 2 / 5 * TUNING.radius**2
+    about_x = about_z + height**2
+    mean = scale * np.array([1, 0, 0, height, about_x, 0, 0, about_x, 0, about_z])
     width = np.einsum("i,iab->ab", mean, _UNITS) / TUNING.degrees
     pull = 0.5 * np.einsum("iab,ba->i", _UNITS, _inverse(width))
     theta = mean if start is None else start
