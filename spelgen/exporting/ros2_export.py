@@ -74,7 +74,8 @@ def _missing_part(trained: Trained) -> tuple[str, str] | None:
         return "controller", "it needs an effort interface of every joint"
     if trained.levels is None:
         return "estimator", "its noise levels are found from the training logs of a fit"
-    # The estimator's payload is in the frame of the last body, but published in the frame of the tip link.
+    # The estimator computes the payload in the frame of the last body, and the controller publishes it in the frame
+    # of the tip link: both frames must belong to the same body.
     if model.tip.carrier != len(model.arm.bodies) - 1:
         return "estimator", "the tip link is not part of the last body"
     return None

@@ -5,7 +5,6 @@ which a model was fitted would be too small.
 """
 
 import itertools
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -261,7 +260,7 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
     for k, peaks_of_log in enumerate(peaks):
         others = levels.model_copy(update=_peak_tail([*peaks[:k], *peaks[k + 1 :]]))
         excess += (peaks_of_log / others.thresholds(TUNING.alarms_per_minute)).max(axis=1).tolist()
-    allowed = int(TUNING.alarms_per_minute * levels.minutes)
+    allowed = int(TUNING.alarms_per_minute * len(excess) * TUNING.window / 60)
     factor = max(sorted(excess, reverse=True)[allowed], TUNING.other_days)
     return levels.model_copy(update=_peak_tail(peaks, factor))
 
@@ -287,8 +286,10 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     """Return the exponential tail of the peaks of logs, (W, n) each, after multiplication by a factor."""
     together = factor * np.concatenate(peaks)
     start = np.quantile(together, 1 - TUNING.tail, axis=0)
-    scale = np.nanmean(np.where(together > start, together - start, np.nan), axis=0)
-    return {"peak_start": start, "peak_scale": scale, "peak_count": math.ceil(TUNING.tail * len(together))}
+    # A joint without residuals has no peaks above the start.
+    count = max(int((together > start).sum(axis=0).max()), 1)
+    scale = np.maximum(together - start, 0).sum(axis=0) / count
+    return {"peak_start": start, "peak_scale": scale, "peak_count": count}
 
 
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:
