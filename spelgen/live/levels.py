@@ -253,16 +253,22 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
         times = np.array([sample.t for sample in samples])
         starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
         peaks.append(np.maximum.reduceat(ratio, starts, axis=0))
-    # A log has larger peaks than the other logs predict. Thresholds of the other logs, multiplied by one factor, give
-    # at most as many alarms as the rate allows. The factor is common to all joints: the joint with the largest factor
-    # differs between logs.
+    return levels.model_copy(update=held_out_tail(peaks, levels))
+
+
+def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
+    """Return the exponential tail of the peaks of logs, (W, n) each, increased for the differences between logs.
+
+    Thresholds of the other logs, multiplied by one factor, give at most as many alarms in each log as the default rate
+    allows for all logs together. All joints have the same factor: the joint that needs the largest one differs between
+    logs.
+    """
     excess: list[float] = []
     for k, peaks_of_log in enumerate(peaks):
         others = levels.model_copy(update=_peak_tail([*peaks[:k], *peaks[k + 1 :]]))
         excess += (peaks_of_log / others.thresholds(TUNING.alarms_per_minute)).max(axis=1).tolist()
     allowed = int(TUNING.alarms_per_minute * len(excess) * TUNING.window / 60)
-    factor = max(sorted(excess, reverse=True)[allowed], TUNING.other_days)
-    return levels.model_copy(update=_peak_tail(peaks, factor))
+    return _peak_tail(peaks, max(sorted(excess, reverse=True)[allowed], TUNING.other_days))
 
 
 def _observer_residuals(
