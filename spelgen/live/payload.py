@@ -118,7 +118,8 @@ def _at_scale(
             step = inverse @ gradient
             decrement = gradient @ step
             theta = theta - step / (1 + math.sqrt(2 * decrement) if decrement > 0.01 else 1)
-            # Newton's method converges quadratically, so this decrement is small enough.
+            # At the intermediate weights a decrement of 0.1 suffices, since only the start at the next weight depends
+            # on the result. At the final weight it must be 1e-12, which quadratic convergence reaches in a few steps.
             if decrement < (0.1 if power else 1e-12):
                 break
     inertia = np.einsum("i,iab->ab", theta, _UNITS)
