@@ -162,7 +162,7 @@ def find_levels(
         point=point,
     )
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
-    segments = [[x.block for x in samples if x.block] for samples in tested]
+    segments = [[x.block for x in samples if x.block is not None] for samples in tested]
     pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
     factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
