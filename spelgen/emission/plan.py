@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from math import isfinite
 
 import numpy as np
 
@@ -129,8 +128,7 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
 def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings) -> JointSpec:
     # The inputs of networks are scaled with a working range, which exists even if the URDF has no limits.
     low, high = working_range(coordinate)
-    limits = (None, None) if coordinate.continuous else (coordinate.lower, coordinate.upper)
-    lower, upper = (None if x is None or not isfinite(x) else rounded(x) for x in limits)
+    lower, upper = (None if x is None else rounded(x) for x in (coordinate.lower, coordinate.upper))
     effort = _plausible(coordinate.effort, TUNING.largest_effort)
     speed = _plausible(coordinate.velocity, TUNING.largest_speed)
     # Without a given rotor inertia, the armature is such that full effort accelerates it to full speed in
@@ -187,16 +185,12 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
         arm: the arm.
         inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (10,).
     """
-    # A link without mass gets a small fraction of the heaviest link's mass, which does not dominate M.
-    heaviest = max(float(ten[0]) for ten in inertias)
-    names = [body.link for body in arm.bodies]
     specs = []
-    for index, (body, ten) in enumerate(zip(arm.bodies, inertias, strict=True)):
-        mass, center, inertia = _about_center(_consistent(arm, index, ten, heaviest))
+    for body, ten in zip(arm.bodies, inertias, strict=True):
+        mass, center, inertia = _about_center(_consistent(ten))
         first, second, third = map(_triple, body.rotation)
         spec = LinkSpec(
-            # A link name that occurs again gets the body's index, so that names are unique.
-            name=body.link if body.link not in names[:index] else f"{body.link} ({index})",
+            name=body.link,
             parent=body.parent,
             joint=body.coordinate,
             joint_type=body.joint_type,
@@ -212,17 +206,8 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
     return tuple(specs)
 
 
-def _consistent(
-    arm: Chain, index: int, ten: Sequence[Fraction | float], heaviest: float
-) -> Sequence[Fraction | float]:
-    """Return inertial parameters, (10,), changed if they are not physically consistent."""
-    # Log-Cholesky parameters contain the logarithm of the mass, so a link without mass gets one, as a ball
-    # that extends to the next joint.
-    if ten[0] <= 0:
-        distances = [float(np.linalg.norm(_triple(x.translation))) for x in arm.bodies if x.parent == index]
-        mass = TUNING.default_mass * heaviest
-        moment = 0.4 * mass * max([0.1, *distances]) ** 2
-        ten = [mass, 0, 0, 0, moment, 0, 0, moment, 0, moment]
+def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
+    """Return inertial parameters, (10,), of a body with mass, changed if they are not physically consistent."""
     factor, is_consistent = reference_factor(np.array(ten, dtype=float))
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]

@@ -23,8 +23,6 @@ class ModelTuning:
     # [1] Smallest principal second moment of mass about the center of mass, divided by the largest: above
     # rounding errors.
     min_second_moment: float = 1e-10
-    # [1] Initial mass of a link without mass in the URDF, divided by the mass of the heaviest link.
-    default_mass: float = 0.01
     # [rad/s] Typical speed of a revolute joint without a velocity limit.
     angular_speed: float = 2.0
     # [m/s] Typical speed of a prismatic joint without a velocity limit.

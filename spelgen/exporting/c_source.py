@@ -86,7 +86,7 @@ def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, st
         "n": model.n,
         "functions": functions,
         "facts": facts,
-        "joints": ", ".join(model.identifiers),
+        "joints": ", ".join(model.joint_labels),
         "memory": model.memory,
         "memory_note": note,
         "residuals": network_source(model) + joint_function_source(model),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import keyword
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -119,7 +118,7 @@ def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
     return TrainedModel(
         name=identifier(loaded.chain.name),
         arm=loaded.chain,
-        identifiers=unique_identifiers(model.joint_names),
+        joint_labels=tuple(_letters_and_digits(name) or "joint" for name in model.joint_names),
         inertias=array(exact.inertial_parameters),
         constant_mass=constant_mass,
         motors=array(motors_of(exact)),
@@ -141,22 +140,6 @@ def identifier(text: str) -> str:
     if not plain or plain[0].isdigit() or keyword.iskeyword(plain):
         return f"arm_{plain}".rstrip("_")
     return plain
-
-
-def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
-    """Return an identifier for each joint, similar to the joint's name; all identifiers differ."""
-    # The identifiers become names and comments of the exported code, so they must be valid there.
-    identifiers: list[str] = []
-    for number, name in enumerate(names, start=1):
-        plain = _letters_and_digits(name)
-        if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
-            plain = f"joint_{plain or number}"
-        unique, count = plain, 2
-        # Two joint names that differ only in invalid characters would give the same identifier.
-        while unique in identifiers:
-            unique, count = f"{plain}_{count}", count + 1
-        identifiers.append(unique)
-    return tuple(identifiers)
 
 
 def _letters_and_digits(text: str) -> str:

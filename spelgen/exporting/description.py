@@ -82,17 +82,18 @@ class Servos:
 class TrainedModel:
     """A trained model of an arm with n joints: rad and Nm for revolute joints, m and N for prismatic joints.
 
-    name, identifiers: identifiers of the robot and of the joints in code. inertias: inertial parameters in the frames
-    of the joints, (bodies, 10). constant_mass: armature and constant residual terms of M, (n, n). motors: C, (n, n),
-    motor velocities per joint velocities. friction: the ``FrictionConstants`` of the runtime, as arrays. breakaway:
-    break-away displacements of the bristles, (n, K) [rad, m]. inputs: G, (n, n), joint torque per motor torque.
-    actuated: 0 for a passive joint, otherwise 1, (n,). torque_offset: measured torque at zero torque, (n,).
-    friction_compensation: torque per velocity that the drives add but do not report, (n,).
+    name: identifier of the robot in code. joint_labels: names of the joints in comments, of letters, digits and _.
+    inertias: inertial parameters in the frames of the joints, (bodies, 10). constant_mass: armature and constant
+    residual terms of M, (n, n). motors: C, (n, n), motor velocities per joint velocities. friction: the
+    ``FrictionConstants`` of the runtime, as arrays. breakaway: break-away displacements of the bristles, (n, K) [rad,
+    m]. inputs: G, (n, n), joint torque per motor torque. actuated: 0 for a passive joint, otherwise 1, (n,).
+    torque_offset: measured torque at zero torque, (n,). friction_compensation: torque per velocity that the drives
+    add but do not report, (n,).
     """
 
     name: str
     arm: Chain
-    identifiers: tuple[str, ...]
+    joint_labels: tuple[str, ...]
     inertias: np.ndarray
     constant_mass: np.ndarray
     motors: np.ndarray
