@@ -156,8 +156,8 @@ class Spans:
 
     @cached_property
     def change_bases(self) -> list[np.ndarray]:
-        """Echelon basis of T_k for each joint k, (dim T_k, entries)."""
-        return list(map(field.row_basis, self.changes))
+        """Echelon basis of T_k for each joint k, (dim T_k, entries), with the entries in the order ``order``."""
+        return [field.row_basis(change[:, self.order]) for change in self.changes]
 
     @cached_property
     def order(self) -> list[int]:
@@ -166,9 +166,8 @@ class Spans:
 
     @cached_property
     def varying(self) -> np.ndarray:
-        """Basis of U, (dim U, entries); with the columns in the order ``order`` it is an echelon form."""
-        echelon = field.row_basis(np.concatenate(self.change_bases)[:, self.order])
-        return echelon[:, np.argsort(self.order)]
+        """Basis of U, (dim U, entries)."""
+        return field.row_basis(np.concatenate(self.change_bases))[:, np.argsort(self.order)]
 
     @cached_property
     def floats(self) -> np.ndarray:
@@ -184,47 +183,28 @@ class Spans:
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
 
     def outside(self, joints: frozenset[int]) -> np.ndarray:
-        """Return rows (m, dim U) that span the changes of M with the positions of joints not in ``joints``.
+        """Return the echelon basis of the changes of M with the positions of joints not in ``joints``, (m, entries).
 
-        U is the span of all changes of M; the rows are coordinates in its basis `varying`.
+        The entries are in the order ``order``.
         """
         first, last = min(joints), max(joints)
         # The joints before `first` and after `last` have cached echelon forms, which saves most of the time.
-        between = [self._coordinates[k] for k in range(first, last) if k not in joints]
-        return np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]])
-
-    def changes_of(self, coordinates: np.ndarray) -> np.ndarray:
-        """Return changes of the entries of M, (m, entries), from their coordinates (m, dim U) in the basis of U."""
-        free = np.ones(len(self.keys), dtype=bool)
-        free[self._pivots] = False
-        changes = np.zeros((len(coordinates), len(self.keys)), dtype=np.uint64)
-        changes[:, self._pivots] = coordinates
-        changes[:, free] = field.product(coordinates, self.varying[:, free])
-        return changes
-
-    @cached_property
-    def _pivots(self) -> list[int]:
-        """Pivot entries of M, whose changes are the coordinates in the basis of U."""
-        return [self.order[pivot] for pivot in field.pivots(self.varying[:, self.order])]
-
-    @cached_property
-    def _coordinates(self) -> list[np.ndarray]:
-        """Basis of T_k in the basis of U for each joint k, (dim T_k, dim U)."""
-        return [basis[:, self._pivots] for basis in self.change_bases]
+        between = [self.change_bases[k] for k in range(first, last) if k not in joints]
+        return field.row_basis(np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]]))
 
     @cached_property
     def _nearer_root(self) -> list[np.ndarray]:
-        """Per joint, a basis (m, dim U) of the changes of M caused by joints nearer the root, in the basis of U."""
-        return _sums(self._coordinates)
+        """Per joint, an echelon basis of the changes of M caused by joints nearer the root, (m, entries)."""
+        return _sums(self.change_bases)
 
     @cached_property
     def _nearer_tip(self) -> list[np.ndarray]:
-        """Per joint, a basis (m, dim U) of the changes of M caused by joints nearer the tip, in the basis of U."""
-        return _sums(self._coordinates[::-1])[::-1]
+        """Per joint, an echelon basis of the changes of M caused by joints nearer the tip, (m, entries)."""
+        return _sums(self.change_bases[::-1])[::-1]
 
 
 def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return one echelon basis (m, dim U) per basis: result k spans the sum of the spans of bases 0 to k - 1."""
+    """Return one echelon basis (m, entries) per basis: result k spans the sum of the spans of bases 0 to k - 1."""
 
     def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
         return field.row_basis(np.concatenate([rows, basis]))
