@@ -52,8 +52,8 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
             expected="a preset with bristle friction, which position servos need", do="--preset closed-form",
         )  # fmt: skip
     structure = derive(arm.chain, options.assume)
-    # Magnitudes of M, V and torques are the scales of networks and friction. They are computed with the
-    # URDF's inertials, or with nominal inertials.
+    # Magnitudes of M, V and torques are the scales of networks and friction. The magnitudes are computed with the
+    # inertials of the URDF or, if they are absent or inconsistent, with default inertials.
     sizes = nominal(arm.chain, structure)
     coordinates = arm.chain.coordinates
     drives = [arm.settings.joint(x.name) for x in coordinates]
@@ -78,7 +78,8 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
         constants=constants,
         potential=tuple(range(len(joints))) if design.potential == "dense" else structure.potential,
         potential_scale=sizes.potential_scale,
-        # The bound is rounded to one digit, so that rounding errors of nominal values do not change the text.
+        # The lower bound of the eigenvalues of M is rounded to one digit, so that rounding errors of nominal values
+        # do not change the text of the module.
         margin=float(f"{max(TUNING.margin * sizes.min_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
         links=links,
@@ -101,7 +102,7 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
         joints = output.joints
-        # With the encoding of the Lie group paper, every function depends on all joints.
+        # With the encoding of Duong et al. (IEEE T-RO 40:3695, 2024), every function depends on all joints.
         if design.encoding == "lie-group":
             joints = tuple(range(len(sizes.mass_sensitivities)))
         outputs.append(OutputSpec(joints, _entries(output.basis), mean, scale))
@@ -169,7 +170,10 @@ def _plausible(limit: float | None, largest: float) -> float | None:
 
 
 def _with_armature(joints: Sequence[JointSpec], mass: np.ndarray) -> list[JointSpec]:
-    """Return the joints, with a small armature if it was unknown; mass: nominal diagonal of M, (n,) [kg m^2, kg]."""
+    """Return the joints; joints of unknown rotor inertia get a small armature.
+
+    mass: nominal diagonal of M, (n,) [kg m^2, kg].
+    """
     initial = [rounded(TUNING.min_armature * value, 3) for value in mass]
     return [replace(x, armature=x.armature or value) for x, value in zip(joints, initial, strict=True)]
 
@@ -212,7 +216,8 @@ def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
-    # Below this bound, rounding to `inertia_digits` could make the body inconsistent.
+    # If a second moment is less than `min_second_moment` times the largest, rounding to `inertia_digits` digits could
+    # make the body physically inconsistent.
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten
@@ -239,7 +244,8 @@ def _about_center(
 
 def _significant(values: Iterable[Fraction | float]) -> list[float]:
     """Return values rounded to the significant digits of inertial parameters."""
-    return [rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values]  # no -0.0
+    # The sum with 0.0 is 0.0 for -0.0.
+    return [rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values]
 
 
 def _triple(values: Vector) -> Triple:

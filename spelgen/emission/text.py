@@ -1,4 +1,4 @@
-"""The text of a module from a ``ModelSpec``, and the reverse. Equal specifications give equal bytes.
+"""Conversion of a ``ModelSpec`` to the text of a module, and back. Equal specifications give equal bytes.
 
 Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. A module that is
 read is parsed, but not executed.
@@ -162,7 +162,7 @@ def _quoted(name: str) -> str:
 
 
 def _rows(spec: ModelSpec, assembly: ModelParts) -> list[str]:
-    """Return the statements that define the rows, each with a comment about units above it."""
+    """Return the statements that define the tables ``JOINTS``, ``LINKS``, ..., with comments about units above."""
     statements = []
     for name, rows in assembly.rows.items():
         about = _term_descriptions(spec) if name in ("FUNCTIONS", "CONSTANTS") else {}

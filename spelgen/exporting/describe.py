@@ -1,4 +1,4 @@
-"""The argument of every exporter, a trained model with its arm; and the conversion of this model to plain numbers."""
+"""``Trained``, a trained model with its arm, the argument of every exporter; its conversion to NumPy arrays."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Trained:
         return self.arm.tip or last_link(self.arm.robot, self.joint_names)
 
     def prepared(self) -> PreparedModel:
-        """Return a copy of the model with constant parameters and tip kinematics, for torch and ONNX programs."""
+        """Return a copy of the model with precomputed parameters, and the kinematics of the tip, for programs."""
         dtype = torch.float32 if self.float32 else torch.float64
         return self.model.prepared(tip_kinematics(self.arm), dtype=dtype)
 
@@ -97,7 +97,7 @@ class Trained:
 
 
 def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
-    """Return a trained model as plain numbers. Raises RunError for a model without rigid bodies."""
+    """Return a trained model as NumPy arrays. Raises RunError for a model without rigid bodies."""
     # A copy in double precision on the CPU: the user's model may be in single precision or on a GPU.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
@@ -164,8 +164,7 @@ def _residuals(model: ArmModel) -> Residuals:
     """Return the residual terms of a model, without the terms that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
-    # Entries of the lower triangle of M without a contribution of any function are zero, and are
-    # omitted.
+    # Entries of the residual of M to which no function contributes are zero and are omitted.
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
@@ -183,13 +182,14 @@ def _residuals(model: ArmModel) -> Residuals:
 def _network(
     layers: Layers | None, encoding: JointEncoding, functions: np.ndarray | None = None
 ) -> SigmoidNetwork | None:
-    """Return the network y(q), or tanh(y(q)) @ functions; None if there are no layers or the last layer is zero.
+    """Return a network of tanh units as a network of sigmoids; None if it has no layers or a zero last layer.
 
-    Units become sigmoids, which take less time in C: tanh(x) = 2 sigmoid(2 x) - 1. The factors and the shift of this
-    formula are included in the weights and biases of the layers before and after the unit.
+    With the outputs y(q) of the given network, the outputs of the result are y(q), or tanh(y(q)) @ functions. Sigmoids
+    take less time in C: tanh(x) = 2 sigmoid(2 x) - 1. The factors and the shift of this formula are included in the
+    weights and biases of the layers before and after the unit.
 
     Args:
-        layers: weights and biases of tanh layers, of which the last is linear.
+        layers: weights and biases of the layers of tanh units, and of the last layer, which is linear.
         encoding: the inputs of the network, (2 n,): cos q and sin q of a revolute joint, (q - center) slope and zero of
             a prismatic joint.
         functions: linear map of tanh(y), (outputs of the last layer, outputs); None: the result is y.
@@ -215,7 +215,10 @@ def _network(
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
-    """Return a spline per index of a joint, from weights (n, splines); joints with only zero weights have none."""
+    """Return cubic splines by the index of the joint; joints whose coefficients are all zero are omitted.
+
+    weights: coefficients of k B-splines per joint, (n, k).
+    """
     splines = {}
     for joint in torch.nonzero(weights.any(dim=1)).flatten().tolist():
         # Three zero weights at each end make the curve and its first two derivatives zero at the ends.
@@ -227,7 +230,10 @@ def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
 
 
 def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
-    """Return the torque ripple for weights (n, 2 H): harmonics of the joint's revolution, then of the motor's.
+    """Return the torque ripple of the joints.
+
+    weights: coefficients of H cosines, then of H sines, (n, 2 H). The H frequencies are the harmonics of a revolution
+    of the joint, then of a revolution of the motor.
 
     An export computes harmonics k = 1, 2, ... of one frequency by a rotating phasor, in sequence. Harmonics with zero
     amplitude are therefore only removed after the last nonzero one.
@@ -236,8 +242,8 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
     cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
-        # number of harmonics of the joint, with frequencies 1, 2, ...; the motor has multiples of the gear
-        # ratio
+        # `regular` is the number of harmonics of the joint, with the frequencies 1, 2, ... per revolution. The other
+        # frequencies are multiples of the gear ratio.
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]

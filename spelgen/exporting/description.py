@@ -1,4 +1,4 @@
-"""A trained model as plain numbers, for exporters of source code, and the entry points: the functions of an export."""
+"""``TrainedModel``, a trained model as NumPy arrays; and the entry points, the functions that an export contains."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -60,7 +60,10 @@ class Residuals:
 
 
 def spline_energy(spline: BSpline) -> BSpline:
-    """Return the antiderivative of a torque spline whose values at both ends of the range have opposite signs."""
+    """Return the potential energy of a torque spline, its antiderivative.
+
+    The energies at both ends of the range have equal magnitudes and opposite signs, as in the runtime.
+    """
     energy = spline.antiderivative()
     count = len(energy.t) - energy.k - 1
     half = energy(spline.t[-4]) / 2
@@ -69,7 +72,10 @@ def spline_energy(spline: BSpline) -> BSpline:
 
 @dataclass(frozen=True, eq=False)
 class Servos:
-    """Constants of ``runtime.PositionServo``, (n,), and the delay [s]; limit: infinite if there is none."""
+    """Constants of position servos, (n,) each, as in ``runtime.PositionServo``, and the delay of the command [s].
+
+    limit: largest torque [Nm, N]; infinite for a servo without a limit.
+    """
 
     kp: np.ndarray
     kd: np.ndarray

@@ -130,7 +130,7 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
-    # The factor is omitted from the file if it is one at all positions.
+    # The factor on friction, which depends on the position, is omitted if it is one at all positions.
     if (factor != 1).any():
         constants["position_factor"] = np.stack([factor.min(axis=0), factor.max(axis=0)], axis=-1)
     return constants
