@@ -92,8 +92,7 @@ class Trained:
     @property
     def memory(self) -> int:
         """Number of values in the friction state z of all joints; 0 for a model of networks."""
-        model = self.model
-        return model.n * model.elements if isinstance(model, RigidBodyDynamics) else 0
+        return self.model.n * self.model.elements
 
 
 def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
