@@ -1,7 +1,6 @@
 """The function ``derive_spec``: the ``ModelSpec`` of an arm, from the arm's structure and nominal values."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -57,13 +56,15 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
     sizes = nominal(arm.chain, structure)
     coordinates = arm.chain.coordinates
     drives = [arm.settings.joint(x.name) for x in coordinates]
-    joints = [_joint(x, sizes, index, drives[index]) for index, x in enumerate(coordinates)]
-    links: tuple[LinkSpec, ...] = ()
     outputs, constants = _outputs(structure, sizes, design), _constants(structure, sizes)
+    links: tuple[LinkSpec, ...] = ()
+    min_armatures = np.zeros(len(drives))
     if design.mass == "closed-form":
         # A URDF may have inertials that are not physically consistent; `_links` corrects them.
         links = _links(arm.chain, exact_inertias(arm.chain, sizes.from_urdf))
-        joints = _with_armature(joints, np.diagonal(mean_mass(len(joints), outputs, constants)))
+        min_armatures = TUNING.min_armature * np.diagonal(mean_mass(len(drives), outputs, constants))
+    rows = enumerate(zip(coordinates, drives, min_armatures.tolist(), strict=True))
+    joints = [_joint(x, sizes, index, drive, min_armature) for index, (x, drive, min_armature) in rows]
     x, y, z = map(float, arm.chain.gravity)
     return ModelSpec(
         robot=arm.chain.name,
@@ -126,7 +127,10 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, speeds.tolist()))
 
 
-def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings) -> JointSpec:
+def _joint(
+    coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings, min_armature: float
+) -> JointSpec:
+    """Return the joint of a coordinate; min_armature: armature if the rotor inertia is unknown [kg m^2, kg]."""
     # The inputs of networks are scaled with a working range, which exists even if the URDF has no limits.
     low, high = working_range(coordinate)
     lower, upper = (None if x is None else rounded(x) for x in (coordinate.lower, coordinate.upper))
@@ -149,7 +153,7 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
         half_range=rounded((high - low) / 2),
         speed=speed or default_speed,
         friction=rounded(friction, 3),
-        armature=rounded(drive.armature or armature, 3),
+        armature=rounded(drive.armature or armature, 3) or rounded(min_armature, 3),
         gear=drive.gear,
         mass_sensitivity=sizes.mass_sensitivities[index],
         potential_sensitivity=sizes.potential_sensitivities[index],
@@ -167,15 +171,6 @@ def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
 def _plausible(limit: float | None, largest: float) -> float | None:
     """Return a limit of the URDF, or None for a placeholder: some tools write 0 or 1e16 for an unknown limit."""
     return limit if limit and limit <= largest else None
-
-
-def _with_armature(joints: Sequence[JointSpec], mass: np.ndarray) -> list[JointSpec]:
-    """Return the joints; joints of unknown rotor inertia get a small armature.
-
-    mass: nominal diagonal of M, (n,) [kg m^2, kg].
-    """
-    initial = [rounded(TUNING.min_armature * value, 3) for value in mass]
-    return [replace(x, armature=x.armature or value) for x, value in zip(joints, initial, strict=True)]
 
 
 def _entries(weights: Weights) -> Entries:
