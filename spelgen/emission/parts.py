@@ -30,10 +30,6 @@ class ModelParts:
     rows: dict[str, tuple[Call, ...]]
     model: Call
 
-    def uses(self, name: Code) -> bool:
-        """Return True if the constructor call refers to ``name``; models with networks refer to ``generator``."""
-        return _names(self.model, name)
-
 
 def model_parts(spec: ModelSpec) -> ModelParts:
     """Return the parts of the model that ``spec`` describes."""
@@ -70,15 +66,6 @@ def base_class(spec: ModelSpec) -> str:
     if spec.links:
         return "RigidBodyDynamics" if spec.design.net == "none" else "ResidualDynamics"
     return "DenseInputDynamics" if spec.design.input == "dense-3n" else "NetworkDynamics"
-
-
-def _names(value: object, name: Code) -> bool:
-    """Return True if a value is this name, or contains it as an argument or item."""
-    if isinstance(value, Call):
-        return any(_names(item, name) for _, item in value.arguments)
-    if isinstance(value, tuple):
-        return any(_names(item, name) for item in value)
-    return value == name
 
 
 def _unless(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
