@@ -31,6 +31,8 @@ class Residues:
         self.values = values
 
     def __add__(self, operand: Residues | int) -> Residues:
+        if isinstance(operand, int) and operand == 0:
+            return self
         return Residues(_folded(self.values + _values(operand)))
 
     __radd__ = __add__
@@ -44,7 +46,9 @@ class Residues:
     def __rsub__(self, operand: int) -> Residues:
         return -self + operand
 
-    def __mul__(self, operand: Residues | int) -> Residues:
+    def __mul__(self, operand: Residues | int) -> Residues | int:
+        if isinstance(operand, int) and operand in (0, 1):
+            return self if operand else 0
         return Residues(_product(self.values, _values(operand)))
 
     __rmul__ = __mul__
