@@ -101,12 +101,15 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
 
 
 def encoded(q: np.ndarray) -> np.ndarray:
-    """Return the path (T, n) [rad, m] without encoder jitter: backlash of one encoder step to both sides."""
+    """Return the path (T, n) [rad, m] without encoder jitter.
+
+    q: measured path, (T, n), which is passed through a backlash of one encoder step in either direction.
+    """
     step = encoder_step(q)
     if not step.any():
         return q
-    # Compositions of clamps are clamps, so a parallel scan needs log2(T) passes instead of T sequential steps.
     # Backlash: out[k] = clip(out[k-1], low[k], high[k]), with low and high one encoder step from the input.
+    # Compositions of clips are clips, so a parallel scan needs log2(T) passes instead of T sequential steps.
     low, high = q - step, q + step
     shift = 1
     while shift < len(q):
@@ -121,8 +124,9 @@ def encoder_step(q: np.ndarray) -> np.ndarray:
     """Return the encoder step (n,) [rad, m] of positions (T, n); 0 for a joint whose positions are not quantised."""
     steps = np.zeros(q.shape[1])
     for joint, values in enumerate(q.T):
-        # Positions of an encoder repeat exactly; positions that are not quantised do not.
+        # Positions of an encoder repeat exactly. They are regarded as quantised if each value occurs more than four
+        # times on average.
         levels = np.unique(values)
-        if len(levels) > 1 and len(levels) < len(values) / 4:  # many values are repeated
+        if len(levels) > 1 and len(levels) < len(values) / 4:
             steps[joint] = np.diff(levels).min()
     return steps

@@ -112,9 +112,10 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 
 
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
-    """Return the values of one coordinate in all blocks of samples, (blocks, S).
+    """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S).
 
-    values: (2 S,); block ``index`` + 1 gets the second half, all other blocks get the first half.
+    values: (2 S,). Block ``index`` + 1, in which only this coordinate differs from block 0, gets the second half of the
+    values; all other blocks get the first half.
     """
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
@@ -156,7 +157,10 @@ class Spans:
 
     @cached_property
     def change_bases(self) -> list[np.ndarray]:
-        """Echelon basis of T_k for each joint k, (dim T_k, entries), with the entries in the order ``order``."""
+        """Echelon basis, for each joint k, of T_k, the span of the changes of M if only joint k moves.
+
+        Each basis is (dim T_k, entries), with the entries in the order ``order``.
+        """
         return [field.row_basis(change[:, self.order]) for change in self.changes]
 
     @cached_property
@@ -166,7 +170,7 @@ class Spans:
 
     @cached_property
     def varying(self) -> np.ndarray:
-        """Basis of U, (dim U, entries)."""
+        """Basis of U, the span of all changes of M, (dim U, entries)."""
         return field.row_basis(np.concatenate(self.change_bases))[:, np.argsort(self.order)]
 
     @cached_property
@@ -183,9 +187,9 @@ class Spans:
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
 
     def outside(self, joints: frozenset[int]) -> np.ndarray:
-        """Return the echelon basis of the changes of M with the positions of joints not in ``joints``, (m, entries).
+        """Return an echelon basis of the changes of M with the positions of joints not in ``joints``, (m, entries).
 
-        The entries are in the order ``order``.
+        The entries of M are in the order ``order``.
         """
         first, last = min(joints), max(joints)
         # The joints before `first` and after `last` have cached echelon forms, which saves most of the time.
@@ -194,17 +198,17 @@ class Spans:
 
     @cached_property
     def _nearer_root(self) -> list[np.ndarray]:
-        """Per joint, an echelon basis of the changes of M caused by joints nearer the root, (m, entries)."""
+        """Echelon basis, for each joint, of the changes of M caused by joints nearer the root, (m, entries)."""
         return _sums(self.change_bases)
 
     @cached_property
     def _nearer_tip(self) -> list[np.ndarray]:
-        """Per joint, an echelon basis of the changes of M caused by joints nearer the tip, (m, entries)."""
+        """Echelon basis, for each joint, of the changes of M caused by joints nearer the tip, (m, entries)."""
         return _sums(self.change_bases[::-1])[::-1]
 
 
 def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return one echelon basis (m, entries) per basis: result k spans the sum of the spans of bases 0 to k - 1."""
+    """Return a list of echelon bases, (m, entries) each; element k spans the sum of the spans of ``bases[:k]``."""
 
     def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
         return field.row_basis(np.concatenate([rows, basis]))
