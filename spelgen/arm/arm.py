@@ -38,8 +38,8 @@ class Coordinate(NamedTuple):
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """Lower and upper limit [rad, m]; None for a continuous joint, or if one of the two limits is absent."""
-        if self.continuous or self.lower is None or self.upper is None:
+        """Lower and upper limit [rad, m]; None if one of the two is absent, as for continuous joints."""
+        if self.lower is None or self.upper is None:
             return None
         return self.lower, self.upper
 

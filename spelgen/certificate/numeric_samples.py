@@ -23,7 +23,7 @@ from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import Settings
 from spelgen.structure.nominal import parameters_of
-from spelgen.urdf.document import urdf_bytes
+from spelgen.urdf.document import read_document
 from spelgen.urdf.robot import Robot
 
 ENGINE = f"Pinocchio {pin.__version__}"
@@ -153,10 +153,10 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
 
 def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
     """Return the dynamics of the URDF as read by Pinocchio. Raises ValueError if the file has changed."""
-    data = urdf_bytes(robot.path)
-    if hashlib.sha256(data).hexdigest() != robot.digest:
+    document = read_document(robot.path)
+    if hashlib.sha256(document.data).hexdigest() != robot.digest:
         raise ValueError("the file has changed since it was read")
-    root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True))
+    root = document.root
     # Limits and friction are replaced, because they are not compared, and Pinocchio rejects some of their values.
     for element in [*root.iter("limit"), *root.iter("dynamics")]:
         element.getparent().remove(element)

@@ -16,8 +16,8 @@ from spelgen.templates import render
 _WIDTH = 118  # maximum length of a line
 FRICTION_STATES = ("z", "z_next", "z_start", "low", "high")
 """Inputs and outputs that are friction states, of type double; all others are of type ``real``."""
-# tanh, unlike SIN and COS, has no float version, because only functions of the friction state call it, in
-# double.
+# SIN and COS are macros for float or double. tanh is always the double function, because only the friction state, which
+# is double, needs it.
 _FORMS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
@@ -41,7 +41,11 @@ _FORMS = {
 
 @dataclass(frozen=True)
 class CFunction:
-    """An entry point in C. shapes: (rows,) or (rows, columns) per output. operations: upper bound of their number."""
+    """An entry point in C.
+
+    shapes: (rows,) or (rows, columns) per output. operations: upper bound of the number of arithmetic operations of a
+    call.
+    """
 
     entry: EntryPoint
     symbol: str
@@ -86,7 +90,7 @@ def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, st
         "n": model.n,
         "functions": functions,
         "facts": facts,
-        "joints": ", ".join(model.identifiers),
+        "joints": ", ".join(model.joint_labels),
         "memory": model.memory,
         "memory_note": note,
         "residuals": network_source(model) + joint_function_source(model),
@@ -114,7 +118,7 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
         shapes[name] = (rows, columns) if columns > 1 else (rows,)
         parameters.append(_parameter(model, name, str(rows * columns)))
         results.append(f"{name} ({', '.join(map(str, shapes[name]))}) [{unit}]")
-    # the comment above the function in the header: results with shapes and units
+    # The comment above the function in the header states the shapes and units of the results.
     about = f"{entry.about[0].upper()}{entry.about[1:]}: {', '.join(results)}."
     symbol = f"{model.name}_{entry.name}"
     signature = f"void {symbol}(\n    " + ",\n    ".join(parameters) + ")"

@@ -46,7 +46,7 @@ def export_ros2(trained: Trained) -> Exported:
     sources, checked = c_files(replace(trained, entries=entries, levels=levels))
     package = f"{model.name}_dynamics"
     context = {"package": package, "controller": controller, "name": model.name, "upper": model.name.upper()}
-    context |= {"joints": ", ".join(model.identifiers), "estimator": estimator}
+    context |= {"joints": ", ".join(model.joint_labels), "estimator": estimator}
     context["dependencies"] = sorted(_DEPENDENCIES + (_CONTROLLER_DEPENDENCIES if controller else ()))
     paths = _PATHS
     if controller:

@@ -96,14 +96,6 @@ class NetworkDynamics(PortHamiltonian):
             cache.encoded, qd, cache.parameters["friction"], torch.eye(self.n).to(qd)
         )
 
-    def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """Return d/dt of the state (q, p), (..., 2 n), or (q, p, tau) with constant tau, (..., 3 n)."""
-        # ODE solvers integrate one vector, so a constant input is appended to the state, with rate
-        # zero.
-        q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
-        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
-        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
-
 
 class DenseInputDynamics(NetworkDynamics):
     """A model of networks with a diagonal G(q).

@@ -201,21 +201,6 @@ class RigidBodyDynamics(PortHamiltonian):
         moved = z + self._motor(displacement).unsqueeze(-1)
         return moved.clamp(-self.friction.reach, self.friction.reach)
 
-    def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """Return d/dt of the state (q, p, z), (..., 2 n + n K), or of (q, p, z, tau) with constant tau.
-
-        A state without z, (..., 2 n), gives friction that depends on velocity.
-        """
-        n, size = self.n, self.n * self.elements
-        if state.shape[-1] < 2 * n + size:
-            size = 0
-        q, p, flat, tau = state.tensor_split((n, 2 * n, 2 * n + size), dim=-1)
-        z = flat.reshape(*flat.shape[:-1], n, -1) if size else None
-        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
-        if z is not None:
-            flat = self.memory_rate(z, qd).flatten(-2)
-        return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
-
     def input_force(self, cache: RigidConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
         """Return the generalized force G (tau - b) + k qd, (..., n) [Nm, N].
 

@@ -98,7 +98,7 @@ def working_range(coordinate: Coordinate) -> tuple[float, float]:
     lower, upper = coordinate.lower, coordinate.upper
     is_revolute = coordinate.joint_type == "revolute"
     # Huge or equal limits are not usable: exporters write +-1e16, or equal limits, for a joint without limits.
-    if coordinate.continuous or lower is None or upper is None or not 0 < upper - lower < 1e3:
+    if lower is None or upper is None or not 0 < upper - lower < 1e3:
         half_range = pi if is_revolute else 0.5
         return -half_range, half_range
     if is_revolute:
