@@ -196,7 +196,8 @@ class Spans:
         The rows are coordinates in the basis `varying` of U, the span of all changes of M.
         """
         first, last = min(joints), max(joints)
-        # The joints before `first` and after `last` have cached echelon forms, which saves most of the time.
+        # Spans for all joints before `first`, and for all joints after `last`, are cached. Only the bases of the joints
+        # between are added one at a time.
         between = [self._coordinates[k] for k in range(first, last) if k not in joints]
         return np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]])
 
