@@ -93,9 +93,9 @@ def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the samples at which each column of a path (T, n) starts or reverses.
 
     Returns:
-        Indices of these samples, (R, n): first the start, then the reversals, where R - 1 is the largest number of
-        reversals of a column. Columns with fewer reversals are padded with zeros.
-        For each sample, the row of this array with the latest start or reversal, (T, n).
+        Indices of these samples, (R, n): the start, and up to R - 1 reversals of each column. Columns with fewer
+        reversals are padded with zeros.
+        For each sample, the row in the array of indices with the latest start or reversal, (T, n).
     """
     steps = np.diff(path, axis=0, prepend=path[:1])
     # A drive at rest keeps the direction of its last motion.
