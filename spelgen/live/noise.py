@@ -74,11 +74,11 @@ class NoiseLevels(BaseModel):
 
     @property
     def load_quantile(self) -> float:
-        """Half width of 95 % intervals of a payload, in standard deviations: Student's t, for an estimated variance.
+        """Half width of 95 % intervals of a payload, in standard deviations.
 
-        `load_variance` was estimated without a payload; the decision between payload and no payload uses it unchanged.
-        Intervals use at least its prior value, because with a payload, friction and its errors are larger than in the
-        training logs.
+        It is a quantile of Student's t distribution, because the variance is estimated. The factor `load_variance` is
+        estimated from logs without payload. A payload increases friction and the errors of friction, so a smaller
+        factor than the prior value is replaced by the prior value in intervals.
         """
         with_load = max(TUNING.prior_variance / self.load_variance, 1.0)
         return float(stdtrit(self.load_freedom, 0.975)) * math.sqrt(with_load)
