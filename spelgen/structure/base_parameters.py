@@ -116,5 +116,5 @@ def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
 
 
 def rational(number: Fraction) -> fmpq:
-    """Return the fraction as a rational number of FLINT: arithmetic with these is faster than with `Fraction`."""
+    """Return the fraction as a rational number of FLINT, for which arithmetic is faster than for `Fraction`."""
     return fmpq(number.numerator, number.denominator)
