@@ -223,7 +223,7 @@ class Inspection:
 
 
 def _rows(entries: Iterable[InputEntry]) -> str:
-    """Return the joints, which are the rows, of these entries of G as text."""
+    """Return the joints of the rows in G of these entries as text."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
 
 

@@ -61,10 +61,10 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
     gravity = np.zeros((count, n))
     for sample in range(count):
         dynamics = arm_dynamics(with_random_inertias(arm, rng) if random_inertials else arm, Settings())
-        # Each further row of q differs from the first in one coordinate, so that a difference of M is an effect of
-        # this coordinate.
+        # Row 0 of q, (1 + n, n), has random positions. Row 1 + k differs from row 0 in coordinate k only, so that a
+        # difference of M is an effect of this coordinate.
         base, moved = _positions(arm, rng), _positions(arm, rng)
-        q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)  # (1 + n, n)
+        q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)
         mass[:, sample] = dynamics.mass_matrix(q)
         gravity[sample] = dynamics.gravity(base)
     # Entries have different units (kg, kg m, kg m2), and are therefore divided by scales with the same units.

@@ -173,11 +173,11 @@ def find_levels(
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
     """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
 
-    The logs are without payload, so each estimated payload is an error. Windows of consecutive blocks are independent
-    trials. Each trial has two normalised squared errors: of the mass, and of the mass and first moments. Each error is
-    averaged over the trials; the prior value counts as `prior_trials` more trials. The factor is the largest average
-    over both errors and all window lengths: errors of the model average out slowly, so that longer windows may have
-    larger normalised errors.
+    The logs are without payload, so each estimated payload is an error. Each window of consecutive blocks is one trial,
+    with two normalised squared errors: of the mass, and of mass and first moments. The mean of an error over the trials
+    includes the prior value with the weight of `prior_trials` trials. The factor is the largest of the means for both
+    errors and for all lengths of windows. A longer window may have a larger normalised error, because the errors of
+    the model are correlated over time.
     """
     factors = []
     for window in TUNING.trial_blocks:
@@ -240,7 +240,10 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
-    """Return the levels with the noise of the momentum observer, and the tail of its peaks, added."""
+    """Return a copy of the levels with two more estimates, from held-out samples of each tested log.
+
+    The estimates are the noise of the momentum observer, and the exponential tail of the observer's peaks.
+    """
     residuals = [_observer_residuals(levels, samples) for samples in tested]
     signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))
     levels = levels.model_copy(update=_observer_noise(signal, qd, levels))

@@ -76,11 +76,12 @@ class NoiseLevels(BaseModel):
 
     @property
     def load_quantile(self) -> float:
-        """Half width of 95 % intervals of a payload, in standard deviations: Student's t, for an estimated variance.
+        """Half width of 95 % intervals of a payload, in standard deviations.
 
-        `load_variance` was estimated without a payload; the decision between payload and no payload uses it unchanged.
-        Intervals are wider: errors are larger on other days than in the training logs, and friction with its errors is
-        larger with a payload.
+        It is a quantile of Student's t distribution, because the variance is estimated, times a factor. The factor
+        `load_variance` is estimated from logs without payload, and the decision between payload and no payload uses
+        it unchanged. Intervals are wider for two reasons: errors are larger on other days than in the training logs,
+        and a payload increases friction and the errors of friction.
         """
         width = max(TUNING.other_days, math.sqrt(TUNING.prior_variance / self.load_variance))
         return float(stdtrit(self.load_freedom, 0.975)) * width

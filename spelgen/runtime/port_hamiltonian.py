@@ -12,7 +12,7 @@ from spelgen.runtime.rows import Joint
 
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     """Return the product of a matrix, (..., n, m), and a vector, (..., m)."""
-    # A single operation: for a single state, the number of operations determines the time.
+    # A single state needs one operation in place of three: the number of operations determines the time.
     if vector.dim() == 1:
         return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
@@ -21,7 +21,9 @@ def applied(matrix: Tensor, vector: Tensor) -> Tensor:
 class PortHamiltonian(nn.Module):
     """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
 
-    The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
+    The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014), with
+    momenta p, dissipation matrix D(q, qd) and input matrix G.
+
     q, qd, qdd, tau and p are (..., n), with any leading dimensions, in rad and Nm for revolute joints,
     in m and N for prismatic joints. In place of q, methods also accept the configuration cache that
     ``at`` returns: all quantities that depend on q only, computed once for several calls. inputs: the

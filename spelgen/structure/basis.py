@@ -194,7 +194,8 @@ def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the least-squares solution X (k, p) of A X = B, with A = matrix (S, k) and B = right (S, p)."""
     width = matrix.shape[1]
-    # The triangular factor of the QR decomposition of [A, B] has the same normal equations and far fewer rows.
+    # With the triangular factor of the QR decomposition of [A, B], the normal equations and the solution are the same,
+    # but there are far fewer rows.
     factor = np.asarray(np.linalg.qr(np.concatenate([matrix, right], axis=1), mode="r"))
     return np.asarray(np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0])
 

@@ -167,9 +167,9 @@ def circle_point(angle: float) -> tuple[Fraction, Fraction]:
 
 
 def base_denominators(arm: Chain) -> list[int]:
-    """Return an integer d per coordinate q.
+    """Return for each coordinate q the smallest integer d for which all its joint angles are multiples of q / d.
 
-    The angle of each revolute joint with this coordinate, mimic joints included, is an integer multiple of q / d, up to
+    The angle of each revolute joint with this coordinate, mimic joints included, is an integer multiple of q / d plus
     a constant.
     """
     denominators = [1] * len(arm.coordinates)
