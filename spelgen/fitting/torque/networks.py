@@ -48,7 +48,7 @@ def fit_networks(
     """
     count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
-    # The errors of a joint of constant torque would have an infinite weight.
+    # Without this lower bound, the errors of a joint of constant torque would have an infinite weight.
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def summands() -> Iterator[torch.Tensor]:
@@ -108,7 +108,8 @@ def select_networks(
     # subset suffices.
     step = -(-len(samples.q) // SELECTION.network_samples)
     subset = ResidualSamples(*(column[::step] for column in samples))
-    # The target is the torque that the sum of all residual terms should have, single-joint terms included.
+    # The target is the torque that all residual terms together should explain: the torque residual of the model plus
+    # the torque of the current single-joint terms.
     with torch.no_grad():
         current = residual_torque(model, *subset[:3])
     subset = subset._replace(torque_residual=subset.torque_residual + current)
