@@ -92,9 +92,10 @@ def spec_of(model: object) -> ModelSpec | None:
 
 
 def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
-    """Return M, (..., n, n), a linear function of terms (...,): the function ``mass_entries`` of a module.
+    """Return M, (..., n, n), whose entries are linear combinations of terms (...,).
 
-    rows: linear combinations per row of the lower triangle. terms: values of the functions of q, then the constants.
+    The result equals the result of the function ``mass_entries`` in the text of a module. rows: linear combinations per
+    row of the lower triangle. terms: values of the functions of q, then the constants.
     """
     return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in rows))
 
@@ -114,7 +115,7 @@ def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
 
 @cache
 def _model_class(base: str) -> Callable[..., ArmModel]:
-    """Return a class ``Model`` that derives from ``ArmModel`` and from this class of the runtime."""
+    """Return a class ``Model`` that derives from ``ArmModel`` and from the class ``base`` of the runtime."""
     # The cache makes one class per class of the runtime, so that models with equal dynamics have the same
     # type.
     return cast("Callable[..., ArmModel]", type("Model", (ArmModel, vars(runtime)[base]), {}))

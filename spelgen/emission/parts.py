@@ -190,7 +190,10 @@ def _mass_network(spec: ModelSpec) -> Call:
 
 
 def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
-    """Return two rows of input scales per joint: of cos q (or the scaled q of a prismatic joint), and of sin q."""
+    """Return the scales of the inputs of the network of M, as two rows with a scale per joint.
+
+    The first row is of the inputs cos q, or of the scaled q of prismatic joints; the second row is of the inputs sin q.
+    """
     return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
 
 

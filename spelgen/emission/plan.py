@@ -227,7 +227,8 @@ def _consistent(
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
-    # Below this bound, rounding to `inertia_digits` could make the body inconsistent.
+    # If a second moment is below `min_second_moment` times the largest one, rounding to `inertia_digits` could make
+    # the body inconsistent.
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten
@@ -245,7 +246,8 @@ def _about_center(
     x, y, z = hx / m, hy / m, hz / m
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
     inertia = [value - m * square for value, square in zip(tensor, steiner, strict=True)]
-    # `_consistent` computes in floating point: entries as small as its rounding errors become zero.
+    # The given parameters have rounding errors, since `_consistent` computes in floating point. Entries of the size of
+    # these errors become zero.
     noise = max(map(abs, inertia)) / 10 ** (TUNING.inertia_digits + 3)
     inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]
     mass, cx, cy, cz, xx, xy, xz, yy, yz, zz = _significant([m, x, y, z, *inertia])
@@ -254,7 +256,9 @@ def _about_center(
 
 def _significant(values: Iterable[Fraction | float]) -> list[float]:
     """Return values rounded to the significant digits of inertial parameters."""
-    return [rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values]  # no -0.0
+    return [
+        rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values
+    ]  # adding 0.0 changes -0.0 to 0.0
 
 
 def _triple(values: Vector) -> Triple:
