@@ -72,8 +72,8 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     rotation, weight = pose[:3, :3], load[0] * constant(model.arm.gravity)
     load_momentum, load_gradient = payload.momentum(qd)
     moment = ca.cross(rotation @ load[1:4], constant(model.arm.gravity))
-    # The payload's gravity torque is J^T times its weight. Newton-Euler has larger rounding errors: the log
-    # odds then differ 40 times as much from the Python estimator's.
+    # The payload's gravity torque is J^T times its weight. With the gravity torque by Newton-Euler, which has
+    # larger rounding errors, the log odds of "no payload" differ 40 times as much from the Python estimator's.
     load_gradient += jacobian.T @ ca.vertcat(weight, moment)
     at_point = jacobian[:3, :] - ca.skew(rotation @ levels.point) @ jacobian[3:, :]
     outputs = {

@@ -1,8 +1,8 @@
 """Residual terms of a model in C: networks as loops over tables, and functions of single joints.
 
-Splines are tables with a polynomial per interval; harmonics are powers of a phasor exp(i f q). The C
-code of an entry point first calls functions that compute its residual terms (see
-`residual_expressions`).
+Splines are tables with a polynomial per interval. Harmonics of torque ripple are powers of the phasor
+exp(i f q), with the frequency f per angle of the joint. The C code of an entry point, a function of the
+export, first calls functions that compute its residual terms (see `residual_expressions`).
 """
 
 from collections.abc import Mapping, Sequence

@@ -59,7 +59,10 @@ def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> 
 
 
 def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
-    """Return `function` with the states as its only inputs; its inputs for residual terms are computed from them."""
+    """Return a function with the inputs of the entry point only; `function` has residual terms as further inputs.
+
+    The returned function computes the residual terms from q and qd.
+    """
     needed = residuals_needed(function)
     if not needed:
         return function

@@ -1,4 +1,4 @@
-"""The argument of every exporter, a trained model with its arm; and the conversion of this model to plain numbers."""
+"""The argument of every exporter, a trained model with its arm; and the conversion of this model to NumPy arrays."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class Trained:
 
 
 def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
-    """Return a trained model as plain numbers. Raises RunError for a model without rigid bodies."""
+    """Return a trained model as a `TrainedModel` of NumPy arrays. Raises RunError for a model without rigid bodies."""
     # A copy in double precision on the CPU: the user's model may be in single precision or on a GPU.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
@@ -232,7 +232,10 @@ def _network(
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
-    """Return a spline per index of a joint, from weights (n, splines); joints with only zero weights have none."""
+    """Return the spline of each joint by the index of the joint; joints with only zero weights have none.
+
+    weights: (n, W), the W spline coefficients of each joint.
+    """
     splines = {}
     for joint in torch.nonzero(weights.any(dim=1)).flatten().tolist():
         # Three zero weights at each end make the curve and its first two derivatives zero at the ends.

@@ -1,4 +1,4 @@
-"""A trained model as plain numbers, for exporters of source code, and the entry points: the functions of an export."""
+"""A trained model as NumPy arrays, for exporters of source code, and the entry points: the functions of an export."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,10 @@ class SigmoidNetwork:
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Torque ripple of a joint [Nm]: sum over k = 1, 2, ... of cosines[k] cos(k frequency q) + sines[k] sin(...)."""
+    """Torque ripple of a joint [Nm]: a sum over k = 1, 2, ... at the position q of the joint.
+
+    The terms are cosines[k - 1] cos(k frequency q) + sines[k - 1] sin(k frequency q).
+    """
 
     joint: int
     frequency: float
@@ -60,7 +63,11 @@ class Residuals:
 
 
 def spline_energy(spline: BSpline) -> BSpline:
-    """Return the antiderivative of a torque spline whose values at both ends of the range have opposite signs."""
+    """Return the antiderivative [J] of a torque spline.
+
+    The constant of integration is the runtime's: at the two ends of the range, the antiderivative has values of equal
+    magnitude and opposite sign.
+    """
     energy = spline.antiderivative()
     count = len(energy.t) - energy.k - 1
     half = energy(spline.t[-4]) / 2

@@ -153,7 +153,7 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
     speed = ca.fabs(qd) / constants.stribeck_velocity
     rounding = constants.stribeck_rounding
     slow = 1 / (1 + (1 + rounding) / 8 * speed**2 / (speed + rounding))
-    for _ in range(3):  # three squares are the power of 8
+    for _ in range(3):  # squaring three times gives the eighth power
         slow = slow * slow
     dry = constants.coulomb + constants.load_dependence * load + constants.stribeck * slow
     viscous = constants.viscous * qd + constants.saturation * _smooth_sign(qd, constants.saturation_velocity)
@@ -202,9 +202,10 @@ def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
 
 
 def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Outputs:
-    """Return Jacobians, (n, n) each, of inverse dynamics (by q, qd) and forward dynamics (by q, qd, tau).
+    """Return the Jacobians, (n, n) each, of inverse and of forward dynamics.
 
-    Forward dynamics have dqdd/dx = -M^-1 dforce/dx at the computed qdd (Carpentier and Mansard, RSS
+    Inverse dynamics are differentiated with respect to q and qd, forward dynamics with respect to q, qd
+    and tau. For x = q or qd, dqdd/dx = -M^-1 dforce/dx at the computed qdd (Carpentier and Mansard, RSS
     2018).
     """
     expressions = _expressions(model, inputs, residuals, derivatives=True)

@@ -97,7 +97,7 @@ def _cross(a: Tensor, b: Tensor, *, dim: int) -> Tensor:
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Return matrix^-1 right, (..., n, columns), by Gauss-Jordan elimination without pivoting; matrix: definite."""
-    n = matrix.shape[-1]  # constant: tracing unrolls the loop
+    n = matrix.shape[-1]  # an int, so that tracing unrolls the loop over n
     identity = torch.eye(n, dtype=matrix.dtype)
     # Either of the matrix and the right-hand side may have no batch dimension.
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
@@ -190,5 +190,5 @@ def onnx_session(content: bytes) -> onnxruntime.InferenceSession:
     # One thread is used, since synchronising several takes longer than operations with small matrices.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # no warnings of unused inputs
+    options.log_severity_level = 3  # Only errors are printed, no warnings of unused inputs.
     return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])

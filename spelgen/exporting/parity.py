@@ -63,7 +63,7 @@ class Parity:
 def require_parity(differences: dict[str, float], tolerance: float, states: int) -> Parity:
     """Return the result of a comparison. Raises RunError if a relative difference is above the tolerance."""
     for name, difference in differences.items():
-        if not difference <= tolerance:  # also raised for NaN
+        if not difference <= tolerance:  # True for NaN, too
             raise RunError(
                 f"{name} differs from the model by {difference:.1e}",
                 element="parity check",

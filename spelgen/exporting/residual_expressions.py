@@ -82,7 +82,10 @@ def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
 
 
 def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
-    """Return pairs of a symbol that depends on q, as a column of any length, and the Jacobian with respect to q."""
+    """Return all symbols that depend on q with the Jacobians of the symbols with respect to q, in pairs.
+
+    A symbol is a column of any length l, its Jacobian a matrix (l, n).
+    """
     # One row per friction factor, which depends on the position of its own joint only.
     joints = np.eye(model.n)[list(model.residuals.friction)]
     # `second` is (m, n n): each block of n columns is the Jacobian of one column of `first`.

@@ -62,9 +62,9 @@ class RigidBodies:
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
         """Return M qdd + h of the bodies without armature, (n, 1) [Nm, N]; zeros of qd cause no operations."""
-        # The motion of the base and then of each body, in its own frame: angular velocity, angular
-        # acceleration, acceleration of the origin, and spin. Gravity is replaced by an upward acceleration of
-        # the base.
+        # `motions` has four quantities of the base and of each body, in the frame of the body: angular
+        # velocity w, angular acceleration, acceleration of the origin, and the matrix `spin` of the
+        # acceleration due to rotation (see below). Gravity is replaced by an upward acceleration of the base.
         gravity = np.array(self.arm.gravity, dtype=float)
         motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
         wrenches: list[Wrench] = []
@@ -81,7 +81,7 @@ class RigidBodies:
                 w = w + _Z * speed
                 rate = rate + _Z * added + turning
             else:
-                # The Coriolis acceleration is 2 w x v.
+                # The Coriolis acceleration is 2 w x v, with the velocity v along the prismatic joint.
                 acceleration = acceleration + _Z * added + 2 * turning
             # With this matrix, spin @ p is the acceleration of a point p of the body relative to the origin.
             spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
@@ -100,8 +100,8 @@ class RigidBodies:
     def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return the momentum M qd and d/dq of the kinetic energy, both without armature, (n, 1) each.
 
-        The momentum of all bodies that a joint carries is projected onto the joint axis S for M qd, and onto dS/dt =
-        twist x S for the gradient.
+        For M qd, the momentum of all bodies that a joint carries is projected onto the joint axis S. For the gradient,
+        the momentum is projected onto dS/dt = twist x S.
         """
         # The twist of the base and then of each body, in its own frame: angular velocity, and velocity of the
         # origin.

@@ -98,7 +98,7 @@ def _saved(program: torch.export.ExportedProgram) -> bytes:
     """Return the content of the .pt2 file of a program."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # shared memory, harmless for constants
+        warnings.simplefilter("ignore")  # torch warns of constants that share memory, which is harmless
         torch.export.save(program, buffer)
     return buffer.getvalue()
 
