@@ -30,7 +30,10 @@ def call(callee: str, *positional: object, **named: object) -> Call:
 
 
 def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
-    """Return ``start`` and ``value``, in one line if ``reserved`` more characters fit there, else in several lines."""
+    """Return ``start`` and ``value``, in one line if the line has room for ``reserved`` more characters.
+
+    Otherwise the text has several lines.
+    """
     text = start + flat(value)
     if indent + len(text) + reserved < WIDTH or not _items(value) or _alike(value):
         return text

@@ -152,7 +152,7 @@ def refit_terms(
 
     Args:
         model: model with residual terms.
-        samples: samples with the torque residual of the model and its current terms.
+        samples: samples with the torque residual of the model, whose current residual terms are included.
         projection: projection onto the rigid-body and friction model.
         selected: terms to refit.
         correlation_length: (n,) number of samples per independent error.

@@ -162,7 +162,7 @@ def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
     length = curvature.diagonal().sqrt()
     scale = torch.where(length > 0, 1 / length, 0.0)
     scale = scale * scale[:, None]
-    # Eigenvalues below the rounding errors of the sums of products are treated as zero.
+    # The curvature is a sum over samples: eigenvalues below the rounding errors of this sum are treated as zero.
     inverse: torch.Tensor = torch.linalg.pinv(curvature * scale, rtol=1e-10, hermitian=True)
     return inverse * scale
 

@@ -101,7 +101,7 @@ def select_networks(
 
     Args:
         model: model with residual terms; weights of accepted networks are written to it.
-        samples: samples with the torque residual of the model and its current terms.
+        samples: samples with the torque residual of the model, whose current residual terms are included.
         correlation_length: number of samples per independent error.
     """
     # The time of L-BFGS is proportional to the number of samples, and successive samples are correlated, so that a

@@ -85,7 +85,7 @@ def select_functions(
 
     Args:
         model: model with residual terms.
-        samples: samples with the torque residual of the model and its current terms.
+        samples: samples with the torque residual of the model, whose current residual terms are included.
         projection: projection onto the rigid-body and friction model.
         selected: terms that were selected before, which are no candidates.
         correlation_length: (n,) number of samples per independent error.
