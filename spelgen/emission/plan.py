@@ -92,7 +92,7 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
 def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
     """Return the nonzero entries of the input matrix G.
 
-    The result is empty if each input is the torque of one joint, or if G is a network.
+    The result is empty if each input is the torque of its own joint, or if a network gives G.
     """
     entries = actuation.entries
     if design.input != "derived" or (actuation.direct and len(entries) == actuation.joints):

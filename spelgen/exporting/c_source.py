@@ -41,7 +41,10 @@ _FORMS = {
 
 @dataclass(frozen=True)
 class CFunction:
-    """An entry point in C. shapes: (rows,) or (rows, columns) per output. operations: upper bound of the number of operations."""
+    """An entry point in C.
+
+    shapes: (rows,) or (rows, columns) per output. operations: upper bound of the number of operations.
+    """
 
     entry: EntryPoint
     symbol: str
