@@ -91,7 +91,10 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
 
 
 def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
-    """Return the nonzero entries of G; empty if each input is the torque of its own joint, or if a network gives G."""
+    """Return the nonzero entries of the input matrix G.
+
+    The result is empty if each input is the torque of its own joint, or if a network gives G.
+    """
     entries = actuation.entries
     if design.input != "derived" or (actuation.direct and len(entries) == actuation.joints):
         return ()
@@ -230,7 +233,8 @@ def _about_center(
     x, y, z = hx / m, hy / m, hz / m
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
     inertia = [value - m * square for value, square in zip(tensor, steiner, strict=True)]
-    # `_consistent` computes in floating point: entries as small as its rounding errors become zero.
+    # The given parameters have rounding errors, since `_consistent` computes in floating point. Entries of the size of
+    # these errors become zero.
     noise = max(map(abs, inertia)) / 10 ** (TUNING.inertia_digits + 3)
     inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]
     mass, cx, cy, cz, xx, xy, xz, yy, yz, zz = _significant([m, x, y, z, *inertia])

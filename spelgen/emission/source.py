@@ -77,7 +77,10 @@ def flat(value: object) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return a string literal with 32-bit escapes: JSON has none, and splits larger code points in two."""
+    """Return a string literal of ASCII characters, with Python's 32-bit escapes for all others.
+
+    JSON has only 16-bit escapes, and needs two of them for a larger code point.
+    """
     return '"' + "".join(rf"\U{ord(x):08x}" if not x.isascii() else json.dumps(x)[1:-1] for x in text) + '"'
 
 

@@ -193,7 +193,10 @@ def _evaluate_torques(
 def _results(
     tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces
 ) -> Results:
-    """Return the results of an evaluation, to which names of the arm, the joints and the logs are added."""
+    """Return the results of an evaluation with the names of the arm, the joints and the logs, and without errors.
+
+    The caller adds the errors.
+    """
     return Results(
         robot=tested.spec.robot if tested.spec else type(tested.model).__name__,
         joints=tuple(tested.joints),

@@ -160,13 +160,15 @@ def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str
         if operation == ca.OP_OUTPUT:
             output, index = writes
             rows, columns = shapes[output]
-            row_by_row = index % rows * columns + index // rows  # CasADi's order is column-major
+            row_by_row = (
+                index % rows * columns + index // rows
+            )  # index in the row-major C array, from CasADi's column-major index
             lines.append(f"{outputs[output]}[{row_by_row}] = a{reads[0]};")
             continue
         if operation == ca.OP_INPUT:
             value = f"{inputs[reads[0]]}[{reads[1]}]"
         elif operation == ca.OP_CONST:
-            value = f"R({function.instruction_constant(k)!r})"  # repr keeps all digits
+            value = f"R({function.instruction_constant(k)!r})"  # the C literal has all digits of the constant
         else:
             value = _FORMS[operation].format(*(f"a{slot}" for slot in reads))
         # The keys of a dict are unique and keep the order of the first assignments; a set would lose this

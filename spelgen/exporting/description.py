@@ -25,7 +25,10 @@ class SigmoidNetwork:
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Torque ripple of a joint [Nm]: sum over k = 1, 2, ... of cosines[k] cos(k frequency q) + sines[k] sin(...)."""
+    """Torque ripple of a joint [Nm]: a sum over k = 1, 2, ... at the position q of the joint.
+
+    The terms are cosines[k - 1] cos(k frequency q) + sines[k - 1] sin(k frequency q).
+    """
 
     joint: int
     frequency: float

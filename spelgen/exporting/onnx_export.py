@@ -193,5 +193,5 @@ def onnx_session(content: bytes) -> onnxruntime.InferenceSession:
     # One thread is used, since synchronising several takes longer than operations with small matrices.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # no warnings of unused inputs
+    options.log_severity_level = 3  # Only errors are printed, no warnings of unused inputs.
     return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])

@@ -69,7 +69,7 @@ def require_parity(differences: dict[str, float], tolerance: float, states: int)
     differences: largest relative difference per entry point.
     """
     for name, difference in differences.items():
-        if not difference <= tolerance:  # also raised for NaN
+        if not difference <= tolerance:  # True for NaN, too
             raise RunError(
                 f"{name} differs from the model by {difference:.1e}",
                 element="parity check",

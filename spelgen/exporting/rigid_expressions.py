@@ -81,7 +81,7 @@ class RigidBodies:
                 w = w + _Z * speed
                 rate = rate + _Z * added + turning
             else:
-                # The Coriolis acceleration is 2 w x v.
+                # The Coriolis acceleration is 2 w x v, with the velocity v along the prismatic joint.
                 acceleration = acceleration + _Z * added + 2 * turning
             # With this matrix, spin @ p is the acceleration of a point p of the body relative to the origin.
             spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
@@ -100,8 +100,8 @@ class RigidBodies:
     def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return the momentum M qd and d/dq of the kinetic energy, both without armature, (n, 1) each.
 
-        The momentum of all bodies that a joint carries is projected onto the joint axis S for M qd, and onto dS/dt =
-        twist x S for the gradient.
+        For M qd, the momentum of all bodies that a joint carries is projected onto the joint axis S. For the gradient,
+        the momentum is projected onto dS/dt = twist x S.
         """
         # The twist of the base and then of each body, in its own frame: angular velocity, and velocity of the
         # origin.

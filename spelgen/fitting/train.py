@@ -55,7 +55,7 @@ def train(
         if preprocessing is AUTOMATIC:
             preprocessing = record.preprocessing
         options = replace(options, mapping=options.mapping or record.mapping)
-        # `fit` loads the weights from the checkpoint
+        # The model is made with initial weights: `fit` loads the fitted weights from the checkpoint.
         model = run.untrained_model()
     else:
         model = load_module(module) if module is not None else fitted_model(RunFolder(source or folder))

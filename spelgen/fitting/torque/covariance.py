@@ -31,8 +31,8 @@ def parameter_covariance(estimate: TorqueEstimate) -> torch.Tensor:
     """
     problem, x, free = estimate.problem, estimate.state.x, estimate.problem.free
     model, samples = problem.jacobian.model, problem.jacobian.samples
-    # The noise is converted from the initial to the current motor gains: the Jacobians below are made from the fitted
-    # model, so that its current gains are their initial gains, and their factor `logged_scale` is 1.
+    # The noise belongs to torques at the initial motor gains. The Jacobians below are made from the fitted model and
+    # belong to torques at the fitted gains, so the noise is converted to the fitted gains.
     noise = problem.noise / problem.jacobian.logged_scale(x)
     # The jackknife needs independent blocks: shorter ones would be strongly correlated with their neighbours.
     blocks = max(1, min(BLOCKS, samples.count // MIN_BLOCK))
