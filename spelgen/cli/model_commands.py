@@ -1,5 +1,6 @@
 """Commands about models: `init`, `build`, `check`, `export`."""
 
+import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,7 @@ from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.design import PRESET_NAMES
 from spelgen.exporting.exported import Format
 from spelgen.files import write_text
+from spelgen.labels import UNITS
 
 
 def init(
@@ -25,7 +27,7 @@ def init(
 ) -> None:
     """Write a commented file of settings for an arm."""
     from spelgen.arm.arm import make_arm
-    from spelgen.settings.starter import StarterJoint, starter
+    from spelgen.templates import render
     from spelgen.urdf.read import read_urdf
 
     path = output or robot.with_suffix(".yaml")
@@ -33,8 +35,16 @@ def init(
     # The arm is made without a settings file, because this command writes it.
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
     # Damping and friction of the URDF are the initial values in the file, which the user edits.
-    drives = [StarterJoint(x.name, x.joint_type, x.damping, x.friction) for x in arm.coordinates]
-    say(f"wrote {write_text(path, starter(robot.name, drives, arm.bodies[-1].link))}")
+    text = render(
+        "settings.yaml.jinja",
+        urdf=robot.name,
+        joints=arm.coordinates,
+        names=arm.joint_names,
+        tip=arm.bodies[-1].link,
+        units=UNITS,
+        json=json.dumps,
+    )
+    say(f"wrote {write_text(path, text)}")
 
 
 def build(
