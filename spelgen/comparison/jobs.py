@@ -182,7 +182,8 @@ def run_job(job: Job) -> RunResult:
         errors = _errors(results)
     else:
         simulated = simulated_figures(trained, training, testing, job.inputs.truth)
-        errors = {"prediction loss, 1 s": {MODEL: simulated.prediction.loss}}
+        # The first loss ranks the models.
+        errors = {label: {MODEL: loss} for label, loss in list(simulated.losses.items())[:1]}
     result = RunResult(
         key=job.key, arm=job.arm, preset=job.preset, seed=job.seed, split=job.split, seconds=seconds,
         parameters=trained.parameters, errors=errors, simulated=simulated,
