@@ -76,8 +76,8 @@ def _text(
     format: str, inspection: Inspection, closed: Formulas | None, proof: Verification | None, urdf: Path
 ) -> str:
     """Return the text of the inspection in a format, with a line end. closed: closed-form formulas of M and V."""
-    if closed and format in ("latex", "sympy"):
-        return _formula_file(format, closed, proof)
+    if closed:  # SymPy is slow to import and needed for formulas only
+        from spelgen.certificate import formula_files
     if format == "html":
         from spelgen.render.arm_pages import inspection_page
 
@@ -85,30 +85,21 @@ def _text(
     if format == "json":
         data = inspection.to_dict()
         if closed:
-            from spelgen.certificate.formula_files import to_dict
-
-            data["formulas"] = to_dict(closed)
+            data["formulas"] = formula_files.to_dict(closed)
         if proof:
             data["verification"] = proof.to_dict()
         return json.dumps(data, indent=2) + "\n"
-    paragraphs = [] if proof is None else [proof.text()]
-    if closed is None:
-        return "\n\n".join([inspection.text(), *paragraphs]) + "\n"
-    from spelgen.certificate import formula_files
-
-    return "\n\n".join([formula_files.text(closed), *paragraphs]) + "\n"
-
-
-def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> str:
-    """Return the text of a file of formulas; print the proof and the names of omitted formulas to stderr."""
-    from spelgen.certificate import formula_files
-
-    names = [formula.name for formula in closed.unwritten]
-    if names:
-        note(f"too long to be written: {', '.join(names)}")
-    if proof:
-        note(proof.text())
-    return formula_files.latex(closed) if format == "latex" else formula_files.sympy_source(closed)
+    if closed and format in ("latex", "sympy"):
+        # The file contains formulas only: the proof and the names of omitted formulas are printed to stderr.
+        names = [formula.name for formula in closed.unwritten]
+        if names:
+            note(f"too long to be written: {', '.join(names)}")
+        if proof:
+            note(proof.text())
+        return formula_files.latex(closed) if format == "latex" else formula_files.sympy_source(closed)
+    paragraphs = [formula_files.text(closed) if closed else inspection.text()]
+    paragraphs += [proof.text()] if proof else []
+    return "\n\n".join(paragraphs) + "\n"
 
 
 def identify(

@@ -8,6 +8,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, NoReturn, get_args
@@ -34,28 +35,39 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an e
 def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
     """Return the command with an additional option --debug; exceptions of the command are reported by `fail`.
 
-    Usage errors (exit code 2) are unchanged, because typer raises them before the command runs.
+    An argument of the command that is a dataclass is replaced by one option per field. Usage errors (exit code 2) are
+    unchanged, because typer raises them before the command runs.
     """
+    groups: dict[str, type] = {}
+    options: list[inspect.Parameter] = []
+    # eval_str: annotations are strings, because of `from __future__ import annotations`.
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        if isinstance(parameter.annotation, type) and is_dataclass(parameter.annotation):
+            groups[name] = parameter.annotation
+            options += inspect.signature(parameter.annotation, eval_str=True).parameters.values()
+        else:
+            options.append(parameter)
+    options.append(inspect.Parameter("debug", parameter.KEYWORD_ONLY, default=False, annotation=Debug))
 
     @functools.wraps(command)
-    def run(*arguments: object, debug: bool = False, **options: object) -> None:
+    def run(*, debug: bool = False, **values: object) -> None:
         try:
-            command(*arguments, **{name: _local(value) for name, value in options.items()})
+            values = {name: _local(value) for name, value in values.items()}
+            for name, group in groups.items():
+                values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
+            command(**values)
             sys.stdout.flush()  # a closed pipe raises its error here and not at the exit of the interpreter
         except (typer.Exit, typer.Abort, typer.BadParameter):
             raise
         except BaseException as error:
             fail(error, debug=debug)
 
-    # eval_str: annotations are strings, because of `from __future__ import annotations`.
-    signature = inspect.signature(command, eval_str=True)
-    for parameter in signature.parameters.values():
-        _name_values(*get_args(parameter.annotation))
-    option = inspect.Parameter("debug", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Debug)
-    parameters = [*signature.parameters.values(), option]
+    for option in options:
+        _name_values(*get_args(option.annotation))
     # Typer reads the options from the signature and the annotations.
-    vars(run)["__signature__"] = signature.replace(parameters=parameters)
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    parameters = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    vars(run)["__signature__"] = inspect.Signature(parameters)
+    run.__annotations__ = {option.name: option.annotation for option in options}
     return run
 
 

@@ -128,6 +128,8 @@ def estimate(
     from spelgen.logs.read import read_logs
     from spelgen.render.estimate_page import write_estimate
 
+    path = output or Path(run) / "estimate.html"
+    options.choose_format(None, path, ["html"])
     fit = load_run(run)
     # A model without torques is an error, which is raised here before logs are read.
     torque_model(fit)
@@ -135,7 +137,7 @@ def estimate(
     joints = list(fit.model.joint_names)
     log_mapping = options.log_mapping(joints, mapping or fit.record.mapping, accept)
     results = replay(fit, read_logs(paths, joints, mapping=log_mapping), alarms)
-    page = write_estimate(fit, levels, results, output or Path(run) / "estimate.html")
+    page = write_estimate(fit, levels, results, path)
     record: dict[str, object] = {"run": str(run), "page": str(page)}
     record["supported_alarms_per_minute"] = rate = levels.supported_alarms
     record["logs"] = [result.to_dict() for result in results]
@@ -162,6 +164,8 @@ def report(
     """Write an HTML page about one run or several."""
     if robot is not None and len(runs) > 1:
         raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
+    if output is not None:
+        options.choose_format(None, output, ["html", "json"] if len(runs) == 1 else ["html"])
     from spelgen.evaluation.results import Results
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.render.report_page import write_report, write_runs

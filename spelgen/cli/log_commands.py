@@ -54,7 +54,6 @@ class MotionOptions:
         return vars(self) | {"acceleration": acceleration, "start": options.numbers(self.start, "--from")}
 
 
-@options.grouped
 def excite(
     robot: options.Robot,
     output: Annotated[Path, output_option("FILE.csv", "Output file of the motion.")],

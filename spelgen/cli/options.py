@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import csv
-import inspect
 import re
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import fields, is_dataclass
-from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 from typer.models import ArgumentInfo, OptionInfo
@@ -53,7 +50,9 @@ def output_option(metavar: str, text: str) -> OptionInfo:
     return option(metavar, text, "-o", "--output")
 
 
-SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
+SUFFIXES = {"": "text", ".txt": "text", ".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex"}
+SUFFIXES |= {".py": "sympy"}
+"""Suffix of an output file -> format of its content; a name without a suffix means text."""
 
 Robot = Annotated[
     Path, argument("ROBOT.urdf", "URDF of the arm; settings are read from ROBOT.yaml beside it.")
@@ -101,44 +100,23 @@ def result_format() -> OptionInfo:
 
 
 def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
-    """Return the format of a result: `format`, else the format for the suffix of the output file, else text."""
-    # A suffix without a format of this command is no error: users may choose any file name.
-    by_suffix = SUFFIXES.get(output.suffix.lower(), "text") if output else "text"
-    return format or (by_suffix if by_suffix in formats else "text")
+    """Return the format of a result: `format`, else the format for the suffix of the output file, else text.
+
+    formats: formats of the command. Raises a usage error for a suffix of another format.
+    """
+    if format or output is None:
+        return format or "text"
+    suffixes = {suffix: name for suffix, name in SUFFIXES.items() if name in formats}
+    if output.suffix.lower() not in suffixes:
+        forms = ", ".join(filter(None, suffixes))
+        message = f"{output.name!r} has no suffix of a format of this command: {forms}"
+        raise typer.BadParameter(message, param_hint="'--output'")
+    return suffixes[output.suffix.lower()]
 
 
 def write_result(format: str | None, output: Path | None, forms: Mapping[str, Callable[[], str]]) -> None:
     """Print a result, or write it to a file. forms: format -> function that returns the text of the result."""
     deliver(forms[choose_format(format, output, forms)]() + "\n", output)
-
-
-def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command in which an argument that is a dataclass is replaced by one option per field."""
-    parameters: list[inspect.Parameter] = []
-    groups: dict[str, type] = {}
-    declared = get_type_hints(command, include_extras=True)
-    for name, parameter in inspect.signature(command).parameters.items():
-        group = declared[name]
-        if not (isinstance(group, type) and is_dataclass(group)):
-            parameters.append(parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=group))
-            continue
-        groups[name], options = group, get_type_hints(group, include_extras=True)
-        for field in fields(group):
-            annotation, default = options[field.name], field.default
-            parameters.append(
-                inspect.Parameter(field.name, parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-            )
-
-    @wraps(command)
-    def run(**values: object) -> None:
-        for name, group in groups.items():
-            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
-        command(**values)
-
-    # Typer reads the options from the signature and the annotations.
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    vars(run)["__signature__"] = inspect.Signature(parameters)
-    return run
 
 
 def names(text: str | None) -> list[str] | None:

@@ -15,7 +15,7 @@ from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, new_run, read_assignments, resumed_run
-from spelgen.errors import LogError, ModuleError, OptionError
+from spelgen.errors import LogError, ModuleError, OptionError, RunError
 from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, TorqueFit, WindowConfig
 
@@ -211,7 +211,11 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
     if resume and module is not None and module.is_dir():
         return module
     name = f"{(source or Path()).resolve().name}_adapted" if module is None else module.stem
-    return Path("runs") / name
+    folder = Path("runs") / name
+    if resume and module is not None and not folder.is_dir():
+        got = f"no run: {module} is no folder, and there is no {folder}, the default folder of this module"
+        raise RunError(got, element="--resume", do="name the run folder, or pass it by -o")
+    return folder
 
 
 def _specification(module: Path | None, source: Path | None, resumed: Path | None) -> ModelSpec:

@@ -8,7 +8,7 @@ from math import nan, pi
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from spelgen.arm.arm import Chain
 from spelgen.errors import ArmError, SpelgenError, collect
@@ -107,6 +107,13 @@ class Surroundings(Group):
     floor: Number | None = None
     boxes: dict[str, Box] = Field(default_factory=dict)
     clearance: Positive = 0.01
+
+    @field_validator("boxes", mode="before")
+    @classmethod
+    def _by_name(cls, boxes: object) -> object:
+        if isinstance(boxes, list):
+            raise ValueError("boxes by name, as in {table: {size: [1, 1, 0.1], xyz: [0, 0, -0.05]}}")
+        return boxes
 
 
 def read_surroundings(path: Path) -> Surroundings:

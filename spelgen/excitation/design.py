@@ -66,8 +66,7 @@ def excite(
         seed: seed of the random motions.
         progress: function that is called with the number of finished trials and the number of all trials.
 
-    Raises SettingsError for an invalid value, ArmError for a joint whose limits are not increasing and if no motion
-    without a contact was found.
+    Raises SettingsError for an invalid value, ArmError for a joint without a range and if all motions had a contact.
     """
     harmonics = _checked_harmonics(duration, sample_rate, harmonics, reach, speed)
     ranges = arm.robot.joint, arm.settings.simulation.positions

@@ -221,7 +221,15 @@ def load_mapping(path: Path | str, joints: Collection[str]) -> LogMapping:
     Raises SettingsError as `load_settings` does, also for joints that are not among `joints`.
     """
     document = read_document(Path(path))
-    mapping = validated(LogMapping, document.value(), document)
+    content = document.value()
+    groups = Settings.model_fields.keys() - LogMapping.model_fields
+    if isinstance(content, dict) and "logs" in content and content.keys() <= groups | {"joints"}:
+        raise SettingsError(
+            "settings of a robot", file=document.path, line=document.line(("logs",)),
+            expected="the keys of a mapping, as in the group logs of these settings",
+            do="write these keys into a file of their own; without --mapping, the settings beside the URDF are used",
+        )  # fmt: skip
+    mapping = validated(LogMapping, content, document)
     _require_joints(((("joints", name), name) for name in mapping.joints), joints, document)
     return mapping
 
