@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, deliver, note, refuse_warnings
 from spelgen.cli.options import flag, option
+from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
     from spelgen.certificate.formulas import Formulas
@@ -27,21 +28,17 @@ FRICTION_HELP = (
 
 
 def inspect(
-    robot: options.Robot,
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    assume: options.Assumption = "kinematics",
-    angle_tolerance: options.AngleTolerance = 2e-3,
-    formulas: Annotated[
-        bool, flag("--formulas", "Write M and V as expressions in q and base parameters.")
-    ] = False,
-    entry: options.Entry = None,
-    format: Annotated[InspectionFormat | None, options.result_format()] = None,
-    output: options.Output = None,
-    strict: options.Strict = False,
-    verify: Annotated[
-        bool, flag("--verify", "Verify the structure by Pinocchio, SymPy and numeric samples.")
-    ] = False,
+    robot: Path = options.ROBOT,
+    joints: str | None = options.JOINTS,
+    tip: str | None = options.TIP,
+    assume: Assume = options.ASSUMPTION,
+    angle_tolerance: float = options.ANGLE_TOLERANCE,
+    formulas: bool = flag("--formulas", "Write M and V as expressions in q and base parameters."),
+    entry: str | None = options.ENTRY,
+    format: InspectionFormat | None = options.result_format(),
+    output: Path | None = options.OUTPUT,
+    strict: bool = options.STRICT,
+    verify: bool = flag("--verify", "Verify the structure by Pinocchio, SymPy and numeric samples."),
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
     chosen_entry = options.entry(entry)
@@ -103,22 +100,21 @@ def _text(
 
 
 def identify(
-    robot: options.Robot,
-    extra_logs: options.MoreData = None,
-    data: options.Data = None,
-    mapping: options.MappingFile = None,
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    angle_tolerance: options.AngleTolerance = 2e-3,
-    filter: options.Filter = None,
-    weights: Annotated[
-        Literal["equal", "range", "noise"],
-        option("", "Weights of the joints: equal, by torque range, or by torque noise."),
-    ] = "noise",
-    friction: Annotated[str | None, option(",".join(EFFECTS), FRICTION_HELP)] = None,
-    accept: options.Accept = None,
-    format: Annotated[IdentificationFormat | None, options.result_format()] = None,
-    output: options.Output = None,
+    robot: Path = options.ROBOT,
+    extra_logs: list[Path] | None = options.MORE_DATA,
+    data: list[Path] | None = options.DATA,
+    mapping: Path | None = options.MAPPING_FILE,
+    joints: str | None = options.JOINTS,
+    tip: str | None = options.TIP,
+    angle_tolerance: float = options.ANGLE_TOLERANCE,
+    filter: float | None = options.FILTER,
+    weights: Literal["equal", "range", "noise"] = option(
+        "", "Weights of the joints: equal, by torque range, or by torque noise.", default="noise"
+    ),
+    friction: str | None = option(",".join(EFFECTS), FRICTION_HELP),
+    accept: list[str] | None = options.ACCEPT,
+    format: IdentificationFormat | None = options.result_format(),
+    output: Path | None = options.OUTPUT,
 ) -> None:
     """Identify base parameters and friction by least squares."""
     paths = options.logs(data, extra_logs)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, NoReturn, get_args
+from typing import NoReturn, get_args
 
 import typer
 from typer.models import OptionInfo
@@ -29,7 +29,7 @@ BROKEN_PIPE = 141  # exit code of shells: 128 + SIGPIPE
 EXTRAS = {"pinocchio": "simulate", "ray": "parallel"}
 EXTRAS |= dict.fromkeys(("casadi", "mujoco", "onnxruntime", "onnxscript", "safetensors"), "deploy")
 
-Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+DEBUG = typer.Option(False, "--debug", help="Show the traceback of an error.")
 
 
 def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
@@ -47,7 +47,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
             options += inspect.signature(parameter.annotation, eval_str=True).parameters.values()
         else:
             options.append(parameter)
-    options.append(inspect.Parameter("debug", parameter.KEYWORD_ONLY, default=False, annotation=Debug))
+    options.append(inspect.Parameter("debug", parameter.KEYWORD_ONLY, default=DEBUG, annotation=bool))
 
     @functools.wraps(command)
     def run(*, debug: bool = False, **values: object) -> None:
@@ -63,7 +63,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
             fail(error, debug=debug)
 
     for option in options:
-        _name_values(*get_args(option.annotation))
+        _name_values(option.annotation, option.default)
     # Typer reads the options from the signature and the annotations.
     parameters = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
     vars(run)["__signature__"] = inspect.Signature(parameters)
@@ -71,12 +71,11 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _name_values(annotation: object, *metadata: object) -> None:
+def _name_values(annotation: object, info: object) -> None:
     """Set the placeholder that the help shows for the value of an option: N, X, FILE, or the choices."""
     value_type = get_args(annotation)[0] if NoneType in get_args(annotation) else annotation
-    for info in metadata:
-        if isinstance(info, OptionInfo) and info.metavar is None and value_type is not bool:
-            info.metavar = METAVARS.get(value_type) or "|".join(map(str, get_args(value_type)))
+    if isinstance(info, OptionInfo) and info.metavar is None and value_type is not bool:
+        info.metavar = METAVARS.get(value_type) or "|".join(map(str, get_args(value_type)))
 
 
 def _local(value: object) -> object:

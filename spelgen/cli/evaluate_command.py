@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -26,18 +26,16 @@ LIMIT_HELP = f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMI
 
 
 def evaluate(
-    run: options.Run,
-    extra_logs: options.MoreData = None,
-    data: options.Data = None,
-    mapping: options.MappingFile = None,
-    filter: options.Filter = None,
-    format: Annotated[Format | None, options.result_format()] = None,
-    output: options.Output = None,
-    limit: Annotated[list[str] | None, option("FIGURE=MAX", LIMIT_HELP)] = None,
-    truth: Annotated[
-        Path | None, option("URDF", "The true arm of simulated logs: state the error of M(q).")
-    ] = None,
-    quick: Annotated[bool, flag("--quick", "Torque errors only, without rollouts.")] = False,
+    run: Path = options.RUN,
+    extra_logs: list[Path] | None = options.MORE_DATA,
+    data: list[Path] | None = options.DATA,
+    mapping: Path | None = options.MAPPING_FILE,
+    filter: float | None = options.FILTER,
+    format: Format | None = options.result_format(),
+    output: Path | None = options.OUTPUT,
+    limit: list[str] | None = option("FIGURE=MAX", LIMIT_HELP),
+    truth: Path | None = option("URDF", "The true arm of simulated logs: state the error of M(q)."),
+    quick: bool = flag("--quick", "Torque errors only, without rollouts."),
 ) -> None:
     """Evaluate a trained run and its baselines on test logs.
 
@@ -101,18 +99,14 @@ def _limit(text: str) -> tuple[str, float]:
 
 
 def estimate(
-    run: options.Run,
-    extra_logs: options.MoreData = None,
-    data: options.Data = None,
-    mapping: options.MappingFile = None,
-    accept: options.Accept = None,
-    alarms: Annotated[
-        float | None, option("RATE", "False alarms of contact per minute; default: 1.", min=1e-6)
-    ] = None,
-    output: Annotated[
-        Path | None, output_option("FILE", "HTML page; default: estimate.html in the run folder.")
-    ] = None,
-    format: options.TextOrJson = "text",
+    run: Path = options.RUN,
+    extra_logs: list[Path] | None = options.MORE_DATA,
+    data: list[Path] | None = options.DATA,
+    mapping: Path | None = options.MAPPING_FILE,
+    accept: list[str] | None = options.ACCEPT,
+    alarms: float | None = option("RATE", "False alarms of contact per minute; default: 1.", min=1e-6),
+    output: Path | None = output_option("FILE", "HTML page; default: estimate.html in the run folder."),
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Run the estimator along logs: payload, contacts, friction drift.
 
@@ -149,17 +143,12 @@ def estimate(
 
 
 def report(
-    runs: Annotated[list[Path], argument("RUN", "Run folders; several are compared on one page.")],
-    output: Annotated[
-        Path | None,
-        output_option(
-            "FILE",
-            "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
-        ),
-    ] = None,
-    robot: Annotated[
-        Path | None, option("ROBOT.urdf", "URDF with its meshes, for the picture of the arm.")
-    ] = None,
+    runs: list[Path] = argument("RUN", "Run folders; several are compared on one page."),
+    output: Path | None = output_option(
+        "FILE",
+        "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
+    ),
+    robot: Path | None = option("ROBOT.urdf", "URDF with its meshes, for the picture of the arm."),
 ) -> None:
     """Write an HTML page about one run or several."""
     if robot is not None and len(runs) > 1:
@@ -182,41 +171,25 @@ def report(
     say(f"wrote {path}: the report, for any browser" if path.suffix == ".html" else f"wrote {path}")
 
 
-Jobs = Annotated[
-    int | None,
-    option(
+def compare(
+    target: Path = argument("TARGET", "URDF of an arm, or YAML file that lists arms and their logs."),
+    extra_logs: list[Path] | None = options.MORE_DATA,
+    data: list[Path] | None = options.DATA,
+    mapping: Path | None = options.MAPPING_FILE,
+    output: Path | None = output_option("FOLDER", "Output folder; default: comparisons/TARGET."),
+    presets: str | None = option(
+        "A,B,C", "Presets or YAML files of designs; default: closed-form,hybrid on logs, else all presets."
+    ),
+    seeds: int | None = option("", "Number of runs of each preset.", min=1),
+    splits: int | None = option("", "Folds of a cross-validation over trajectories; default: 1.", min=1),
+    steps: int | None = option("", "Training steps of each run on a simulated arm.", min=1),
+    ablation: bool = flag(
+        "--ablation", "Compare designs from phnode to hybrid that differ by one change each."
+    ),
+    jobs: int | None = option(
         "", "Number of parallel runs, one core each, by Ray; default: all cores if Ray is installed.", min=1
     ),
-]
-
-
-def compare(
-    target: Annotated[
-        Path, argument("TARGET", "URDF of an arm, or YAML file that lists arms and their logs.")
-    ],
-    extra_logs: options.MoreData = None,
-    data: options.Data = None,
-    mapping: options.MappingFile = None,
-    output: Annotated[
-        Path | None, output_option("FOLDER", "Output folder; default: comparisons/TARGET.")
-    ] = None,
-    presets: Annotated[
-        str | None,
-        option(
-            "A,B,C",
-            "Presets or YAML files of designs; default: closed-form,hybrid on logs, else all presets.",
-        ),
-    ] = None,
-    seeds: Annotated[int | None, option("", "Number of runs of each preset.", min=1)] = None,
-    splits: Annotated[
-        int | None, option("", "Folds of a cross-validation over trajectories; default: 1.", min=1)
-    ] = None,
-    steps: Annotated[int | None, option("", "Training steps of each run on a simulated arm.", min=1)] = None,
-    ablation: Annotated[
-        bool, flag("--ablation", "Compare designs from phnode to hybrid that differ by one change each.")
-    ] = False,
-    jobs: Jobs = None,
-    address: options.Address = None,
+    address: str | None = options.ADDRESS,
 ) -> None:
     """Train presets on the same logs and rank them.
 

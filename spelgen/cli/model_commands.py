@@ -3,7 +3,6 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -14,16 +13,15 @@ from spelgen.design import PRESET_NAMES
 from spelgen.exporting.exported import Format
 from spelgen.files import write_text
 from spelgen.labels import UNITS
+from spelgen.urdf.robot import Assume
 
 
 def init(
-    robot: options.Robot,
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    output: Annotated[
-        Path | None, output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF.")
-    ] = None,
-    force: options.Force = False,
+    robot: Path = options.ROBOT,
+    joints: str | None = options.JOINTS,
+    tip: str | None = options.TIP,
+    output: Path | None = output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF."),
+    force: bool = options.FORCE,
 ) -> None:
     """Write a commented file of settings for an arm."""
     from spelgen.arm.arm import make_arm
@@ -48,24 +46,20 @@ def init(
 
 
 def build(
-    robot: options.Robot,
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    assume: options.Assumption = "kinematics",
-    angle_tolerance: options.AngleTolerance = 2e-3,
-    preset: Annotated[
-        str, option("NAME|FILE.yaml", f"Preset of the model: {', '.join(PRESET_NAMES)}, or a YAML file.")
-    ] = "hybrid",
-    width: Annotated[int, option("", "Hidden units per layer.", min=1, max=4096)] = 64,
-    depth: Annotated[int, option("", "Number of hidden layers.", min=1, max=16)] = 2,
-    standalone: Annotated[
-        bool, flag("--standalone", "Include the runtime: the module then needs PyTorch only.")
-    ] = False,
-    output: Annotated[
-        Path | None, output_option("MODULE.py", "Output file; default: <robot>_spel.py in this folder.")
-    ] = None,
-    force: options.Force = False,
-    format: options.TextOrJson = "text",
+    robot: Path = options.ROBOT,
+    joints: str | None = options.JOINTS,
+    tip: str | None = options.TIP,
+    assume: Assume = options.ASSUMPTION,
+    angle_tolerance: float = options.ANGLE_TOLERANCE,
+    preset: str = option(
+        "NAME|FILE.yaml", f"Preset of the model: {', '.join(PRESET_NAMES)}, or a YAML file.", default="hybrid"
+    ),
+    width: int = option("", "Hidden units per layer.", min=1, max=4096, default=64),
+    depth: int = option("", "Number of hidden layers.", min=1, max=16, default=2),
+    standalone: bool = flag("--standalone", "Include the runtime: the module then needs PyTorch only."),
+    output: Path | None = output_option("MODULE.py", "Output file; default: <robot>_spel.py in this folder."),
+    force: bool = options.FORCE,
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
     # The preset is checked before the URDF is read, which takes time.
@@ -91,7 +85,7 @@ def build(
     answer(format, record, line)
 
 
-def check(module: options.Module, robot: options.RobotOption = None) -> None:
+def check(module: Path = options.MODULE, robot: Path | None = options.ROBOT_OPTION) -> None:
     """Check whether a module is up to date with its URDF."""
     from spelgen.certificate.module_check import check as check_module
 
@@ -106,23 +100,16 @@ def check(module: options.Module, robot: options.RobotOption = None) -> None:
 
 
 def export(
-    run: Annotated[Path, argument("RUN", "A folder that `spelgen train` wrote.")],
-    output: Annotated[Path, output_option("FILE|FOLDER", "Output file or folder.")],
-    to: Annotated[
-        Format | None, option("", "Export format. Default: by the extension of the output.")
-    ] = None,
-    entry: Annotated[
-        list[str] | None,
-        option(
-            "NAME",
-            "A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
-        ),
-    ] = None,
-    float32: Annotated[
-        bool, flag("--float32", "Numbers of onnx and torch programs; otherwise float64.")
-    ] = False,
-    force: options.Force = False,
-    format: options.TextOrJson = "text",
+    run: Path = argument("RUN", "A folder that `spelgen train` wrote."),
+    output: Path = output_option("FILE|FOLDER", "Output file or folder.", default=...),
+    to: Format | None = option("", "Export format. Default: by the extension of the output."),
+    entry: list[str] | None = option(
+        "NAME",
+        "A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
+    ),
+    float32: bool = flag("--float32", "Numbers of onnx and torch programs; otherwise float64."),
+    force: bool = options.FORCE,
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Export a trained model to other tools. Each export is compared with the model before it is written.
 

@@ -7,7 +7,7 @@ import math
 import textwrap
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -25,36 +25,26 @@ if TYPE_CHECKING:
     from spelgen.spec import ModelSpec
 
 
-TrainModule = Annotated[
-    Path | None, argument("MODULE.py", "Module of `spelgen build`; with --resume, a run folder.")
-]
-NewRun = Annotated[Path | None, output_option("RUN", "Run folder; default: runs/<module>.")]
-Resume = Annotated[bool, flag("--resume", "Resume the run in the run folder.")]
-Source = Annotated[Path | None, option("RUN", "Adapt the model of this run; replaces MODULE.", "--from")]
-ObjectiveName = Annotated[
-    Objective | None,
-    option("", "Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."),
-]
-Assignments = Annotated[
-    list[str] | None,
-    option("KEY=VALUE", "Set an option of the fit, e.g. epochs=50; repeat it for more options.", "--set"),
-]
-
-
 def train(
-    module: TrainModule = None,
-    extra_logs: options.MoreData = None,
-    data: options.Data = None,
-    output: NewRun = None,
-    robot: options.RobotOption = None,
-    mapping: options.MappingFile = None,
-    resume: Resume = False,
-    force: options.Force = False,
-    source: Source = None,
-    objective: ObjectiveName = None,
-    assignments: Assignments = None,
-    accept: options.Accept = None,
-    format: options.TextOrJson = "text",
+    module: Path | None = argument(
+        "MODULE.py", "Module of `spelgen build`; with --resume, a run folder.", default=None
+    ),
+    extra_logs: list[Path] | None = options.MORE_DATA,
+    data: list[Path] | None = options.DATA,
+    output: Path | None = output_option("RUN", "Run folder; default: runs/<module>."),
+    robot: Path | None = options.ROBOT_OPTION,
+    mapping: Path | None = options.MAPPING_FILE,
+    resume: bool = flag("--resume", "Resume the run in the run folder."),
+    force: bool = options.FORCE,
+    source: Path | None = option("RUN", "Adapt the model of this run; replaces MODULE.", "--from"),
+    objective: Objective | None = option(
+        "", "Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."
+    ),
+    assignments: list[str] | None = option(
+        "KEY=VALUE", "Set an option of the fit, e.g. epochs=50; repeat it for more options.", "--set"
+    ),
+    accept: list[str] | None = options.ACCEPT,
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Fit a module to logs.
 
