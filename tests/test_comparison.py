@@ -39,7 +39,6 @@ from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison
 from spelgen.simulation.simulate import simulate
-from spelgen.tasks import run_here, workers
 from spelgen.urdf.read import read_urdf
 
 PRESETS = ("phnode", "hybrid")
@@ -87,7 +86,7 @@ def notes():
 def study(robot, quick, notes, tmp_path_factory):
     prepared = prepare_study(simulated(robot), tmp_path_factory.mktemp("study"))
     notes.append(prepared.announcement(1))
-    return run_study(prepared, run_here, notes.append)
+    return run_study(prepared, notes.append)
 
 
 @pytest.fixture
@@ -192,7 +191,7 @@ def test_only_the_run_without_a_result_is_run_again_and_gives_the_same_figures(s
     lost.unlink()
     again = prepare_study(simulated(robot), study.folder)
     assert list(again.results) == [study.jobs[1].name]
-    run_study(again, run_here, silent)
+    run_study(again, silent)
     assert kept.stat().st_mtime_ns == before[1]
     first, second = (json.loads(x) for x in (before[0], lost.read_text()))
     for result in (first, second):
@@ -359,8 +358,8 @@ def listed_arms(robots, logs, tmp_path, short_epochs):
     return loaded
 
 
-def compared(comparison, folder, run_tasks=run_here):
-    return run_study(prepare_study(comparison, folder), run_tasks, silent)
+def compared(comparison, folder, jobs=1):
+    return run_study(prepare_study(comparison, folder), silent, jobs)
 
 
 def kill_two(folder: Path, killed: list[int]) -> None:
@@ -388,8 +387,7 @@ def test_runs_of_killed_workers_are_resumed_and_end_with_the_same_weights(listed
     comparison = listed_arms(training={"epochs": 12, "patience": 12, "momentum_steps": 0})
     killer = threading.Thread(target=kill_two, args=(folder, killed))
     killer.start()
-    with workers(2) as run_tasks:
-        study = compared(comparison, folder, run_tasks)
+    study = compared(comparison, folder, jobs=2)
     killer.join()
     assert len(set(killed)) == 2
     assert sorted(result.arm for result in study.results.values()) == ["a", "b"]

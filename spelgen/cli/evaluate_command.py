@@ -201,7 +201,7 @@ def compare(
     from spelgen.comparison.tables import arm_sections
     from spelgen.fitting.process import locked, termination_as_interrupt
     from spelgen.render.comparison_page import write_comparison
-    from spelgen.tasks import default_jobs, workers
+    from spelgen.tasks import default_jobs
 
     if ablation and presets is not None:
         raise UsageError("--ablation: names the presets itself, omit --presets")
@@ -225,8 +225,7 @@ def compare(
             study = prepare_study(comparison, folder, progress)
         note(study.announcement(parallel))
         # Inputs are written before the workers start, so that all workers read the same files.
-        with workers(parallel, address) as run_tasks:
-            study = run_study(study, run_tasks, note)
+        study = run_study(study, note, parallel, address)
         sections = arm_sections(study)
         # Tables are printed in addition to the page, which cannot be shown in a terminal.
         for section in sections:

@@ -19,7 +19,7 @@ from spelgen.files import write_json
 from spelgen.labels import MODEL, counted
 from spelgen.listing import number
 from spelgen.settings.settings import load_settings
-from spelgen.tasks import RunTasks
+from spelgen.tasks import run_tasks
 
 PRESETS_ON_LOGS: tuple[str, ...] = ("closed-form", "hybrid")
 # The models of the paper (Wang et al., Sci Rep 15:33179, 2025) are first.
@@ -97,16 +97,16 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     return Study(folder, tuple(jobs), results, failures, estimates)
 
 
-def run_study(study: Study, run_tasks: RunTasks, note: Callable[[str], None]) -> Study:
+def run_study(study: Study, note: Callable[[str], None], jobs: int = 1, address: str | None = None) -> Study:
     """Run the unfinished jobs, write comparison.json and return the study with all results.
 
     A run with an error becomes a failure of the study; the same command runs it again. note: function called with a
-    line of text after each run.
+    line of text after each run. jobs, address: see `run_tasks`.
     """
     waiting = [job for job in study.jobs if job.name in study.estimates]
     results, failures = dict(study.results), dict(study.failures)
     start, done, total = time.monotonic(), 0.0, sum(study.estimates.values())
-    for count, (job, outcome) in enumerate(run_tasks(run_job, waiting), start=1):
+    for count, (job, outcome) in enumerate(run_tasks(run_job, waiting, jobs, address), start=1):
         # Progress is measured in estimated seconds and not in runs, because presets differ in cost.
         done += study.estimates[job.name]
         if isinstance(outcome, Exception):
