@@ -14,14 +14,17 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import argument, flag, option, output_option
-from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, new_run, read_assignments, resumed_run
+from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, fit_options, read_assignments
 from spelgen.errors import LogError, ModuleError, OptionError, RunError
 from spelgen.labels import counted
-from spelgen.settings.fits import Objective, Rollout, TorqueFit, WindowConfig
+from spelgen.settings.fits import OWNERS, Objective, Rollout, TorqueFit, WindowConfig
+from spelgen.settings.settings import load_settings
+from spelgen.settings.training import OF_LOGS, TrainingSettings
 
 if TYPE_CHECKING:
     from spelgen.fitting.fitted import Fit
     from spelgen.live.payload import Payload
+    from spelgen.settings.log_mapping import LogMapping
     from spelgen.spec import ModelSpec
 
 
@@ -53,14 +56,14 @@ def train(
     """
     start_time = time.monotonic()  # max_minutes includes the time to read the logs
     # Keys are checked before any file is read, so that a misspelt key costs no time.
-    request, recorded = Request(objective, read_assignments(assignments or [])), None
+    request = Request(objective, read_assignments(assignments or []))
     if source is not None:
         from spelgen.fitting.run_folder import RunFolder
 
         if module is not None:
             extra_logs = [module, *(extra_logs or [])]  # with --from, all arguments are logs
         run = RunFolder(source)
-        recorded = run.read_record().mapping  # raises an error if the folder is not a run
+        run.read_record()  # raises an error if the folder is not a run
         robot = robot or (run.urdf if run.urdf.exists() else None)
         request = _warm_start(request)
     elif "adapt" in request.values:
@@ -70,35 +73,37 @@ def train(
     paths = options.logs(data, extra_logs)
     # With --resume the first argument may be the run folder instead of a module.
     folder = output or _default_folder(module, source, resume=resume)
-    spec = _specification(module, source, folder if resume else None)
+    recorded = folder if resume else source
+    spec = _specification(module, recorded)
     # A resumed run uses the settings in its record, since the settings file of the robot may have changed.
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
-    start = resumed_run(folder, request) if resume else new_run(urdf, request)
+    settings = TrainingSettings() if urdf is None else load_settings(urdf).training
     from spelgen.emission.specify import arm_of_spec
     from spelgen.log_checks.check_logs import require_sound_logs
 
     # The arm is needed to check logs, and for a mapping that contains all joints of the URDF.
     arm = None if urdf is None else arm_of_spec(spec, urdf)
-    log_mapping = options.log_mapping(arm or spec.joint_names, mapping or start.mapping or recorded, accept)
+    log_mapping = options.log_mapping(arm or spec.joint_names, mapping or _recorded_mapping(recorded), accept)
     # Torch is imported after the checks above, so that their errors are reported without delay.
-    from spelgen.fitting.fit import RunOptions
+    from spelgen.fitting.fit import FitOptions, RunOptions
     from spelgen.fitting.train import train as train_files
-    from spelgen.logs.preprocessing import Preprocessing
 
     # Device and threads are not recorded, because they describe the machine and not the result.
     machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
+    chosen = (
+        FitOptions(request.objective, request.values_of(OWNERS)) if resume else fit_options(request, settings)
+    )
+    of_logs = {} if resume else settings.model_dump(include=OF_LOGS, exclude_none=True)
     try:
         fit = train_files(
             module,
             paths,
             folder,
-            start.options,
+            chosen,
             urdf=urdf,
             source=source,
-            preprocessing=Preprocessing(**start.settings.preprocessing),
-            validation=start.settings.validation_fraction,
-            seed=start.settings.seed,
+            of_logs=of_logs | request.values_of(OF_LOGS),
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
@@ -208,15 +213,21 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
     return folder
 
 
-def _specification(module: Path | None, source: Path | None, resumed: Path | None) -> ModelSpec:
-    """Return the specification of the model, from the module or from the run that is resumed or adapted."""
+def _specification(module: Path | None, run: Path | None) -> ModelSpec:
+    """Return the specification of the model, from the run that is resumed or adapted, else from the module."""
     from spelgen.emission.text import read_spec
     from spelgen.fitting.run_folder import RunFolder
 
-    folder = resumed or source
-    if folder is None and module is not None:
+    if run is None and module is not None:
         return read_spec(module)
-    return RunFolder(folder or Path()).read_spec()
+    return RunFolder(run or Path()).read_spec()
+
+
+def _recorded_mapping(run: Path | None) -> LogMapping | None:
+    """Return the mapping of the logs of the run that is resumed or adapted; None for a new run."""
+    from spelgen.fitting.run_folder import RunFolder
+
+    return None if run is None else RunFolder(run).read_record().mapping
 
 
 def _unchanged_urdf(module: Path, spec: ModelSpec) -> Path | None:

@@ -9,6 +9,8 @@ from spelgen.settings.log_mapping import LONGEST_DELAY
 from spelgen.settings.values import Count, Group, NonNegative, Number, Positive, Whole
 
 PREPROCESSING = {"cutoff", "decimation", "gap", "torque_delay"}
+OF_LOGS = PREPROCESSING | {"validation_fraction", "seed"}
+"""Keys about the logs; the other keys are options of fits."""
 
 
 class TrainingSettings(Group):
