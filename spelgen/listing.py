@@ -124,7 +124,7 @@ def number(value: float | None) -> str:
     # Integers are counts, of samples for example: rounding would hide a lost sample.
     if isinstance(value, int):
         return f"{value:,}"
-    # Plain decimals in the range in which three digits need no exponent.
+    # Numbers from 0.001 to 1,000 are written without an exponent.
     if value == 0 or 1e-3 <= abs(value) < 1e3:
         return f"{value:.3g}"
     if 1e3 <= abs(value) < 1e6:

@@ -82,7 +82,8 @@ def urdf_values(arm: EvaluatedArm) -> list[Predictor]:
         arm.notes.append(_missing("robot.urdf", "no arm is known"))
         return []
     try:
-        from spelgen.dynamics.pinocchio_dynamics import drives_known, urdf_dynamics  # needs an extra
+        # Imported here, because Pinocchio is an optional dependency.
+        from spelgen.dynamics.pinocchio_dynamics import drives_known, urdf_dynamics
 
         plain = urdf_dynamics(arm.urdf, arm.joints)
         predictors = [of_dynamics(URDF, plain, arm.probe)]
@@ -149,7 +150,7 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
     except (LogError, np.linalg.LinAlgError):
         return fitted
     fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
-    # All results are kept for Coulomb friction, and only the parameters for bristles.
+    # Of the friction model with bristles only the parameters are recorded, of the other one the whole identification.
     parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
     return {**fitted, **fits["parameters"].to_dict(), **parameters}
 

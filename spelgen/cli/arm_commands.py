@@ -57,7 +57,7 @@ def inspect(
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE
 
-        # Formulas for programs may have any length; formulas for people are limited.
+        # JSON and SymPy files are read by programs, so their formulas have no length limit as in text and LaTeX.
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
     # The result is printed in any case; --strict and a failed proof only affect the exit code.

@@ -72,14 +72,17 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _name_values(annotation: object, info: object) -> None:
-    """Set the placeholder that the help shows for the value of an option: N, X, FILE, or the choices."""
+    """Set the placeholder of an option's value in the help.
+
+    It is N for an integer, X for a float, TEXT, FILE for a path, or the list of the choices.
+    """
     value_type = get_args(annotation)[0] if NoneType in get_args(annotation) else annotation
     if isinstance(info, OptionInfo) and info.metavar is None and value_type is not bool:
         info.metavar = METAVARS.get(value_type) or "|".join(map(str, get_args(value_type)))
 
 
 def _local(value: object) -> object:
-    """Return the value of an option, in which paths that are addresses are replaced by their local copies."""
+    """Return the value of an option, in which URLs (such as s3://bucket/log) are replaced by paths of local copies."""
     if isinstance(value, list):
         return [_local(element) for element in value]
     return local(value) if isinstance(value, Path) else value
@@ -144,7 +147,7 @@ def note(text: object) -> None:
 
 
 def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
-    """Print the result of a command: its lines as text, or its record as one line of JSON."""
+    """Print the result of a command. form: "text" prints `lines`, "json" prints `record` as one line of JSON."""
     # JSON has one line, as log files of pipelines have one record per line.
     if form == "json":
         print(json.dumps(record, default=str))

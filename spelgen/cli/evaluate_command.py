@@ -39,7 +39,8 @@ def evaluate(
 ) -> None:
     """Evaluate a trained run and its baselines on test logs.
 
-    The assessment comes first. The result is also written to evaluation.json in the run folder; nothing else is.
+    The printed result begins with an assessment of the model. It is also written to evaluation.json in the run folder;
+    no other file is changed.
     """
     # Limits are checked first, so that a misspelt name is reported before minutes of rollouts.
     paths = options.logs(data, extra_logs)
@@ -125,7 +126,7 @@ def estimate(
     path = output or Path(run) / "estimate.html"
     options.choose_format(None, path, ["html"])
     fit = load_run(run)
-    # A model without torques is an error, which is raised here before logs are read.
+    # Models of position servos predict no torques, which the estimator needs: the error is raised before logs are read.
     torque_model(fit)
     levels = noise_levels(fit)
     joints = list(fit.model.joint_names)

@@ -158,7 +158,7 @@ def logs(
 
     # The mapping is loaded after the arm, because its names are checked against the joints of the URDF.
     arm = options.load(robot, joints, tip, angle_tolerance)
-    # A mapping is suggested before the logs are read: without it they may be unreadable.
+    # The mapping is suggested before the logs are read: logs with other column names cannot be read without a mapping.
     if suggest is not None:
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
@@ -178,7 +178,7 @@ def logs(
         note(f"wrote {write_text(html, text)}")
     if result.errors:
         note(SpelgenErrors(result.errors))
-    # Errors decide the exit code before warnings do.
+    # With --strict, warnings give the same exit code as the errors below, and a line on stderr.
     if strict:
         refuse_warnings("", len(result.warnings))
     if result.errors:

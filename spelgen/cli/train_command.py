@@ -61,7 +61,8 @@ def train(
         from spelgen.fitting.run_folder import RunFolder
 
         if module is not None:
-            extra_logs = [module, *(extra_logs or [])]  # with --from, all arguments are logs
+            # With --from there is no argument MODULE, so the first argument is a log, too.
+            extra_logs = [module, *(extra_logs or [])]
         run = RunFolder(source)
         run.read_record()  # raises an error if the folder is not a run
         robot = robot or (run.urdf if run.urdf.exists() else None)
@@ -81,7 +82,7 @@ def train(
     from spelgen.emission.specify import arm_of_spec
     from spelgen.log_checks.check_logs import require_sound_logs
 
-    # The arm is needed to check logs, and for a mapping that contains all joints of the URDF.
+    # The arm is needed to check the logs, and the names in a mapping, which may have every joint of the URDF.
     arm = None if urdf is None else arm_of_spec(spec, urdf)
     log_mapping = options.log_mapping(arm or spec.joint_names, mapping or _recorded_mapping(recorded), accept)
     # Torch is imported after the checks above, so that their errors are reported without delay.
@@ -115,10 +116,11 @@ def train(
 
 
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
-    """Return the payload in the logs of a model that was adapted to a load; None for any other fit.
+    """Write the noise levels of the estimator; return the payload in the logs of a fit with `adapt=load`, else None.
 
-    The estimator of the source run computes it, with noise levels of that run; None if that run has no noise levels.
-    A new fit gets noise levels of its own, an adapted run keeps the noise levels of its source run.
+    source: the run that was adapted. Its model and its noise levels estimate the payload, and the adapted run gets a
+    copy of these noise levels; without noise levels in the source run there is no payload. A fit without a source run
+    gets noise levels from its own logs.
     """
     from spelgen.live.levels import keep_levels, stored_levels
     from spelgen.live.replay import carried_payload
@@ -192,7 +194,7 @@ def _outcome(fit: Fit) -> tuple[str, str]:
 
 
 def _warm_start(request: Request) -> Request:
-    """Return the request to adapt a fitted model; by default the load is adapted, with the torque objective."""
+    """Return the request of a warm start; by default the objective is "torque", for which `adapt` is "load"."""
     objective, values = request.objective or "torque", dict(request.values)
     if objective == "torque":
         values.setdefault("adapt", "load")

@@ -32,8 +32,8 @@ class UsageError(typer.BadParameter):
 class Assignments(TrainingSettings):
     """The keys of the option `--set`: the training settings of a robot, and options of a single fit.
 
-    adapt: see `TorqueFit`. device, threads: device and number of threads of torch. progress: whether a progress bar is
-    shown.
+    adapt: parameters of a fitted model to update (load, friction or unit). device, threads: device and number of
+    threads of torch. progress: whether a progress bar is shown.
     """
 
     adapt: Adaptation | None = None
@@ -63,13 +63,13 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
 
     Raises a usage error for an unknown key, with the nearest known one, and for an invalid value.
     """
-    keys = Assignments.model_fields.keys() - {"objective"}  # has its own option
+    keys = Assignments.model_fields.keys() - {"objective"}  # `objective` has the option --objective
     # All assignments are collected before they are checked, since the fields of a group are checked together.
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         name, _, field = key.strip().replace("-", "_").partition(".")
-        # The sign `=` is checked before the key: the user may have typed a blank in its place.
+        # A missing `=` is reported first: the user may have typed a blank in its place, after a valid key.
         if not equals:
             raise UsageError(f"--set: got {assignment!r}, expected KEY=VALUE")
         if name not in keys:
@@ -96,8 +96,9 @@ def fit_options(request: Request, defaults: TrainingSettings) -> FitOptions:
     options, settings = request.values_of(OWNERS), dict(defaults.options)
     objective = request.objective or defaults.objective
     if request.warm_start and objective == "rollout":
-        settings["torque_first"] = False  # a torque fit would discard the weights of the run
+        # In a warm start no torque fit precedes the rollout: it would discard the source run's parameters.
+        settings["torque_first"] = False
     if objective is None and TIME_LIMIT in options:
-        # The objective is chosen later from the logs, so this option must not be an error for any objective.
+        # The objective is chosen later from the logs. As a default, the limit is ignored by objectives without one.
         settings[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return FitOptions(objective, options, settings)

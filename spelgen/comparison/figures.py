@@ -124,7 +124,7 @@ def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, d
 
 def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
     """Return at most about `TUNING.windows` windows, evenly spread over the logs."""
-    # The stride is a multiple of the decimation, because the controller changes its torque at these samples only.
+    # Windows start at multiples of the decimation: the simulated controller changes its torque at such samples only.
     starts = sum(max(0, len(log) - (samples - 1) * decimation) for log in logs)
     stride = -(-max(1, -(-starts // TUNING.windows)) // decimation) * decimation
     return cut_windows(logs, samples, stride, decimation, measured=False)

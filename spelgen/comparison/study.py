@@ -67,8 +67,8 @@ class Study:
 def prepare_study(comparison: Comparison, folder: Path, progress: Progress | None = None) -> Study:
     """Prepare the inputs of all arms, find finished runs, and estimate the time of the others.
 
-    An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist,
-    RunError if no arm can be used, and the error of a single arm.
+    An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist, and
+    RunError if no arm can be used; if there is only one arm, the error of this arm is raised instead.
     """
     # Presets are checked first, so that a misspelt name is an error before logs are simulated.
     for preset in set(comparison.presets or ()) - ablation_designs().keys():
@@ -157,7 +157,10 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
 
 
 def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
-    """Return the expected time of a run [s]: of finished runs of this arm and preset, else from the training steps."""
+    """Return the expected time of a run [s]: the median time of finished runs of the same arm and preset.
+
+    Without such runs it is, on simulated arms, the number of training steps times the measured time of a step.
+    """
     finished = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
     if finished:
         return statistics.median(finished) + TUNING.measuring

@@ -146,7 +146,7 @@ def _losses(figures: Mapping[str, Sequence[Figures]], published: Mapping[str, Pu
         medians = _summary(figures, label, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        # Ratios are added, because absolute losses of the paper depend on its units and sampling.
+        # The baseline's loss divided by each loss is added: absolute losses depend on the units and the sample rate.
         if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))

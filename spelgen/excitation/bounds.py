@@ -49,9 +49,9 @@ def motion_bounds(
 ) -> MotionBounds:
     """Return bounds with the central fraction of the position ranges, and a fraction of the velocity limits.
 
-    joints: joints of the URDF by name; <mimic> joints among them then keep their own limits. ranges: position ranges by
-    name of the joint, in place of its limits. The default range of continuous joints is -pi to pi. Raises ArmError for
-    a joint without a range, or whose limits are not increasing.
+    joints: joints of the URDF by name; with them, ranges are reduced so that <mimic> joints keep their limits. ranges:
+    position ranges by name of the joint, in place of its limits. The default range of continuous joints is -pi to pi.
+    Raises ArmError for a joint without a range, or whose limits are not increasing.
     """
     limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
     for k, coordinate in enumerate(arm.coordinates):

@@ -72,7 +72,8 @@ def excite(
     ranges = arm.robot.joint, arm.settings.simulation.positions
     limits = motion_bounds(arm.chain, 1.0, 1.0, *ranges)
     bounds = motion_bounds(arm.chain, reach, speed, *ranges)
-    strongest = bounds.speed  # without a limit, the approach reaches its largest speed in one second
+    # Without a limit of the acceleration, the approach reaches its largest speed in one second.
+    strongest = bounds.speed
     if acceleration is not None:
         strongest = _joint_values("acceleration", acceleration, arm.chain, positive=True)
         bounds = replace(bounds, acceleration=strongest)
@@ -156,7 +157,7 @@ def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, pos
 def _collisions(
     arm: Arm, surroundings: Surroundings | Path | str | None, limits: MotionBounds
 ) -> tuple[Collisions | None, str]:
-    """Return the `Collisions` of an arm, or None if they cannot be computed, and a text about the checks for users."""
+    """Return (collisions, text): the `Collisions` of an arm, None if they cannot be computed; a text for users."""
     if not isinstance(surroundings, Surroundings):
         surroundings = Surroundings() if surroundings is None else read_surroundings(Path(surroundings))
     try:

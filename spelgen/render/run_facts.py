@@ -180,7 +180,7 @@ def _names(trajectories: Sequence[str]) -> str:
 
 
 def _duration(seconds: float) -> str:
-    # Times have at most three digits, since training times vary by more than that.
+    # Times are rounded to three digits, since repeated trainings differ by more.
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = seconds / 60

@@ -88,7 +88,7 @@ class MotorCoupling(Group):
 
 
 class Unusable:
-    """Placeholder for a group of settings with errors; it raises these errors when an attribute is read."""
+    """Placeholder for a group of settings that has errors: reading an attribute raises the errors."""
 
     def __init__(self, errors: Sequence[SpelgenError]) -> None:
         self.errors = tuple(errors)
@@ -161,7 +161,7 @@ class Settings(Group):
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """One warning per error in a group that only one step uses; the step raises the error."""
+        """One warning per error in a group that a single command uses, such as `training`; it raises the error."""
         unusable = [group for _, group in self if isinstance(group, Unusable)]
         errors = [error for group in unusable for error in group.errors]
         return tuple(Diagnostic("warning", "unusable-settings", "settings", None, str(x)) for x in errors)
