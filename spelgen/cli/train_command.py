@@ -18,7 +18,6 @@ from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, fit_opti
 from spelgen.errors import LogError, ModuleError, OptionError, RunError
 from spelgen.labels import counted
 from spelgen.settings.fits import OWNERS, Objective, Rollout, TorqueFit, WindowConfig
-from spelgen.settings.settings import load_settings
 from spelgen.settings.training import OF_LOGS, TrainingSettings
 
 if TYPE_CHECKING:
@@ -78,12 +77,12 @@ def train(
     spec = _specification(module, recorded)
     # A resumed run uses the settings in its record, since the settings file of the robot may have changed.
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
-    settings = TrainingSettings() if urdf is None else load_settings(urdf).training
     from spelgen.emission.specify import arm_of_spec
     from spelgen.log_checks.check_logs import require_sound_logs
 
     # The arm is needed to check the logs, and the names in a mapping, which may have every joint of the URDF.
     arm = None if urdf is None else arm_of_spec(spec, urdf)
+    settings = TrainingSettings() if arm is None else arm.settings.training
     log_mapping = options.log_mapping(arm or spec.joint_names, mapping or _recorded_mapping(recorded), accept)
     # Torch is imported after the checks above, so that their errors are reported without delay.
     from spelgen.fitting.fit import FitOptions, RunOptions
@@ -92,16 +91,16 @@ def train(
     # Device and threads are not recorded, because they describe the machine and not the result.
     machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
-    chosen = (
-        FitOptions(request.objective, request.values_of(OWNERS)) if resume else fit_options(request, settings)
-    )
-    of_logs = {} if resume else settings.model_dump(include=OF_LOGS, exclude_none=True)
+    config = fit_options(request, settings)
+    if resume:
+        config = FitOptions(request.objective, request.values_of(OWNERS))
+    of_logs = settings.model_dump(include=OF_LOGS, exclude_unset=True)
     try:
         fit = train_files(
             module,
             paths,
             folder,
-            chosen,
+            config,
             urdf=urdf,
             source=source,
             of_logs=of_logs | request.values_of(OF_LOGS),
