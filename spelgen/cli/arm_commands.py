@@ -28,11 +28,8 @@ FRICTION_HELP = (
 
 
 def inspect(
-    robot: Path = options.ROBOT,
-    joints: str | None = options.JOINTS,
-    tip: str | None = options.TIP,
+    chosen_arm: options.ArmOptions,
     assume: Assume = options.ASSUMPTION,
-    angle_tolerance: float = options.ANGLE_TOLERANCE,
     formulas: bool = flag("--formulas", "Write M and V as expressions in q and base parameters."),
     entry: str | None = options.ENTRY,
     format: InspectionFormat | None = options.result_format(),
@@ -45,7 +42,7 @@ def inspect(
     chosen = options.choose_format(format, output, get_args(InspectionFormat))
     from spelgen.certificate.inspection import inspect as inspect_arm
 
-    arm = options.load(robot, joints, tip, angle_tolerance)
+    arm = chosen_arm.load()
     inspection = inspect_arm(arm, assume=assume)
     proof = None
     if verify:
@@ -63,9 +60,11 @@ def inspect(
     # The result is printed in any case; --strict and a failed proof only affect the exit code.
     deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
     if strict:
-        refuse_warnings(f"{robot}: ", [x.severity for x in inspection.diagnostics].count("warning"))
+        refuse_warnings(
+            f"{chosen_arm.robot}: ", [x.severity for x in inspection.diagnostics].count("warning")
+        )
     if proof and not proof.agrees:
-        note(f"{robot}: the proof contradicts the derivation; please report this file")
+        note(f"{chosen_arm.robot}: the proof contradicts the derivation; please report this file")
         raise typer.Exit(FAILED)
 
 
@@ -100,13 +99,10 @@ def _text(
 
 
 def identify(
-    robot: Path = options.ROBOT,
+    chosen_arm: options.ArmOptions,
     extra_logs: list[Path] | None = options.MORE_DATA,
     data: list[Path] | None = options.DATA,
     mapping: Path | None = options.MAPPING_FILE,
-    joints: str | None = options.JOINTS,
-    tip: str | None = options.TIP,
-    angle_tolerance: float = options.ANGLE_TOLERANCE,
     filter: float | None = options.FILTER,
     weights: Literal["equal", "range", "noise"] = option(
         "", "Weights of the joints: equal, by torque range, or by torque noise.", default="noise"
@@ -131,7 +127,7 @@ def identify(
         if name not in EFFECTS:
             raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
     method = LeastSquares(weights, FrictionModel(**dict.fromkeys(effects, True)))
-    arm = options.load(robot, joints, tip, angle_tolerance)
+    arm = chosen_arm.load()
     # Error codes on the command line are accepted in addition to the codes in the settings.
     log_mapping = options.log_mapping(arm, mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")

@@ -39,8 +39,8 @@ def evaluate(
 ) -> None:
     """Evaluate a trained run and its baselines on test logs.
 
-    The printed result begins with an assessment of the model. It is also written to evaluation.json in the run folder;
-    no other file is changed.
+    The result begins with an assessment of the model. The result is also written to evaluation.json in the run folder,
+    and no other file is changed.
     """
     # Limits are checked first, so that a misspelt name is reported before minutes of rollouts.
     paths = options.logs(data, extra_logs)

@@ -50,13 +50,10 @@ class MotionOptions:
 
 
 def excite(
-    robot: Path = options.ROBOT,
     output: Path = output_option("FILE.csv", "Output file of the motion.", default=...),
     *,
     design: MotionOptions,
-    joints: str | None = options.JOINTS,
-    tip: str | None = options.TIP,
-    angle_tolerance: float = options.ANGLE_TOLERANCE,
+    chosen_arm: options.ArmOptions,
     trajectory: Path | None = option(
         "FILE", "Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML."
     ),
@@ -73,7 +70,7 @@ def excite(
     for path in (output, trajectory, html):
         if path is not None:
             options.require_free(path, force=force)  # checked before the search, which takes minutes
-    arm = options.load(robot, joints, tip, angle_tolerance)
+    arm = chosen_arm.load()
     with progress_bar("searching") as progress:
         motion = design_motion(arm, progress=progress, **design.arguments())
     written = [str(write_text(output, motion.csv()))]
@@ -90,11 +87,9 @@ def excite(
 
 
 def simulate(
-    robot: Path = options.ROBOT,
     output: Path = output_option("LOGS", "Folder for train and test logs.", default=...),
-    joints: str | None = options.JOINTS,
-    tip: str | None = options.TIP,
-    angle_tolerance: float = options.ANGLE_TOLERANCE,
+    *,
+    chosen_arm: options.ArmOptions,
     seed: int | None = option("", "Random seed; default: the seed in the robot's settings.", min=0),
     as_built: int | None = option(
         "SEED", "Simulate an arm that differs from its URDF, drawn from this seed.", min=0
@@ -114,7 +109,7 @@ def simulate(
     from spelgen.simulation.prescribed import read_motion
     from spelgen.simulation.simulate import simulate as simulate_arm
 
-    arm = options.load(robot, joints, tip, angle_tolerance)
+    arm = chosen_arm.load()
     # Columns have the joint names of the URDF, so that the logs need no mapping.
     names = arm.chain.joint_names
     motions = [read_motion(file, names) for file in motion or ()]
@@ -157,7 +152,7 @@ def logs(
     from spelgen.logs.read import read_bounded_logs
 
     # The mapping is loaded after the arm, because its names are checked against the joints of the URDF.
-    arm = options.load(robot, joints, tip, angle_tolerance)
+    arm = options.ArmOptions(robot, joints, tip, angle_tolerance).load()
     # The mapping is suggested before the logs are read: logs with other column names cannot be read without a mapping.
     if suggest is not None:
         options.require_free(suggest, force=force)

@@ -46,11 +46,8 @@ def init(
 
 
 def build(
-    robot: Path = options.ROBOT,
-    joints: str | None = options.JOINTS,
-    tip: str | None = options.TIP,
+    chosen_arm: options.ArmOptions,
     assume: Assume = options.ASSUMPTION,
-    angle_tolerance: float = options.ANGLE_TOLERANCE,
     preset: str = option(
         "NAME|FILE.yaml", f"Preset of the model: {', '.join(PRESET_NAMES)}, or a YAML file.", default="hybrid"
     ),
@@ -69,8 +66,8 @@ def build(
     from spelgen.emission.specify import make_spec
     from spelgen.emission.text import module_text
 
-    arm = options.load(robot, joints, tip, angle_tolerance)
-    path = output or Path(f"{robot.stem}_spel.py")
+    arm = chosen_arm.load()
+    path = output or Path(f"{chosen_arm.robot.stem}_spel.py")
     spec = make_spec(arm, preset, width=width, depth=depth, assume=assume, module=path)
     source = module_text(spec, standalone=standalone)
     # An unchanged file is not written, so that its modification time is kept.

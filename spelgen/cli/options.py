@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -170,11 +171,20 @@ def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequen
     return chosen.model_copy(update={"accept": tuple(accepted)})
 
 
-def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> Arm:
-    """Return the arm of a URDF. joints, tip, angle_tolerance: values of the options of a command, as text or number."""
-    from spelgen.arm.configured_arm import load_arm
+@dataclass(frozen=True)
+class ArmOptions:
+    """Arguments and options of commands that read an arm from a URDF."""
 
-    return load_arm(robot, names(joints), tip, angle_tolerance)
+    robot: Path = ROBOT
+    joints: str | None = JOINTS
+    tip: str | None = TIP
+    angle_tolerance: float = ANGLE_TOLERANCE
+
+    def load(self) -> Arm:
+        """Return the arm."""
+        from spelgen.arm.configured_arm import load_arm
+
+        return load_arm(self.robot, names(self.joints), self.tip, self.angle_tolerance)
 
 
 def require_free(path: Path, *, force: bool) -> None:
