@@ -130,3 +130,12 @@ def number(value: float | None) -> str:
     if 1e3 <= abs(value) < 1e6:
         return f"{value:.0f}"
     return f"{value:.2e}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time such as `40 s`, `2.5 min` or `3.5 h`."""
+    # Times are rounded to three digits, since repeated trainings differ by more.
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"

@@ -25,7 +25,7 @@ from spelgen.cli.main import app
 from spelgen.comparison import jobs
 from spelgen.comparison.arms import ComparedArm, Comparison, ablation_designs, arm_inputs, load_comparison
 from spelgen.comparison.figures import predict_example, spread_windows
-from spelgen.comparison.study import duration, prepare_study, run_study
+from spelgen.comparison.study import prepare_study, run_study
 from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, comparison_sentence
 from spelgen.design import load_design
 from spelgen.emission.build import build
@@ -35,6 +35,7 @@ from spelgen.evaluation.rollout import mass_error, true_mass
 from spelgen.evaluation.tuning import EvaluationTuning
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.rollout import roll_out
+from spelgen.listing import duration
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison

@@ -17,7 +17,7 @@ from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.evaluation.plain import record
 from spelgen.files import write_json
 from spelgen.labels import MODEL, counted
-from spelgen.listing import number
+from spelgen.listing import duration, number
 from spelgen.settings.settings import load_settings
 from spelgen.tasks import run_tasks
 
@@ -124,13 +124,6 @@ def run_study(study: Study, note: Callable[[str], None], jobs: int = 1, address:
     figures = [record(replace(result, simulated=None)) for result in results.values()]
     write_json(study.folder / "comparison.json", {"schema": 1, "failures": failures, "results": figures})
     return finished
-
-
-def duration(seconds: float) -> str:
-    """Return a time in words, such as `40 s`, `12 min` or `3.5 h`."""
-    if seconds < 90:
-        return f"{max(seconds, 1):.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) -> list[Job]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from spelgen.arm.configured_arm import Arm
+from spelgen.arm.configured_arm import Arm, urdf_path
 from spelgen.baselines.registry import FittedBaselines, LinearServoRecord, arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
@@ -100,9 +100,7 @@ def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = 
     if isinstance(tested, str | Path):
         tested = load_run(tested)
     model, fit = (tested.model, tested) if isinstance(tested, Fit) else (tested, None)
-    urdf = None if fit is None else fit.urdf
-    if arm is not None:
-        urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
+    urdf = urdf_path(arm) or (None if fit is None else fit.urdf)
     # Logs are read as float64 on the CPU, so the model must have the same type and device.
     if any(weights.dtype != torch.float64 or not weights.is_cpu for weights in model.parameters()):
         model = copy.deepcopy(model).double().cpu()
