@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import typer
 
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from spelgen.settings.log_mapping import LogMapping
 
 
+Declared: TypeAlias = Any
+"""Declaration of an option or argument, as the default value of a parameter of any type."""
+
+
 def option(
     metavar: str,
     text: str,
@@ -31,7 +35,7 @@ def option(
     default: object = None,
     min: float | None = None,
     max: float | None = None,
-) -> Any:
+) -> Declared:
     """Return an option of a command, in place of the default value of a parameter.
 
     metavar: placeholder of the value in the help; "" for a placeholder by type. text: help. names: names of the option;
@@ -41,17 +45,17 @@ def option(
     return typer.Option(default, *names, metavar=metavar or None, help=text, min=min, max=max)
 
 
-def flag(name: str, text: str) -> Any:
+def flag(name: str, text: str) -> Declared:
     """Return an option without a value, and without the negation `--no-...` that typer would add."""
     return option("", text, name, default=False)
 
 
-def argument(metavar: str, text: str, default: object = ...) -> Any:
+def argument(metavar: str, text: str, default: object = ...) -> Declared:
     """Return a positional argument; without a default it is required."""
     return typer.Argument(default, metavar=metavar, help=text)
 
 
-def output_option(metavar: str, text: str, default: object = None) -> Any:
+def output_option(metavar: str, text: str, default: object = None) -> Declared:
     """Return the option `-o` of a command, which names the output file or folder."""
     return option(metavar, text, "-o", "--output", default=default)
 
@@ -89,7 +93,7 @@ FORCE = flag("--force", "Overwrite existing output.")
 OUTPUT = output_option("FILE", "Write the result to a file.")
 
 
-def result_format() -> Any:
+def result_format() -> Declared:
     """Return the option `--format` of a command; each command has its own formats, which its help lists."""
     return option("", "Format of the result; default: that of the suffix of -o, else text.")
 

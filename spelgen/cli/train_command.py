@@ -17,7 +17,7 @@ from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, fit_options, read_assignments
 from spelgen.errors import LogError, ModuleError, OptionError, RunError
 from spelgen.labels import counted
-from spelgen.settings.fits import OWNERS, Objective, Rollout, TorqueFit, WindowConfig
+from spelgen.settings.fits import Objective, Rollout, TorqueFit, WindowConfig
 from spelgen.settings.training import OF_LOGS, TrainingSettings
 
 if TYPE_CHECKING:
@@ -57,14 +57,10 @@ def train(
     # Keys are checked before any file is read, so that a misspelt key costs no time.
     request = Request(objective, read_assignments(assignments or []))
     if source is not None:
-        from spelgen.fitting.run_folder import RunFolder
-
         if module is not None:
             # With --from there is no argument MODULE, so the first argument is a log, too.
             extra_logs = [module, *(extra_logs or [])]
-        run = RunFolder(source)
-        run.read_record()  # raises an error if the folder is not a run
-        robot = robot or (run.urdf if run.urdf.exists() else None)
+        robot = robot or _urdf_of_run(source)
         request = _warm_start(request)
     elif "adapt" in request.values:
         raise UsageError("--set adapt: belongs to --from")
@@ -85,15 +81,13 @@ def train(
     settings = TrainingSettings() if arm is None else arm.settings.training
     log_mapping = options.log_mapping(arm or spec.joint_names, mapping or _recorded_mapping(recorded), accept)
     # Torch is imported after the checks above, so that their errors are reported without delay.
-    from spelgen.fitting.fit import FitOptions, RunOptions
+    from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
 
     # Device and threads are not recorded, because they describe the machine and not the result.
     machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
-    config = fit_options(request, settings)
-    if resume:
-        config = FitOptions(request.objective, request.values_of(OWNERS))
+    config = fit_options(request, None if resume else settings)
     of_logs = settings.model_dump(include=OF_LOGS, exclude_unset=True)
     try:
         fit = train_files(
@@ -222,6 +216,15 @@ def _specification(module: Path | None, run: Path | None) -> ModelSpec:
     if run is None and module is not None:
         return read_spec(module)
     return RunFolder(run or Path()).read_spec()
+
+
+def _urdf_of_run(folder: Path) -> Path | None:
+    """Return the URDF in a run folder, if there is one. Raises RunError if the folder is not a run."""
+    from spelgen.fitting.run_folder import RunFolder
+
+    run = RunFolder(folder)
+    run.read_record()
+    return run.urdf if run.urdf.exists() else None
 
 
 def _recorded_mapping(run: Path | None) -> LogMapping | None:

@@ -89,11 +89,17 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     return {name: values[name] for name in texts}
 
 
-def fit_options(request: Request, defaults: TrainingSettings) -> FitOptions:
-    """Return the options of a new fit; the command line takes precedence over the robot's settings, `defaults`."""
+def fit_options(request: Request, defaults: TrainingSettings | None) -> FitOptions:
+    """Return the options of a fit; the command line takes precedence over the robot's settings, `defaults`.
+
+    defaults: None for a resumed run, whose record has all options.
+    """
     from spelgen.fitting.fit import FitOptions
 
-    options, settings = request.values_of(OWNERS), dict(defaults.options)
+    options = request.values_of(OWNERS)
+    if defaults is None:
+        return FitOptions(request.objective, options)
+    settings = dict(defaults.options)
     objective = request.objective or defaults.objective
     if request.warm_start and objective == "rollout":
         # In a warm start no torque fit precedes the rollout: it would discard the source run's parameters.

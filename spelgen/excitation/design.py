@@ -46,9 +46,8 @@ def excite(
     """Return an exciting motion, which starts and ends at rest; the same arguments give the same motion.
 
     The motion keeps the limits of position and velocity, also of <mimic> joints. It keeps effort limits, too, if the
-    URDF has effort limits and inertials and the optimizer finds a motion that keeps them. If the URDF has collision
-    geometry and Pinocchio is installed, the motion and the approach to it keep a clearance between links, and to the
-    surroundings.
+    URDF has effort limits and inertials and the optimizer finds such a motion. If the URDF has collision geometry and
+    Pinocchio is installed, motion and approach keep a clearance between links, and to the surroundings.
 
     Args:
         arm: configured arm.
