@@ -70,7 +70,7 @@ def energy_rise(model: ArmModel, windows: Windows) -> float | None:
     """Return the largest rise of H in a step of 1 ms without input, divided by the largest kinetic energy.
 
     The motion starts from the first states of the windows. The rise is not positive, except for rounding, if the model
-    is passive. None: nothing moved.
+    is passive. None: the simulated arm did not move, so that the kinetic energy is zero, or the motion diverged.
     """
     q, qd = windows.q[: TUNING.started_states, 0], windows.qd[: TUNING.started_states, 0]
     no_input = q.new_zeros(len(q), TUNING.free_steps, model.n)

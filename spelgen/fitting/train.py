@@ -47,7 +47,8 @@ def train(
     run = RunFolder(folder)
     robot, notes, settings = None, list[Diagnostic](), dict(of_logs or {})
     if options.resume:
-        record = run.read_record()  # a missing run is reported before anything is read
+        # The record is read first, so that a missing run is reported before the logs are read.
+        record = run.read_record()
         # Validation logs that were passed from Python are not stored in a file, so the run cannot be resumed here.
         if record.validation_fraction is None and record.validation:
             raise RunError(
