@@ -69,8 +69,7 @@ def train(
     paths = options.logs(data, extra_logs)
     # With --resume the first argument may be the run folder instead of a module.
     folder = output or _default_folder(module, source, resume=resume)
-    recorded = folder if resume else source
-    spec = _specification(module, recorded)
+    spec, recorded = _specification(module, folder if resume else source)
     # A resumed run uses the settings in its record, since the settings file of the robot may have changed.
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
     from spelgen.emission.specify import arm_of_spec
@@ -79,7 +78,7 @@ def train(
     # The arm is needed to check the logs, and the names in a mapping, which may have every joint of the URDF.
     arm = None if urdf is None else arm_of_spec(spec, urdf)
     settings = TrainingSettings() if arm is None else arm.settings.training
-    log_mapping = options.log_mapping(arm or spec.joint_names, mapping or _recorded_mapping(recorded), accept)
+    log_mapping = options.log_mapping(arm or spec.joint_names, mapping or recorded, accept)
     # Torch is imported after the checks above, so that their errors are reported without delay.
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
@@ -208,14 +207,19 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
     return folder
 
 
-def _specification(module: Path | None, run: Path | None) -> ModelSpec:
-    """Return the specification of the model, from the run that is resumed or adapted, else from the module."""
+def _specification(module: Path | None, run: Path | None) -> tuple[ModelSpec, LogMapping | None]:
+    """Return the specification of the model, and the recorded mapping of the logs.
+
+    Both are read from the run that is resumed or adapted. For a new fit, the specification is read from the module, and
+    there is no mapping.
+    """
     from spelgen.emission.text import read_spec
     from spelgen.fitting.run_folder import RunFolder
 
     if run is None and module is not None:
-        return read_spec(module)
-    return RunFolder(run or Path()).read_spec()
+        return read_spec(module), None
+    folder = RunFolder(run or Path())
+    return folder.read_spec(), folder.read_record().mapping
 
 
 def _urdf_of_run(folder: Path) -> Path | None:
@@ -225,13 +229,6 @@ def _urdf_of_run(folder: Path) -> Path | None:
     run = RunFolder(folder)
     run.read_record()
     return run.urdf if run.urdf.exists() else None
-
-
-def _recorded_mapping(run: Path | None) -> LogMapping | None:
-    """Return the mapping of the logs of the run that is resumed or adapted; None for a new run."""
-    from spelgen.fitting.run_folder import RunFolder
-
-    return None if run is None else RunFolder(run).read_record().mapping
 
 
 def _unchanged_urdf(module: Path, spec: ModelSpec) -> Path | None:
