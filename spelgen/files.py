@@ -128,7 +128,7 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add `path` to an OSError without a file name that is raised within the context, such as that of a full disk."""
+    """Add `path` to an OSError without a file name that is raised within the context, as by a full disk."""
     try:
         yield
     except OSError as error:

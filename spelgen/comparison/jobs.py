@@ -197,7 +197,7 @@ def _own_checkpoint(job: Job, run: RunFolder) -> bool:
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()
-    run.config.unlink(missing_ok=True)  # without config.json the folder is no run, so the fit starts anew
+    run.config.unlink(missing_ok=True)  # without config.json the folder is no run, and a new fit starts
     write_json(owner, {"key": job.key})
     return False
 

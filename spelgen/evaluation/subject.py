@@ -28,7 +28,7 @@ from spelgen.urdf.read import read_urdf
 
 @dataclass(frozen=True)
 class Subject:
-    """The evaluated model, and what is known about its fit; the defaults are for a model without a fit.
+    """The evaluated model, with data about its fit; the defaults are for a model without a fit.
 
     urdf: URDF of the robot; None if unknown. preprocessing: preprocessing of the fit. window: number of samples of the
     training windows; a typical number for a model that was not fitted to windows. trained_on: names of the training and

@@ -284,7 +284,7 @@ def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     """Return ticks (K,) and labels of a logarithmic axis at powers of ten.
 
     If there are fewer than three, 2 and 5 times powers of ten are added; if there are still fewer than three, the ticks
-    are those of a linear axis (`_steps`).
+    are chosen as on a linear axis (`_steps`).
     """
     # The tolerance includes a power of ten at the end of the axis despite rounding.
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)

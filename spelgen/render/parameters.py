@@ -97,7 +97,7 @@ def base_table(
             "squares has no column for"
         )
     elif isinstance(model, RigidBodyDynamics):
-        # For every friction model the first columns of the regressor are those of inertial parameters and armatures,
+        # For every friction model the first columns of the regressor belong to inertial parameters and armatures,
         # which the trained model has, too.
         common = np.concatenate([body_parameters(model).ravel(), model.armature.detach().numpy()])
         learned = base.combination[:, : len(common)] @ common

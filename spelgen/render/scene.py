@@ -113,8 +113,8 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
     """Return the names of the drawn links, parents first.
 
-    These are the links from the root to each of the `joints`, all links that move with these joints, and the links that
-    are fixed to another drawn link.
+    Drawn are the links from the root to each of the `joints`, all links that move with the joints, and links that are
+    fixed to another drawn link.
     """
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
     carried: set[str] = set()
