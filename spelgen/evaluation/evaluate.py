@@ -106,7 +106,7 @@ def evaluate(
         results = _evaluate_commands(tested, logs, notes)
     else:
         require_torques(logs)
-        used = _preprocessing(tested.fit.preprocessing if tested.fit else None, preprocessing, logs)
+        used = _preprocessing(tested.preprocessing, preprocessing, logs)
         ahead = (steps, seconds)
         results = _evaluate_torques(tested, logs, notes, used, baselines or {}, ahead, truth, progress)
     return tested.assessed(results)
