@@ -163,9 +163,13 @@ def find_dropouts(signals: JointSignals) -> str | None:
         if rows.size:
             first = rows[0]
             size = values[first] - values[max(first - 1, 0)]
-            what = "falls to 0" if values[first] == 0 else f"deviates from its neighbours by {size:.4g}"
+            what = (
+                "falls to 0"
+                if values[first] == 0
+                else f"deviates from its neighbours by {size:.4g} for a moment"
+            )
             times = listed_times(signals.trajectory.t[rows])
-            return f"{name} that {what} for a moment, in {counted(len(rows), 'sample')}, at t = {times}"
+            return f"{name} that {what}, in {counted(len(rows), 'sample')}, at t = {times}"
     return None
 
 

@@ -62,6 +62,18 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         return outliers
     steps = np.diff(values)
     sizes = np.abs(steps)
+    logged = np.flatnonzero(values)
+    # positions do not jump to 0 before the first or after the last sample; torques and velocities may
+    for end, rows in (
+        (logged[:1], slice(0, logged[:1].sum())),
+        (logged[-1:], slice(logged[-1:].sum() + 1, None)),
+    ):
+        if (
+            smooth
+            and len(logged) > TUNING.jump_window
+            and np.abs(values[end]).max() > TUNING.jump * _usual(sizes)
+        ):
+            outliers[rows] = True
     is_jump = sizes > TUNING.jump * _usual(sizes)
     # a signal in which more than 5 % of the steps are large is noisy: its large steps are no outliers
     if not is_jump.any() or is_jump.mean() > 0.05:
