@@ -2,11 +2,16 @@
 
 import gc
 import os
+import sys
 from pathlib import Path
 
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch and numpy when they are first imported
+# Byte code is cached even if the environment disables the cache: otherwise each of the processes that tests start would
+# compile all imported packages, which takes as long as the imports (pip installs them without byte code).
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 ROOT = Path(__file__).parents[1]
 
