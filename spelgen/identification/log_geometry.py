@@ -21,6 +21,7 @@ from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.identification.drive_hints import FRICTION, drive_rows
 from spelgen.identification.least_squares import block_products, varying
 from spelgen.identification.tuning import GEOMETRY
+from spelgen.runtime.body_chain import BodyChain
 
 Vector3 = tuple[float, float, float]
 
@@ -145,6 +146,7 @@ class GeometryProblem:
         self._precision = block_diag(precision, np.zeros((drives, drives)))
         self._counted: np.ndarray | None = None
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
+        self._chains: dict[Vector3, BodyChain] = {}  # under each direction of gravity
 
     def thinned(self, count: int) -> GeometryProblem:
         """Return the problem on at most `count` samples, evenly spaced."""
@@ -192,7 +194,8 @@ class GeometryProblem:
         key = hypothesis.motion_key
         if key not in self._equations:
             q, qd, qdd, _ = hypothesis.signals(self.samples)
-            rows = drive_rows(body_chain(self.arm, hypothesis.gravity), q, qd, qdd, self.speeds)
+            chain = self._chains.get(hypothesis.gravity) or body_chain(self.arm, hypothesis.gravity)
+            rows = drive_rows(self._chains.setdefault(hypothesis.gravity, chain), q, qd, qdd, self.speeds)
             rows = rows if self._counted is None else rows * self._counted
             if len(self._equations) >= 30:  # bounds the memory of the cache: an entry has about 1 MB
                 self._equations.pop(next(iter(self._equations)))

@@ -17,7 +17,7 @@ from torch import Tensor
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.protocol import is_stateful
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidParameters
 
 _BLOCK = 2048  # samples computed at a time, to limit the memory
 
@@ -69,7 +69,11 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
 
 
 def balance(
-    model: RigidBodyDynamics, point: np.ndarray, samples: Sequence[np.ndarray], bounds: Sequence[np.ndarray]
+    model: RigidBodyDynamics,
+    point: np.ndarray,
+    samples: Sequence[np.ndarray],
+    bounds: Sequence[np.ndarray],
+    prepared: RigidParameters | None = None,
 ) -> Balance:
     """Return the terms of the momentum balance at samples.
 
@@ -78,19 +82,27 @@ def balance(
         point: point of the last body, in the frame of this body, whose Jacobian is returned, (3,) [m].
         samples: q, qd and tau, (T, n).
         bounds: lower and upper bound of the friction state, (T, n, K) [rad, m].
+        prepared: parameter cache of the model; None: the function computes it.
     """
     blocks: list[list[np.ndarray]] = []
     with torch.no_grad():
+        prepared = prepared or model.prepare()
         for start in range(0, len(samples[0]), _BLOCK):
             tensors = [torch.from_numpy(x[start : start + _BLOCK]) for x in (*samples, *bounds)]
-            blocks.append([x.numpy() for x in _terms(model, torch.from_numpy(point), *tensors)])
+            blocks.append([x.numpy() for x in _terms(model, prepared, torch.from_numpy(point), *tensors)])
     return Balance(*map(np.concatenate, zip(*blocks, strict=True)))
 
 
 def _terms(
-    model: RigidBodyDynamics, point: Tensor, q: Tensor, qd: Tensor, tau: Tensor, *bounds: Tensor
+    model: RigidBodyDynamics,
+    prepared: RigidParameters,
+    point: Tensor,
+    q: Tensor,
+    qd: Tensor,
+    tau: Tensor,
+    *bounds: Tensor,
 ) -> list[Tensor]:
-    at = model.at(q, qd)
+    at = model.at(q, qd, prepared=prepared)
     torque = model.input_force(at, qd, tau) + model.lagrangian_gradient(at, qd)
     if is_stateful(model):
         low, high = (model.friction_torque(at, qd, z) for z in bounds)
