@@ -31,7 +31,8 @@ def parameter_covariance(estimate: TorqueEstimate) -> torch.Tensor:
     """
     problem, x, free = estimate.problem, estimate.state.x, estimate.problem.free
     model, samples = problem.jacobian.model, problem.jacobian.samples
-    # The new Jacobians below measure logged torques relative to the gains in the model, not to the initial gains.
+    # The noise is converted from the initial to the current motor gains: the Jacobians below are made from the fitted
+    # model, so that its current gains are their initial gains, and their factor `logged_scale` is 1.
     noise = problem.noise / problem.jacobian.logged_scale(x)
     # The jackknife needs independent blocks: shorter ones would be strongly correlated with their neighbours.
     blocks = max(1, min(BLOCKS, samples.count // MIN_BLOCK))
@@ -69,8 +70,8 @@ def held_out_nmse(estimate: TorqueEstimate, samples: TorqueSamples) -> torch.Ten
     for start in range(0, residual.shape[1], size):
         rows = slice(start, start + size)
         block = weighted[:, rows].flatten(0, 1)
-        # The matrix has an eigenvalue near zero if only this segment moves a joint: solving is more accurate than
-        # inverting.
+        # `kept` is 1 - H. It has an eigenvalue near zero if a joint moves in this segment only; solving a linear system
+        # with it is more accurate than inverting it.
         kept = torch.eye(len(block)).double() - block @ segments.covariance @ block.mT
         error[:, rows] = torch.linalg.solve(kept, residual[:, rows].flatten()).view(len(noise), -1)
     return error.square().mean(dim=1) * (noise / estimate.problem.noise_estimator.torque_std).square()

@@ -117,7 +117,7 @@ class ResidualTuning:
     # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
     # degrees of freedom.
     standard_errors: float = 2.82
-    # [1] The same number for one or two recordings, whose motion may repeat errors: p = 0.001.
+    # [1] `standard_errors` for one or two recordings, whose motion may repeat model errors: p = 0.001.
     standard_errors_of_one: float = 4.30
     # [1] Largest standard deviation of a position-dependent torque that is selected on one or two recordings, as a
     # fraction of the standard deviation of the joint's torque.
@@ -127,8 +127,8 @@ class ResidualTuning:
     min_load_fraction: float = 0.1
     # [1] Smallest error reduction of a residual term.
     min_reduction: float = 1e-3
-    # [1] A later term is preferred to the best one so far only if its residual is below this fraction of the residual
-    # of the best one.
+    # [1] A candidate replaces the best candidate of a joint so far only if its held-out squared residual is below this
+    # fraction of the best candidate's. Candidates are tested in the order splines, friction factor, ripple.
     preference_ratio: float = 0.9
     # [1] Largest number of samples to which networks are fitted.
     network_samples: int = 2**12
