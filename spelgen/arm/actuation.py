@@ -71,8 +71,10 @@ class Actuation:
     def drives(self) -> Drives:
         """Return the input matrix G and the matrix C of motor speeds per joint velocity, (n, n) each."""
         torques = self.matrix()
+        # If the logs contain joint torques, rows of G of coupled joints are rows of the identity. The motor speeds
+        # depend on the couplings, which replace these rows.
         for coupling in self.couplings:
-            torques[coupling.row] = 0.0  # the logged torque acts at the joint, not at its motors
+            torques[coupling.row] = 0.0
         for coupling in self.couplings:
             torques[coupling.row, coupling.column] = coupling.value
         return Drives(self.matrix(), motor_speeds(torques))
@@ -186,7 +188,8 @@ def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[
     for transmission in robot.transmissions:
         names = transmission.joint_names
         is_pair = _DIFFERENTIAL in transmission.type and len(names) == len(transmission.actuators) == 2
-        # An unusable transmission is an error only if the logs contain motor torques: joint torques do not need it.
+        # An unusable transmission is an error only if the logs contain motor torques: with logged joint torques, the
+        # transmission is not needed, and is ignored.
         if is_pair and free.issuperset(names) and not (transmission.errors and settings.torque == "joint"):
             collect(transmission.errors)
             entries += _block(joints, names, _differential(transmission))
@@ -207,7 +210,10 @@ def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]
 def _block(
     joints: Sequence[str], names: Sequence[str], matrix: Sequence[Sequence[float]]
 ) -> Iterator[InputEntry]:
-    """Yield the nonzero entries of ``matrix``, the block of G for ``names``, with their indices in ``joints``."""
+    """Yield the nonzero entries of the block of G in the rows and columns of the joints ``names``.
+
+    The block has the values ``matrix``. Indices of the entries are positions in ``joints``.
+    """
     for row, values in zip(names, matrix, strict=True):
         for column, value in zip(names, values, strict=True):
             if value:

@@ -1,4 +1,7 @@
-"""Robot -> Chain: the serial chain with exact geometry; links that move rigidly together are lumped into bodies."""
+"""Derive a `Chain` from a `Robot`: a serial chain with exact geometry.
+
+Links that move rigidly together are lumped into bodies.
+"""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -98,7 +101,7 @@ class Chain:
 
 
 class MovingJoint(NamedTuple):
-    """A moving joint, the links with an inertial that move rigidly with its child link, and the body of these links."""
+    """A moving joint, its body, and the links of this body that have an inertial."""
 
     joint: UrdfJoint
     links: tuple[UrdfLink, ...]
@@ -106,7 +109,7 @@ class MovingJoint(NamedTuple):
 
 
 class LumpedLinks(NamedTuple):
-    """Moving joints, locked joints, and the frames of all links by name.
+    """Result of `lump_links`: moving joints with their bodies, locked joints, and the frames of all links by name.
 
     ``moved`` lists the joints of the chain before their mimic joints on other branches; ``locked`` includes fixed
     joints.
@@ -167,8 +170,8 @@ def _require_small(robot: Robot, chain: ChainChoice) -> None:
     if moving > largest:
         do = "choose fewer with --joints or --tip"
         raise ArmError(f"{moving} joints", file=robot.source, expected=f"at most {largest}", do=do)
-    # Mimic joints are counted too, because each is a separate body in the derivation. Each joint of the chain is its
-    # own leader in `leaders`, and is subtracted.
+    # `following` is the number of mimic joints of the chain, each of which is a separate body in the derivation.
+    # `leaders` contains each joint of the chain too, as its own leader; these joints are subtracted.
     following = sum(x.leader.name in chain.names for x in leaders(robot).values()) - moving
     if following > most_followers:
         got = f"{following} joints that follow others by <mimic>"
@@ -204,7 +207,7 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
         if joint.moves and followed.leader.name in chain.names and followed.multiplier:
             poses.append((joint, *placement.move(joint)))
         else:
-            # Locked joints are at 0: a mimic joint of a locked joint is then at its offset.
+            # Locked joints are at 0, so that a mimic joint whose leader is locked is at the offset of its <mimic>.
             locked.append(joint)
             placement.lock(joint, float(followed.offset) if joint.moves else 0.0)
     moved = []
@@ -298,7 +301,8 @@ def _dependent_remarks(
         if joint.moves or joint.parent in behind:
             behind.add(joint.child)
         turns = joint.type in ("revolute", "continuous") and joint.mimic is None
-        # Joints between a locked joint and the tip of its branch are not part of a linkage of the arm.
+        # Joints behind another locked joint, towards the tip of its branch, are not part of a parallelogram linkage of
+        # the arm.
         if joint.parent in behind or not turns:
             continue
         beside = _parallel_beside(placement.frames[joint.parent], moved, joint)
@@ -319,9 +323,10 @@ def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], joint: UrdfJoin
     axis = rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis)
     parallel = []
     for body in (moving.body for moving in moved):
-        # The axis of the other joint in the frame of the parent body: the z axis of the joint's frame.
+        # Axis of the moving joint, the z axis of its frame, as a vector in the frame of the parent body.
         beside = np.array(body.rotation, dtype=float)[:, 2]
-        is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2  # [rad] parallel within rounding errors
+        # [rad] Largest angle between axes that count as parallel, since URDFs have rounded axes.
+        is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2
         if body.parent == frame.body >= 0 and body.joint_type != "prismatic" and is_parallel:
             parallel.append(body.name)
     return parallel

@@ -1,4 +1,4 @@
-"""Robot -> the serial chain of joints that are the coordinates of an arm, and the leaders of mimic joints."""
+"""Choose the serial chain of joints of a `Robot` that are the coordinates of an arm; find leaders of mimic joints."""
 
 import math
 import re
@@ -81,7 +81,8 @@ def leaders(robot: Robot) -> dict[str, Leader]:
             followers.append((leader.name, leader.mimic))
             leader = robot.joint[leader.mimic.joint]
         follow = result.setdefault(leader.name, Leader(leader, Fraction(1), Fraction(0)))
-        # From the leader outwards, because the multiplier and offset of a joint depend on its leader's.
+        # Mimic joints are processed from the leader outwards, because the multiplier and the offset of a mimic joint
+        # depend on the values of the joint that it mimics.
         for name, mimic in reversed(followers):
             multiplier = exact(mimic.multiplier)
             offset = multiplier * follow.offset + exact(mimic.offset)
@@ -115,7 +116,7 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
             raise ArmError(
                 got, file=robot.source, line=joint.line, expected="joints on one path from the root"
             )
-    # An error in place of sorting: columns of logs have the order of `names`.
+    # A wrong order is an error and is not corrected, because users expect columns of logs in the order of `names`.
     if list(ordered) != chosen:
         got, do = f"the joints in the order {','.join(names)}", f"use {','.join(x.name for x in ordered)}"
         raise ArmError(got, file=robot.source, expected="the order from the root to the tip", do=do)
@@ -139,11 +140,14 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
 
 
 def _longest(robot: Robot) -> ChainChoice:
-    """Return the longest chain. Raises ArmError if several chains have this length and the choice is ambiguous.
+    """Return the longest chain of joints from the root to a tip, without the joints of grippers.
 
-    Prismatic joints of a pair of jaws are excluded. Of several chains, the only one with effort limits is chosen.
+    If several chains have the largest length, the only one whose joints all have effort limits is returned; without
+    such a chain, ArmError is raised. Chains that differ only in the prismatic joints of a pair of jaws are one chain
+    without these joints.
     """
-    # Hands, tools and sensors are on shorter branches than the arm.
+    # The end of each branch may be the tip. The longest chain is the arm, because hands, tools and sensors are on
+    # shorter branches.
     tips = [link.name for link in robot.links if not robot.joints_below[link.name]]
     # Duplicates are removed: several fixed fingers are at the end of the same chain.
     chains = dict.fromkeys(_without_gripper(_independent(robot.path_to(tip))) for tip in tips)
@@ -179,8 +183,8 @@ def _longest(robot: Robot) -> ChainChoice:
 def _possible_gripper(robot: Robot, last: UrdfJoint) -> tuple[Diagnostic, ...]:
     """Return a remark if the last joint of the chain may open a gripper; otherwise no remark.
 
-    The link of such a joint has the name of a gripper, and no joint of the robot has one. A joint with a range of more
-    than half a turn rotates the gripper as a whole, because no jaw opens that far.
+    The joint may open a gripper if its child link has the name of a gripper, and no joint of the robot has such a name.
+    A joint with a range of more than half a turn rotates the gripper as a whole, because no jaw opens that far.
     """
     turns = last.lower is not None and last.upper is not None and last.upper - last.lower > math.pi
     if turns or not _GRIPPER.search(last.child) or any(map(_GRIPPER.search, robot.joint)):
@@ -200,5 +204,5 @@ def _without_gripper(chain: tuple[UrdfJoint, ...]) -> tuple[UrdfJoint, ...]:
     end = len(chain)
     while end and _GRIPPER.search(chain[end - 1].name):
         end -= 1
-    # If all joints have names of fingers, the robot is a single finger, which is then the arm.
+    # If all joints of a chain have names of fingers, the robot is a single finger, which is then the arm.
     return chain[:end] or chain

@@ -34,7 +34,7 @@ TenVector = tuple[Fraction, ...]
 
 @dataclass(frozen=True)
 class AngleRounding:
-    """Rounding of the geometry of a URDF to the special values that its rounded numbers represent, with diagnostics.
+    """Replacement of rounded numbers in a URDF, such as 1.5708, by the exact values that they represent, such as pi/2.
 
     tolerance: largest change of an angle to a multiple of pi/2 [rad]. Offsets, axes and inertia tensors are rounded
     with tolerances of their own. A tolerance of 0 disables all rounding. diagnostics: one entry per changed position,
@@ -47,7 +47,8 @@ class AngleRounding:
     @property
     def rotation_error(self) -> float:
         """Largest error of the rational approximation of a rotation [rad]."""
-        # Without rounding, an angle of 1.57079632679 must not become pi/2, from which it differs by 5e-12.
+        # If rounding is disabled, the rational approximation must not round either: with an error of 1e-11, an angle of
+        # 1.57079632679 would become pi/2, from which it differs by 5e-12.
         return TUNING.rotation_error if self.tolerance else 1e-15
 
     def origin(
@@ -92,7 +93,8 @@ class AngleRounding:
         unit: np.ndarray = np.array(joint.axis) / np.linalg.norm(joint.axis)
         if self.tolerance == 0.0:
             return unit
-        rounded = np.where(np.abs(unit) < 1e-3, 0.0, unit)  # some CAD exporters print three digits
+        # Components below 1e-3 are set to 0, because some CAD exporters print three digits.
+        rounded = np.where(np.abs(unit) < 1e-3, 0.0, unit)
         # The axis is normalised again, because components were set to 0.
         rounded /= np.linalg.norm(rounded)
         if np.abs(rounded - unit).max() > TUNING.notable:
@@ -102,7 +104,8 @@ class AngleRounding:
 
     def position(self, vector: np.ndarray) -> np.ndarray:
         """Return a position (3,) [m] with components below 1 nm, which are rounding errors of rotations, set to 0."""
-        noise = 1e-9 if self.tolerance else 0.0  # [m] rounding errors of composed rotations
+        # [m] Bound of the rounding errors that composed rotations cause in positions.
+        noise = 1e-9 if self.tolerance else 0.0
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
 
     def _note(self, code: str, where: str, line: int, message: str) -> None:
@@ -111,7 +114,8 @@ class AngleRounding:
 
 def _in_pi(angle: float) -> str:
     """Return a rounded angle as a multiple of pi: "-3 pi/4"."""
-    multiple = Fraction(angle / pi).limit_denominator(120)  # a common multiple of 2, 5, 8 and 12
+    # 120 is a common multiple of 2, 5, 8 and 12, the divisors of pi of all special angles (see `rounded_angle`).
+    multiple = Fraction(angle / pi).limit_denominator(120)
     numerator, denominator = multiple.as_integer_ratio()
     if not numerator:
         return "0"
@@ -128,9 +132,9 @@ class Frame(NamedTuple):
     """The pose of the frame of a link at zero position.
 
     body: index of the body of the link, -1 for the root link. composed: float64 rotation (3, 3) of the link in the
-    frame of the last revolute body on the path from the root to the link. rotation: exact rotation (3, 3) of the link
-    in the frame of its own body, which is another frame if this body is prismatic. position: exact position (3,) of
-    the link in the frame of its own body [m].
+    frame of the last body with a revolute joint on the path from the root to the link. rotation: exact rotation (3, 3)
+    of the link in the frame of its own body, which is another body if its joint is prismatic. position: exact position
+    (3,) of the link in the frame of its own body [m].
     """
 
     body: int
@@ -140,7 +144,7 @@ class Frame(NamedTuple):
 
 
 _Rotation = tuple[np.ndarray, np.ndarray]
-"""Rotation (3, 3) of a body in the frame of the last revolute body before it, in float64 and as rational numbers."""
+"""Rotation (3, 3) in the frame of the last body with a revolute joint, in float64 and as rational numbers."""
 
 
 class Placement:
@@ -149,8 +153,9 @@ class Placement:
     def __init__(self, root: str, rounding: AngleRounding) -> None:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
-        # For the root and each body, the rotations of all bodies from the last revolute body to this body. The segment
-        # of a revolute body contains only the body itself.
+        # The segment of the root, and of each body: the rotations of all bodies from the last body with a revolute
+        # joint to this body, relative to the last body with a revolute joint. The segment of a body with a revolute
+        # joint contains only the body itself.
         self._segments: list[tuple[_Rotation, ...]] = [((np.eye(3), IDENTITY),)]
 
     def lock(self, joint: UrdfJoint, value: float) -> None:
@@ -219,24 +224,25 @@ class Placement:
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
     def _seen_from_both(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return a position (3,) [m] of a joint with rounding errors removed in two frames.
+        """Return the position (3,) [m] of a joint in the frame of the parent body, without rounding errors.
 
-        position: position in the frame of the parent body. rotation: rotation (3, 3) of the joint's frame. The position
-        is rounded in the joint's frame too, and kept if both roundings are consistent. Reason: an offset of
-        (0.1, 0.1, 0) is parallel to an axis at 45 degrees, but not exactly to the rational approximation of this axis.
+        position: in the frame of the parent body, where rounding errors have been removed. rotation: rotation (3, 3) of
+        the joint's frame. Components that are rounding errors in the joint's frame are set to 0 too, unless rounding in
+        the parent's frame would undo this. Reason: an offset of (0.1, 0.1, 0) is parallel to an axis at 45 degrees, but
+        not exactly to the rational approximation of this axis.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
-        # A component that is exactly 0 may make an entry of M zero, which a rounding error would make nonzero.
+        # Exact zeros matter: with a rounding error in place of 0, a zero entry of M would become nonzero.
         moved = self._rounding.position(rotation @ in_own_frame)
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
         """Return an exact rotation (3, 3) in the frame of a body.
 
-        composed: float64 rotation (3, 3) in the frame of the last revolute body, where the segment of the body begins.
-        The rotation relative to one of the bodies of the segment is approximated. The body is chosen for which most
-        zero elements are preserved relative to all bodies of the segment: an axis at 45 degrees, which is not rational,
-        may be normal to several other axes.
+        composed: float64 rotation (3, 3) in the frame of the last body with a revolute joint, where the segment of the
+        body begins. The rotation is approximated relative to one body of the segment: the body for which the
+        approximation preserves the most zero elements of the rotations relative to all bodies of the segment. Reason:
+        an axis at 45 degrees, which is not rational, may be normal to several other axes.
         """
         segment = self._segments[body + 1]
         candidates: list[tuple[int, int, np.ndarray]] = []

@@ -17,8 +17,8 @@ class GeometryTuning:
 
     # [rad, 1] A change of an angle, or of a component of a unit axis, by at most this number is not reported.
     notable: float = 1e-9
-    # [1] An element of a rotation matrix below this bound is a rounding error and is replaced by 0. So is a product of
-    # inertia whose ratio to the largest moment of inertia is below this bound.
+    # [1] An element of a rotation matrix below this bound is a rounding error and is replaced by 0. A product of
+    # inertia is replaced by 0 if its ratio to the largest moment of inertia is below this bound.
     zero_noise: float = 1e-12
     # [rad] Largest error of a rational rotation. It is thousands of times smaller than the error of any calibration.
     rotation_error: float = 1e-11
@@ -55,8 +55,8 @@ def rounded_angle(angle: float, tolerance: float) -> float:
     """
     if tolerance == 0.0:
         return angle
-    # The divisors of pi give the special angles on the CAD drawings of 189 arms. The tolerance of pi/12, pi/8 and pi/5
-    # is small, because 0.26, 0.39 and 0.63 rad also occur as exact values.
+    # Divisors of pi, with the tolerance of each: the special angles in the URDFs of 189 arms are multiples of them. The
+    # tolerance of pi/12, pi/8 and pi/5 is small, because 0.26, 0.39 and 0.63 rad also occur as exact values.
     limits = {2: tolerance, 12: 2e-5, 8: 2e-5, 5: 2e-5}
     for divisor, limit in limits.items():
         step = pi / divisor
@@ -103,7 +103,7 @@ def alignment(axis: np.ndarray) -> np.ndarray:
     first, second = np.eye(3)[(index + 1) % 3], np.eye(3)[(index + 2) % 3]
     columns = [first, second, closest] if sign > 0 else [second, first, closest]
     if sign < 0 and index == 2:
-        # Rotation by pi about x. Parameters of existing modules depend on this convention for -z axes.
+        # For the axis -z, the rotation is by pi about x; parameters of existing modules depend on this convention.
         columns = [first, -second, closest]
     turned: np.ndarray = smallest @ np.stack(columns, axis=1)
     return turned
@@ -137,7 +137,9 @@ def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
     SciPy's Rotation is not used, because its checks of the input take 0.2 ms per call.
     """
     trace = float(np.trace(rotation))
-    squares = np.empty((4, 4))  # 4 q q^T of the unit quaternion q
+    # `squares` is 4 q q^T for the unit quaternion q. Each row is proportional to q; the row with the largest diagonal
+    # element has the smallest rounding errors.
+    squares = np.empty((4, 4))
     squares[0, 0] = 1.0 + trace
     squares[1:, 1:] = rotation + rotation.T + (1.0 - trace) * np.eye(3)
     antisymmetric = rotation - rotation.T
@@ -171,19 +173,21 @@ def _rotation_with_zero(rotation: np.ndarray, row: int, column: int, error: floa
 def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     """Return a rational rotation (3, 3) about the coordinate axis 0, 1 or 2.
 
-    cosine, sine: cosine and sine of the angle in float64, up to a common factor. error: see ``exact_rotation``.
+    cosine, sine: cosine and sine of the angle in float64, both multiplied by the same positive factor, which need not
+    be 1. error: largest error of an element.
     """
-    # The angle is a number of quarter turns plus a remainder from -0.7 to 0.87 rad, which is approximated. The
-    # approximations of 45 and 135 degrees then differ by exactly a right angle. The interval does not end at +-45
-    # degrees, so that rounding of these common angles does not change their quarter turn.
-    eighth = 0.7  # [rad] just below pi/4
+    # The angle is split into quarter turns, which are exact, and a remainder, which is approximated; 45 and 135 degrees
+    # then have approximations that differ by exactly a right angle. The remainder is in -0.7 .. 0.87 rad and not in
+    # +-45 degrees: rounding of the common angles +-45 degrees would otherwise change the number of quarter turns.
+    eighth = 0.7  # [rad] somewhat less than pi/4
     quarter, angle = divmod(atan2(sine, cosine) + eighth, pi / 2)
     tangent = tan((angle - eighth) / 2)
     t = Fraction(0)
     if abs(tangent) >= TUNING.zero_noise:
         for bound in TUNING.denominators:
             t = Fraction(tangent).limit_denominator(bound)
-            # A quarter of the bound: the angle has twice the error of t, and the product has two such rotations.
+            # t = tan(angle / 2) may have a quarter of the error: the error of the angle is up to twice the error of t,
+            # and `_rotation_with_zero` multiplies two such rotations.
             if abs(float(t) - tangent) < error / 4:
                 break
     norm = 1 + t * t
@@ -210,6 +214,6 @@ def _rotation_of(quaternion: Sequence[Fraction]) -> np.ndarray:
     w, x, y, z = (int(component * common) for component in quaternion)
     v = np.array([x, y, z], dtype=object)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=object)
-    # R = 1 + (2 w [v]x + 2 [v]x [v]x) / (w^2 + v.v)
+    # Euler-Rodrigues for a quaternion (w, v) of any norm: R = 1 + (2 w [v]x + 2 [v]x [v]x) / (w^2 + v.v).
     turned: np.ndarray = IDENTITY + 2 * (w * cross + cross @ cross) * Fraction(1, w * w + v @ v)
     return turned

@@ -27,15 +27,15 @@ def is_plain(arm: Chain) -> bool:
 class Axes:
     """Tests of the axes of the joints of an arm without branches and mimic joints; joints are counted from 0.
 
-    A test is True if the relation holds at every configuration. assume: see ``derive``; with ``kinematics`` the
-    inertials are unknown, and the last body is neither centred nor balanced.
+    A test is True if the relation holds at every configuration. assume: ``inertials`` for the inertial parameters of
+    the URDF; with ``kinematics`` they are unknown, and all tests of the last body's balance are False.
     """
 
     def __init__(self, arm: Chain, assume: Assume = "kinematics"):
         self.arm = arm
         self.assume = assume
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
-        generator = random.Random(0)  # a fixed seed, for reproducible reports
+        generator = random.Random(0)  # The seed is fixed, so that reports are reproducible.
         # For each configuration, the directions (n, 3) and the twists (n, 6) of the axes. Two configurations suffice:
         # at one, a false relation holds by chance with a probability of about its polynomial degree divided by 1e6.
         self._configurations = [_configuration(arm, generator) for _ in range(2)]
@@ -58,7 +58,10 @@ class Axes:
         return max(self._cosines(a, b)) < 0
 
     def same_twist(self, a: int, b: int) -> bool:
-        """Whether unit velocities of two joints cause equal or opposite velocity fields of the bodies."""
+        """Whether two joints have equal or opposite twists.
+
+        Unit velocities of the two joints then give the bodies that both joints carry equal or opposite velocities.
+        """
         return all(_are_parallel(twists[a], twists[b]) for _, twists in self._configurations)
 
     def commute(self, a: int, b: int) -> bool:
@@ -70,13 +73,13 @@ class Axes:
         return True
 
     def keep_offset(self, slider: int, hinge: int) -> bool:
-        """Whether the mass carried by a prismatic joint keeps its distance from a plane.
+        """Whether the load of a prismatic joint ``slider`` keeps its distance from a plane.
 
         The plane contains the axis of the revolute joint ``hinge``, which is nearer the root, and is parallel to the
-        axis of the prismatic joint ``slider``.
+        axis of ``slider``. The test includes the motion of all joints between ``hinge`` and the tip.
         """
         if not all(self.prismatic[hinge + 1 : slider]):
-            return False  # a revolute joint between the two joints may rotate the plane
+            return False  # A revolute joint between the two joints may rotate the plane.
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]
         for axes, twists in self._configurations:
             normal = np.cross(axes[slider], axes[hinge])

@@ -1,9 +1,10 @@
 """SymPy expressions from the polynomials of an arm, and their output as text, LaTeX and Python.
 
 Products of cosines and sines of the angles of consecutive joints with parallel axes become cosines and sines of sums of
-these angles. Other forms (powers of single angles, common factors of several terms) shorten long formulas by 20 %, but
-not the formulas that are short enough to be read. Printed decimals have at most twelve digits; Python for SymPy has
-exact fractions. Before lines are wrapped, blanks at which a line must not be broken are replaced by no-break spaces.
+these angles. Other forms (powers of single angles, common factors of several terms) are not used: they shorten long
+formulas by 20 %, but not the formulas that are short enough to be read. Printed decimals have at most twelve digits;
+Python for SymPy has exact fractions. Before lines are wrapped, blanks at which a line must not be broken are replaced
+by no-break spaces.
 """
 
 import re
@@ -22,7 +23,7 @@ from spelgen.certificate.axes import Axes, is_plain
 from spelgen.structure.recursion import base_denominators
 
 FLOAT_DIGITS = 17  # significant decimal digits that determine a double
-_FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at it
+_FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at this character.
 Terms = dict[Expr, fmpq]
 """A linear combination {product of distances, cosines and sines: coefficient}, with nonzero coefficients."""
 
@@ -58,7 +59,8 @@ class PolynomialWriter:
         generators = context.gens()
         waves = zip(generators[::3], generators[1::3], strict=True)
         self._circles = [sine**2 + cosine**2 - 1 for sine, cosine in waves]
-        # s and c are sine and cosine of a fraction of the coordinate: the angles of mimic joints are multiples of it.
+        # s and c are sine and cosine of q / d with the coordinate q and an integer d, because the angles of mimic
+        # joints are integer multiples of q / d.
         fractions = enumerate(base_denominators(arm))
         self._angles = [coordinate(joint) / denominator for joint, denominator in fractions]
         self._runs = parallel_runs(arm)
@@ -120,7 +122,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
         for quarter in [1] * sines + [0] * cosines:
             products: dict[tuple[Expr, int], fmpq] = {}
             for (total, quarters), value in waves.items():
-                # cos a cos b = (cos(a + b) + cos(a - b)) / 2
+                # Each product becomes a sum: cos a cos b = (cos(a + b) + cos(a - b)) / 2.
                 for sign in (1, -1):
                     wave = (total + sign * angle, (quarters + sign * quarter) % 4)
                     products[wave] = products.get(wave, fmpq(0)) + value / 2
@@ -137,8 +139,9 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
 
 
 def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
-    """Return the sum of parameters times functions; parameters with proportional functions share one product.
+    """Return the sum of parameters times functions.
 
+    Parameters with proportional functions are combined: (a + 2 b) f in place of a f + b (2 f), with parameters a and b.
     functions: pairs of the symbol of a parameter and its function.
     """
     groups: dict[tuple[tuple[Expr, fmpq], ...], dict[Expr, fmpq]] = {}
@@ -149,7 +152,8 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
         groups.setdefault(unit, {})[symbol] = leading
     total = []
     for unit, parameters in groups.items():
-        # A function of one parameter is not normalised, because its coefficients are dimensions of the arm.
+        # The function of a parameter that no other parameter has is not normalised, because its coefficients are
+        # lengths of the arm.
         factor = abs(next(iter(parameters.values()))) if len(parameters) == 1 else fmpq(1)
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))

@@ -1,9 +1,10 @@
-"""A structure in words: zero, constant and equal entries of M, joints without effect on M or V, and the reasons.
+"""The structure of M and V in words: zero, constant and equal entries of M, joints without effect on M or V, reasons.
 
 A reason is given only if the exact geometry of the arm proves it. The entry of M of joints a and b is the integral of
 v_a . v_b over the mass that both joints move, where v_a is the velocity field for a unit velocity of joint a; the
-reasons are properties of this integral. A function that returns a reason returns None if it finds none. In the text of
-a reason, ``{joints}`` and ``{axes}`` are placeholders for the other joints of the entries, and for their axes.
+reasons are properties of this integral. A function that returns a reason returns None if it finds none. The text of a
+reason is valid for several entries, each of two joints: it names one of the joints of an entry, and has the placeholder
+``{joints}`` for the other joints of all entries, or ``{axes}`` for the axes of these joints.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -78,10 +79,11 @@ class _Sentences:
         for entry in self.structure.entries:
             if entry.kind == kind:
                 groups.setdefault(self._reason(why, entry), []).append(entry)
-        # entries without a reason come last
+        # Entries without a reason are listed last.
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # A reason names the other joint of each entry: the one closer to the root, unless it is prismatic.
+                # The placeholders get the joint of the column of each entry, which is closer to the root. If this joint
+                # is prismatic, they get the joint of the row.
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
@@ -100,7 +102,8 @@ class _Sentences:
                 terms.setdefault((row, column), {})[number] = factor
         groups: dict[tuple[tuple[int, Fraction], ...], dict[tuple[int, int], bool]] = {}
         for entry, factors in sorted(terms.items()):
-            # The first factor is made positive, so that opposite entries have equal factors.
+            # The factors of an entry are multiplied by -1 if the first one is negative, so that opposite entries have
+            # equal factors and are in the same group.
             positive = next(iter(factors.values())) > 0
             if not positive:
                 factors = {number: -factor for number, factor in factors.items()}
@@ -116,7 +119,7 @@ class _Sentences:
         """Yield a fact for each joint on which no entry of M depends."""
         inputs = {joint for entry in self.structure.entries for joint in entry.joints}
         if not inputs:
-            return  # M is constant, which the facts about its entries state
+            return  # M is constant: the facts about its entries state this.
         for joint in sorted(set(range(len(self.structure.joints))) - inputs):
             means = "It is not an input of the networks of M"
             yield Fact(f"M does not depend on joint {joint + 1}", means, self._reason(idle_reason, joint))
@@ -170,8 +173,8 @@ def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def _diagonal_reason(axes: Axes, joint: int) -> Reason:
-    # Joints nearer the root move the axis and the load of this joint together: only joints after it can change the
-    # inertia of the load about the axis.
+    # Joints nearer the root move the axis and the load of this joint together: only joints nearer the tip can change
+    # the inertia of the load about the axis.
     behind = range(joint + 1, len(axes.prismatic))
     if axes.prismatic[joint]:
         return "the diagonal entry of a prismatic joint is the mass that it carries"
@@ -206,7 +209,10 @@ def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
-    """Return the reason for equal entries of one row of M: the joints of the columns move the load of the row equally.
+    """Return the reason that entries of one row of M are equal or opposite.
+
+    Unit velocities of the joints of the columns give the bodies that the joint of the row carries the same velocity
+    field; for a single balanced body, the same angular velocity suffices.
 
     entries: (row, column) of each entry, 0-based.
     """
@@ -232,7 +238,7 @@ def idle_reason(axes: Axes, joint: int) -> Reason:
     if joint == 0:
         return "it moves the whole arm as one rigid body"
     # M does not depend on the first joint, which moves the whole arm. A joint whose motion commutes with all joints
-    # nearer the root could be the first joint.
+    # nearer the root could be exchanged with the first joint, so that M does not depend on it either.
     nearer = list(range(joint))
     if all(axes.commute(joint, earlier) for earlier in nearer):
         return f"its motion commutes with {joints_in_words(nearer)}, as if it were the first joint"

@@ -19,8 +19,8 @@ from spelgen.labels import printable, short_name
 _LATEX_WIDTH = 140
 _PYTHON_WIDTH = 100
 
-# The docstring is the start of the file and not the comments with names from the URDF: a comment in the first two lines
-# could declare an encoding (PEP 263).
+# The file starts with this docstring, not with the comments that contain names from the URDF, because a comment in the
+# first two lines could declare an encoding (PEP 263).
 _HEAD = '''"""Closed forms of a serial arm's mass matrix M(q) and potential energy V(q), by spelgen.
 
 q: the joints' positions [rad, m]. entries: {(row, column): entry of M}, counted from 1, lower triangle.
@@ -84,7 +84,7 @@ def _parameters(formulas: Formulas, width: int) -> list[str]:
     lines = ["Base parameters, and the URDF's values" if values else "Base parameters"]
     for symbol, definition in formulas.base_parameters.items():
         value = f" [{float(values[symbol]):.6g}]" if symbol in values else ""
-        # a base parameter that equals an inertial parameter needs no equation
+        # A base parameter that equals an inertial parameter needs no equation.
         name = "" if definition.is_Symbol else f"{symbol.name} = "
         lines += expressions.lines(expressions.text(definition), f"  {name}", width, value)
     return lines

@@ -158,8 +158,8 @@ def formulas(
         arm: The arm.
         structure: Structure of the arm.
         entry: The entry; None: all entries.
-        longest: Largest number of terms of an entry; longer entries have no expression. Default: 40, or ``WRITABLE``
-            for one entry.
+        longest: Largest number of terms of an entry; longer entries have no expression. Default: 40, or 3,000
+            (``WRITABLE``) for one entry.
 
     Raises SpelgenError for an entry that M does not have.
     """
@@ -220,7 +220,8 @@ class _Writer:
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:
-            # A base parameter has the same coefficient in M as its first inertial parameter, which is in no other one.
+            # The coefficient of a base parameter in M or V is the coefficient of its first inertial parameter, which
+            # occurs in no other base parameter.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index, budget))
             # V is determined up to a constant: constant terms are omitted.
             if entry == "V":

@@ -21,7 +21,7 @@ from spelgen.structure.servo_rank import servo_rank
 from spelgen.structure.structure import MassEntry, Structure, derive
 from spelgen.urdf.robot import Assume
 
-if TYPE_CHECKING:  # not imported at run time, since these modules import SymPy, which is slow
+if TYPE_CHECKING:  # These modules are not imported at run time, since they import SymPy, which is slow.
     from spelgen.certificate.formulas import Entry as PlaceOfEntry
     from spelgen.certificate.formulas import Formulas
 
@@ -119,7 +119,8 @@ class Inspection:
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
         if self.input == "torque":
             return {"entries": entries}
-        # Logs of position servos determine only ratios of parameters, which are listed; logs of torques determine all.
+        # Logs of position servos determine only ratios of parameters, which are listed. Logs of torques determine all
+        # base parameters.
         rank = servo_rank(self.arm)
         undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
         ratios = list(map(self._names, rank.groups))

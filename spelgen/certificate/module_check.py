@@ -25,7 +25,7 @@ class CheckResult:
 
 
 def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
-    """Derive a module again with its own options, compare the result, and verify its structure numerically.
+    """Generate a module again with the options of its build, compare the two, and verify the structure numerically.
 
     Raises ModuleError if the URDF is not found, or if the file is not a module of spelgen.
 

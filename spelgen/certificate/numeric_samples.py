@@ -35,8 +35,8 @@ class NumericSamples:
     """Samples of M and of the gravity torque.
 
     mass: lower triangles of M divided by ``scale``, (1 + n, S, n(n+1)/2); block 1 + k has the positions of block 0,
-    except for coordinate k (k from 0). scale: geometric mean of the mean diagonal entries of row and column,
-    (n(n+1)/2,). gravity: gravity torque dV/dq divided by its largest magnitude, (S, n).
+    except for coordinate k (k from 0). scale: sqrt(mean M_ii * mean M_jj) for the entry (i, j), (n(n+1)/2,), with means
+    over the samples. gravity: gravity torque dV/dq divided by its largest magnitude, (S, n).
     """
 
     mass: np.ndarray
@@ -82,7 +82,8 @@ def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
     dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
     n, bodies = len(arm.coordinates), len(arm.bodies)
     rows = []
-    for _ in range(10 * bodies // n + 10):  # more rows than columns
+    # There are more rows than columns, so that the samples do not limit the rank.
+    for _ in range(10 * bodies // n + 10):
         q = dynamics.configuration(_positions(arm, rng))
         qd = dynamics.jacobian @ rng.normal(size=n)
         qdd = dynamics.jacobian @ rng.normal(size=n)
@@ -126,9 +127,10 @@ class ReadingDifference:
 
 
 def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingDifference]:
-    """Return the differences of an arm from the reading of its URDF by Pinocchio, at random configurations.
+    """Read the URDF by Pinocchio, and return the differences of the chain of ``arm`` from the result.
 
-    seed: seed of the configurations. Raises any exception of Pinocchio, and ValueError if the file has changed.
+    Axes, masses and inertias are compared at random configurations. seed: seed of the configurations. Raises any
+    exception of Pinocchio, and ValueError if the file has changed.
     """
     dynamics = _pinocchio_dynamics(robot, arm)
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, len(arm.coordinates)))
@@ -179,9 +181,9 @@ def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
 def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
     """Return kinematic and dynamic quantities of the B moving bodies of an arm at positions q (S, n).
 
-    The key "axes of the joints" has the twists for unit velocities in the root frame, (S, 6, B). "masses and inertias"
-    has M of the B joints, in which diagonal entries are doubled, and the gravity torque as the last column,
-    (S, B, B + 1).
+    The key "axes of the joints" has the twists for unit velocities in the root frame, (S, 6, B). "masses and inertias",
+    (S, B, B + 1), has the upper triangle of M plus its transpose, that is, M of the B joints with doubled diagonal
+    entries, and the gravity torque as the last column.
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]

@@ -104,7 +104,10 @@ Magnitude = tuple[str, float, bool]
 
 @dataclass(frozen=True)
 class _DerivedFact:
-    """A derived fact, and the numbers that are zero or nonzero according to the fact."""
+    """A derived fact, with the sampled numbers that must be zero, and the numbers that must not, if it is true.
+
+    fact: name of the fact. derived: result of the derivation, as text.
+    """
 
     fact: str
     derived: str
@@ -164,7 +167,7 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
     """Yield checks that compare the chain with the reading of the URDF by Pinocchio."""
     try:
         differences = differences_of_reading(robot, arm, seed)
-    except Exception as problem:  # a failure of Pinocchio is no evidence about the chain
+    except Exception as problem:  # A failure of Pinocchio is no evidence about the chain.
         text = " ".join(str(problem).split())[:120]
         result = f"Pinocchio cannot read it ({type(problem).__name__}: {text})"
         yield FactCheck("reading of the file", "the moving bodies", result, "undecided")
@@ -228,14 +231,17 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFac
 
 
 def _ranks(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield facts about the numbers of outputs and constants, and of outputs that do not depend on the first joints."""
+    """Yield facts about the number of outputs, of outputs and constants, and of outputs of the joints nearer the tip.
+
+    An output is a varying term of M.
+    """
     changes, outputs = samples.changes, len(structure.outputs)
     width = changes.shape[-1]
     yield _rank("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield _rank("outputs and constants together", samples.mass[0], together)
-    # The selection of outputs maximises the number of outputs that depend only on joints from any joint to the tip;
-    # this number is checked for each joint.
+    # For each joint k, the selection of outputs maximises the number of outputs that depend only on the joints from k
+    # to the tip. This number is checked for each k.
     counts, magnitudes = [str(outputs)], []
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)

@@ -20,7 +20,7 @@ def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     center = inertia[1:4] / mass
     xx, xy, xz, yy, yz, zz = inertia[4:]
     about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # the parallel axis theorem
+    # Parallel-axis theorem: the inertia about the joint's origin exceeds the inertia about the centre by mass * shift.
     shift = center @ center * np.eye(3) - np.outer(center, center)
     return mass, center, about_joint - mass * shift
 
@@ -28,9 +28,9 @@ def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 def quaternion(rotation: object) -> np.ndarray:
     """Return the unit quaternion (w, x, y, z) with w >= 0 of a rotation matrix (3, 3)."""
     matrix = np.array(rotation, dtype=float)
-    # scipy has the order (x, y, z, w)
+    # SciPy returns quaternions in the order (x, y, z, w).
     result: np.ndarray = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
-    result[np.abs(result) < 1e-16] = 0.0  # rounding
+    result[np.abs(result) < 1e-16] = 0.0  # Smaller elements are rounding errors.
     return result
 
 
@@ -54,8 +54,8 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
         q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     count = len(chain.parents)
-    # The columns of a body's homogeneous transform replace points of the body: the kinetic energy is then
-    # linear in its pseudo-inertia.
+    # With the homogeneous transform T (4 x 4), its time derivative T', and the pseudo-inertia J of a body, the kinetic
+    # energy is 1/2 tr(T' J T'^T), which is linear in J. The identity in place of point masses gives the columns of T.
     pose = chain.forward(q, torch.eye(4 * count).to(q))
     rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
     rises = torch.unflatten(rises, -1, (3, count, 4))
@@ -100,17 +100,18 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
         10 * body + INERTIAL_PARAMETERS.index(name) for body in range(inertial // 10) for name in BASE_ORDER
     ]
     order += range(inertial, inertial + n)
-    shape = (3, 2 * len(order) // n + 1, n)  # twice as many equations as parameters
+    # There are twice as many equations as parameters, so that the samples do not limit the rank.
+    shape = (3, 2 * len(order) // n + 1, n)
     motion = torch.from_numpy(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
     columns = constants_regressor(chain, motors, *motion).flatten(0, 1)
-    # norm of each column after projection onto the complement of all columns before it
+    # Norm of each column after projection onto the orthogonal complement of all preceding columns.
     remainder = torch.linalg.qr(columns[:, order]).R.diagonal().abs()
     # A column is linearly dependent if its part orthogonal to all preceding columns is shorter than 1e-8 times
     # the column. Rounding errors are smaller than this.
     is_base = remainder > 1e-8 * columns[:, order].norm(dim=0).clamp(min=1.0)
     base = torch.tensor(order)[is_base]
     combination = torch.linalg.lstsq(columns[:, base], columns).solution
-    # coefficients below the threshold are rounding errors
+    # Coefficients below the threshold are rounding errors.
     combination[combination.abs() < 1e-9] = 0.0
     names = []
     for index, row in zip(base.tolist(), combination, strict=True):

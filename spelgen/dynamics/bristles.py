@@ -79,7 +79,8 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
         at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
-    size = 2**14  # samples computed at a time, to limit the memory of temporary arrays
+    # Number of samples that are computed together; it limits the memory of temporary arrays.
+    size = 2**14
     for start in range(0, len(q), size):
         block = slice(start, start + size)
         corner = latest[block], drives
@@ -89,11 +90,12 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
 
 
 def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the samples at which each column of a path (T, n) begins or reverses, and the latest one at each sample.
+    """Return the samples at which each column of a path (T, n) starts or reverses.
 
     Returns:
-        Indices of samples (R, n): first the start, then the reversals; columns with fewer reversals end with zeros.
-        Row of the first result that is the latest reversal at each sample, (T, n).
+        Indices of these samples, (R, n): first the start, then the reversals, where R - 1 is the largest number of
+        reversals of a column. Columns with fewer reversals are padded with zeros.
+        For each sample, the row of this array with the latest start or reversal, (T, n).
     """
     steps = np.diff(path, axis=0, prepend=path[:1])
     # A drive at rest keeps the direction of its last motion.
@@ -123,12 +125,15 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
 
 
 def encoded(q: np.ndarray) -> np.ndarray:
-    """Return the path (T, n) [rad, m] without encoder jitter: backlash of one encoder step to both sides."""
+    """Return the path (T, n) [rad, m] without encoder jitter.
+
+    q: measured path, (T, n), which is passed through a backlash of one encoder step in either direction.
+    """
     step = encoder_step(q)
     if not step.any():
         return q
-    # Compositions of clamps are clamps, so a parallel scan needs log2(T) passes instead of T sequential steps.
     # Backlash: out[k] = clip(out[k-1], low[k], high[k]), with low and high one encoder step from the input.
+    # Compositions of clips are clips, so a parallel scan needs log2(T) passes instead of T sequential steps.
     low, high = q - step, q + step
     shift = 1
     while shift < len(q):
@@ -143,8 +148,9 @@ def encoder_step(q: np.ndarray) -> np.ndarray:
     """Return the encoder step (n,) [rad, m] of positions (T, n); 0 for a joint whose positions are not quantised."""
     steps = np.zeros(q.shape[1])
     for joint, values in enumerate(q.T):
-        # Positions of an encoder repeat exactly; positions that are not quantised do not.
+        # Positions of an encoder repeat exactly. They are regarded as quantised if each value occurs more than four
+        # times on average.
         levels = np.unique(values)
-        if len(levels) > 1 and len(levels) < len(values) / 4:  # many values are repeated
+        if len(levels) > 1 and len(levels) < len(values) / 4:
             steps[joint] = np.diff(levels).min()
     return steps

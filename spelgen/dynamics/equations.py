@@ -47,7 +47,7 @@ def equations_of(dynamics: object) -> EquationsAt:
 
 
 def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEquations:
-    """Return the equations of an assembled model."""
+    """Return the equations of a port-Hamiltonian model at q (W, n); prepared: the model's parameter cache."""
     pose = model.configuration(q, prepared)
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
@@ -62,7 +62,7 @@ def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEqua
 
 
 def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
-    """Return the equations of motion of dynamics that are no assembled model, from their forward dynamics."""
+    """Return the equations at q (W, n) of dynamics of any other class, from their forward dynamics."""
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
@@ -71,7 +71,7 @@ def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
         """Return the force M qdd, (W, n) [Nm, N]."""
-        # These dynamics may not provide a bias torque. M times the acceleration contains it.
+        # `RigidDynamics` has no method for the force of the inputs, so M qdd is computed from the acceleration.
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
 
@@ -94,7 +94,7 @@ def runge_kutta(
 
     qd1 = qd = pd = torch.zeros_like(p)
     moved = pushed = torch.zeros_like(p)
-    # time of each stage as a fraction of the step, and weight of the stage
+    # For each stage, its time as a fraction of the step, and its weight in the mean.
     for fraction, weight in ((0.0, 1), (0.5, 2), (0.5, 2), (1.0, 1)):
         stage = fraction * step
         # The friction state of a stage is z, the state at the start of the step, after the displacement from the
@@ -108,7 +108,10 @@ def runge_kutta(
 
 
 def unbounded(mass: Tensor) -> Tensor:
-    """Return ones, (...), in place of ``DerivedMass.fraction``: M, (..., n, n), is then not corrected."""
+    """Return ones, (...), for mass matrices M, (..., n, n).
+
+    The function replaces ``DerivedMass.fraction``, so that an indefinite M is not corrected.
+    """
     return mass.new_ones(mass.shape[:-2])
 
 
@@ -119,7 +122,7 @@ def mass_as_learned(model: nn.Module) -> Iterator[None]:
     if not isinstance(mass, DerivedMass):
         yield
         return
-    # An attribute of the instance hides the method of its class.
+    # An attribute of the instance hides the method of its class, so that only this model is changed.
     vars(mass)["fraction"] = unbounded
     try:
         yield

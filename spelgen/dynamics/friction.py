@@ -139,7 +139,10 @@ class FrictionModel:
     def torque(
         self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None, motors: np.ndarray
     ) -> np.ndarray:
-        """Return the joint torque of all effects but the armature, (..., n) [Nm, N], for ``constants`` (effects, n)."""
+        """Return the joint torque of all effects except for the armature, (..., n) [Nm, N].
+
+        constants: coefficients of all effects, (effects, n). qd, bent, motors: see `columns`.
+        """
         speed = qd @ motors.T
         torque: np.ndarray = (self._effects(speed, np.zeros_like(speed), bent) * constants).sum(
             axis=-2
@@ -147,20 +150,21 @@ class FrictionModel:
         return torque
 
     def _effects(self, speed: np.ndarray, rise: np.ndarray, bent: np.ndarray | None) -> np.ndarray:
-        """Return the factor of each constant, (..., effects, n).
+        """Return the torque of each effect per unit of its coefficient, (..., effects, n), at the drives.
 
-        speed, rise: velocities and accelerations of the drives, (..., n).
+        speed, rise: velocities and accelerations of the drives, (..., n). bent: see `columns`.
         """
         sign = np.tanh(speed / self.coulomb_smoothing_velocity)
         dry = [sign]
         if self.memory:
-            # If the history of motion is unknown, assume that the joint has moved in this direction for a long time.
+            # If the friction state is unknown, the drive is assumed to have moved in the direction of its velocity for
+            # a long time.
             dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
         effects = [rise, speed, *dry, np.ones_like(speed)]
         if self.stribeck:
-            # the Stribeck effect falls to 1/e at 0.1 rad/s or m/s
+            # The Stribeck effect falls to 1/e at 0.1 rad/s or m/s.
             effects.append(sign * np.exp(-((speed / 0.1) ** 2)))
         if self.polynomial:
             effects += [speed * np.abs(speed), speed**3]
-        # in the order of the property `effects`
+        # The columns have the order of the property `effects`.
         return np.stack(effects, axis=-2)

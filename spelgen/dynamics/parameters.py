@@ -46,7 +46,8 @@ def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
         for declared in type(module).__mro__:
             for name, kind, unit, *_ in vars(declared).get("parameter_groups", ()):
                 weight = module._parameters.get(name, module._buffers.get(name))
-                if weight is not None and weight.numel():  # a module may have no such parameter
+                # Optional parameters are None or empty in modules that do not use them.
+                if weight is not None and weight.numel():
                     table[f"{path}.{name}" if path else name] = ParameterInfo(kind, unit)
     return table
 
@@ -104,7 +105,7 @@ def without_idle_residuals(model: Model) -> Model:
             terms.mass = None
         if _is_idle(terms.potential):
             terms.potential = None
-        # Without any residual term the factor on friction is one: remove its evaluation, too.
+        # If all residual terms are zero, the factor on friction is one, and its evaluation is removed, too.
         if not any(bool(weights.any()) for weights in terms.parameters()):
             reduced.residuals = None
     return reduced
@@ -128,7 +129,7 @@ def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
 
 
 def friction_factor(model: object, q: Tensor) -> Tensor:
-    """Return the factor of the residual terms on friction, (..., n), at q (..., n)."""
+    """Return the position-dependent factor by which the residual terms multiply friction, (..., n), at q (..., n)."""
     if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.ones_like(q)
     return model.residuals.at(q, model.prepare().residual).friction

@@ -45,10 +45,10 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
     )
     collect([error(element=f"joint {body.name!r}") for body in arm.bodies if body.inertia is None])
     model = kinematic_model(arm)
-    # index 0 of Pinocchio is the universe
+    # The joint with index 0 is the universe (the fixed world) in Pinocchio, so bodies are counted from 1.
     for index, body in enumerate(arm.bodies, start=1):
         model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
-    # a mimic joint has no motor of its own
+    # A mimic joint has no motor of its own, and therefore no armature.
     rotors = {name: settings.joint(name).armature for name in arm.joint_names}
     model.armature = np.array([rotors.get(body.name, 0.0) for body in arm.bodies])
     return model
@@ -69,6 +69,6 @@ def kinematic_model(arm: Chain) -> pin.Model:
 
 def _inertia(parameters: np.ndarray) -> pin.Inertia:
     mass, hx, hy, hz, ixx, ixy, ixz, iyy, iyz, izz = parameters
-    if mass == 0.0:  # Pinocchio would divide by zero
+    if mass == 0.0:  # `FromDynamicParameters` would divide by zero.
         return pin.Inertia(0.0, np.zeros(3), np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]))
     return pin.Inertia.FromDynamicParameters(np.array([mass, hx, hy, hz, ixx, ixy, iyy, ixz, iyz, izz]))

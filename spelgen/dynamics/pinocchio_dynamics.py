@@ -36,7 +36,7 @@ def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
         result = method(self, *np.broadcast_arrays(*map(np.asarray, states)))
         if isinstance(first, np.ndarray):
             return result
-        # torch is imported here, since this file must be importable without torch
+        # A method of the argument makes the tensor, since this file must be importable without torch.
         return first.new_tensor(result)
 
     return on_arrays
@@ -75,7 +75,8 @@ class PinocchioDynamics:
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
         """Return the mass matrix M, (..., n, n) [kg m^2, kg m, kg]."""
         upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
-        joints = upper + np.triu(upper, 1).swapaxes(-1, -2)  # Pinocchio guarantees the upper triangle only
+        # Pinocchio guarantees only the upper triangle of M.
+        joints = upper + np.triu(upper, 1).swapaxes(-1, -2)
         return np.asarray(self.jacobian.T @ joints @ self.jacobian)
 
     @_takes_tensors
@@ -98,7 +99,7 @@ class PinocchioDynamics:
     def forward_dynamics(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """Return the accelerations qdd, (..., n), under the inputs tau (..., n)."""
         force = tau @ self.inputs.T - self.friction(qd)
-        if self._same:  # Pinocchio overwrites its result in the next call: copy it
+        if self._same:  # The result is copied, because Pinocchio overwrites it in the next call.
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
         # `aba` cannot solve the constrained equations K^T M K qdd = force, so M is computed.
         force = force - self.nonlinear_effects(q, qd)
@@ -124,7 +125,7 @@ class PinocchioDynamics:
         configuration = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
         for joint in self.model.joints[1:]:
             position = q[..., joint.idx_v]
-            if joint.nq <= 2:  # Pinocchio represents a continuous joint by (cos, sin)
+            if joint.nq <= 2:  # Pinocchio represents a continuous joint by (cos q, sin q).
                 values = [position] if joint.nq == 1 else [np.cos(position), np.sin(position)]
                 configuration[..., joint.idx_q : joint.idx_q + joint.nq] = np.stack(values, axis=-1)
         return configuration

@@ -134,7 +134,7 @@ class PreparedModel:
         """
         n = self.n
         z = self.memory(qd) if z is None else z
-        # torch.func cannot differentiate compiled functions
+        # torch.func cannot differentiate compiled functions, so the copy has the method that is not compiled.
         plain = copy.copy(self)
         vars(plain).pop("forward_dynamics", None)
 
@@ -169,7 +169,10 @@ class PreparedModel:
         return result
 
     def _at(self, q: Tensor, *others: Tensor) -> object:
-        """Return the configuration cache of the model at q, after a check of the shapes of all arguments."""
+        """Return the model's configuration cache, the quantities that depend on q only, at q (..., n).
+
+        others: further vectors (..., n), whose dtypes and shapes are checked.
+        """
         return self._model.at(q, *others, prepared=self._weights)
 
     def _kinematics(self) -> TipKinematics:
@@ -182,7 +185,8 @@ def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: 
     """Return the Jacobians, (batch, m, n), of a function with respect to each of its first ``variables`` inputs."""
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
-    # torch 2.13: vmap of a derivative of linalg.solve is wrong in forward mode, or without autograd
+    # In torch 2.13, vmap of a derivative of linalg.solve is wrong in forward mode, and if autograd is disabled:
+    # autograd is therefore enabled, and reverse mode is used.
     with torch.inference_mode(False), torch.enable_grad():
         jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
         # Tensors of inference mode cannot be differentiated, so the inputs are cloned.

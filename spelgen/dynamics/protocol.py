@@ -1,4 +1,4 @@
-"""The common interface of dynamics of an arm: trained models, Pinocchio, and least-squares parameters."""
+"""The common interface of dynamics of an arm: trained models, Pinocchio, and bodies with least-squares parameters."""
 
 from __future__ import annotations
 
@@ -104,10 +104,11 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the last arguments of each method, which describe the history of friction: z and the direction.
+    """Return the friction state z and the direction, which are the last arguments of the methods of `dynamics`.
 
-    z is omitted if friction has no state. direction: direction in [-1, 1] of dry friction without bristles, (..., n).
-    It is required if tau was filtered, and must have passed the same filter.
+    Arguments that `dynamics` does not have are omitted. z: (..., n, K) [rad, m] for K bristles. direction: direction in
+    [-1, 1] of dry friction without bristles, (..., n); it is required if tau was filtered, and must have passed the
+    same filter.
     """
     if z is None or not is_stateful(dynamics):
         return ()
@@ -117,7 +118,7 @@ def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = No
 
 
 class VelocityState:
-    """Adapter for rollouts: dynamics without momenta, whose state has velocities in place of momenta."""
+    """Adapter with which rollouts integrate dynamics that have no momenta: the state is (q, qd) in place of (q, p)."""
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
@@ -151,5 +152,5 @@ class VelocityState:
 
 
 def integrable(dynamics: RigidDynamics) -> Any:
-    """Return dynamics for rollouts: the given ones if they have momenta, otherwise `VelocityState` of them."""
+    """Return `dynamics` in a form for rollouts: unchanged if it has momenta, otherwise wrapped in `VelocityState`."""
     return dynamics if isinstance(dynamics, PortHamiltonian | VelocityState) else VelocityState(dynamics)

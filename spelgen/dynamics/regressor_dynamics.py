@@ -51,7 +51,7 @@ class RegressorDynamics:
     parameters: inertial parameters, (10 B,), in the order of ``regressor``. armature: armature of the drives, (n,)
     [kg m^2, kg]. friction: function of velocities (T, n), and of the friction state z (T, n, K) or None, that returns
     torques (T, n) [Nm, N]. bristle_reach: break-away displacements, (n, K) [rad, m]; None: friction has no state.
-    drives: None: each input is the torque of its joint.
+    drives: matrices G of the inputs and C of the motors (see ``Drives``); None: each input is the torque of its joint.
     """
 
     def __init__(
@@ -99,8 +99,13 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the frames of the B bodies at q, and the momenta of the bodies per joint velocity, (..., n, 12 B)."""
-        # The columns of homogeneous transforms replace points of the bodies: M is linear in the pseudo-inertias.
+        """Return the configuration cache of the B bodies at q, and their momenta per joint velocity, (..., n, 12 B).
+
+        The momentum of a body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and
+        its pseudo-inertia J.
+        """
+        # The kinetic energy of a body is 1/2 tr(T' J T'^T), linear in J, so that J may be physically inconsistent. The
+        # identity in place of point masses gives the columns of T.
         chain = self.chain.forward(q, torch.eye(len(self.inertia)).to(q))
         jacobian = torch.unflatten(self.chain.ratios.mT @ chain.jacobian, -1, (3, -1))
         return chain, (jacobian @ self.inertia).flatten(-2)
@@ -113,9 +118,8 @@ class RegressorDynamics:
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the accelerations qdd, (..., n), under the inputs tau (..., n)."""
         equations = self.equations_at(q)
-        force = equations.force(qd, tau, z).unsqueeze(
-            -1
-        )  # (..., n, 1), so that M and tau may have different batch dimensions
+        # With a last dimension of 1, M and tau may have different batch dimensions.
+        force = equations.force(qd, tau, z).unsqueeze(-1)
         qdd: Tensor = torch.linalg.solve(equations.mass, force)
         return qdd.squeeze(-1)
 

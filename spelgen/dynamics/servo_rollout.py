@@ -2,10 +2,10 @@
 
 The springs of the servos and dry friction are stiff, so both are integrated implicitly. Springs are linearised at the
 start of a step (Rosenbrock; Hairer and Wanner, Solving ODEs II, IV.7, with the weights of the theta method). A few
-steps between samples are then stable for any gain. Theta is fitted exponentially, so that decaying motion decays at its
-true rate to third order (Liniger and Willoughby, SIAM J. Numerical Analysis 7:47, 1970): 1/2 for slow motion, without
-numerical damping, and towards 1 for motion that is too fast for a step. The update of the friction state is exact for a
-given displacement.
+steps between samples are then stable for any gain. Theta is computed for each step such that decaying motion has its
+true rate of decay to third order (exponential fitting: Liniger and Willoughby, SIAM J. Numerical Analysis 7:47, 1970).
+Theta is 1/2 for slow motion, without numerical damping, and tends to 1 for motion that is too fast for a step. The
+update of the friction state is exact for a given displacement.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,8 @@ class ServoDrives(NamedTuple):
     friction: FrictionConstants
     offset: Tensor  # torque offset [Nm, N]
     reach: Tensor  # break-away displacements, (K, ..., n) [rad, m]
-    steepness: Tensor  # derivative of the direction of dry friction, (K, ..., n) [1/rad, 1/m]
+    # Derivative of the direction of dry friction, from -1 to 1, with respect to the deflection of each bristle.
+    steepness: Tensor  # (K, ..., n) [1/rad, 1/m]
 
 
 class ServoState(NamedTuple):
@@ -67,7 +68,7 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return the state whose bristles balance the other torques as far as their break-away torque allows.
+    """Return the state in which dry friction balances all other torques, or is at its limit if it cannot.
 
     It is the state at rest, or of steady motion. q, u: positions and commands, (..., n) [rad, m]. qd: velocities, (...,
     n) [rad/s, m/s].
@@ -86,7 +87,8 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     strength = drives.friction.dry(qd, load.gravity) * drives.steepness
     spring = servo.kp * beyond(u - q, servo.dead_zone)
     torque = spring - servo.kd * qd
-    free = (torque.abs() < servo.limit).to(q)  # 0: the servo is saturated, without stiffness and damping
+    # `free` is 0 if the servo is saturated: its torque is then constant, without stiffness and damping.
+    free = (torque.abs() < servo.limit).to(q)
     servo_stiffness = free * servo.kp * (spring != 0)
     torque = torch.where(free > 0, spring, servo.limit * torque.sign())
     force = torque - drives.offset - load.bias - (strength * z).sum(dim=0)
@@ -104,7 +106,8 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     velocity = slipped(inertia * qd + impulse, inertia + damping, bristle_stiffness, bent, reach)
     if load.coupled:
         momentum = applied(load.inertia, qd) + impulse
-        # The inertia couples joints: the bristles that slide follow from a fixed point, reached in two iterations.
+        # Which bristles slide depends on the displacements of all joints, which the inertia couples. The solution is
+        # found by fixed-point iteration; two iterations suffice.
         for _ in range(2):
             rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
             secant = rise / torch.where(velocity == 0, 1.0, velocity)
@@ -120,30 +123,32 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
 def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Tensor) -> Tensor:
     """Return the displacement x, (..., n), that solves slope x + sum_k strength_k (z_k(x) - z_k) = push, (..., n).
 
-    strength, z, reach: (K, ..., n), the shortest break-away displacement first. Bristles that are deflected in the same
-    direction begin to slide in this order. With k sliding bristles the equation is a straight line; x is the largest
-    zero of these K + 1 lines.
+    push: force on the joint. slope: stiffness without bristles, (..., n). strength: stiffness of each bristle. z,
+    reach: deflections and break-away displacements. strength, z and reach are (K, ..., n), the shortest break-away
+    displacement first. Bristles that are deflected in the same direction begin to slide in this order. With k sliding
+    bristles the equation is linear in x; the solution is the largest of the solutions of these K + 1 linear equations.
     """
     direction, stiffness = push.sign(), slope + strength.sum(dim=0)
-    # Cumulative sums give the remaining push and the stiffness for each number k of sliding bristles.
+    # For each number k = 0 .. K of sliding bristles, cumulative sums give the force that remains for all elements that
+    # do not slide, and the stiffness of these elements.
     remaining = torch.cat([push.abs().unsqueeze(0), -strength * (reach - direction * z)]).cumsum(dim=0)
     resisting = torch.cat([stiffness.unsqueeze(0), -strength]).cumsum(dim=0)
     return direction * (remaining / resisting).amax(dim=0)
 
 
 def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:
-    """Return the positions (W, K, n) [rad, m] after each of K intervals, for W windows.
+    """Integrate W windows under their commands; return the positions (W, I, n) [rad, m] after each of I intervals.
 
-    q, qd: initial positions and velocities, (W, n). commands: delayed commands, (W, K, S, n), with S steps per
-    interval. dt: durations of the intervals, (W, K) [s]. M and the gravity torque are evaluated once per interval.
+    q, qd: initial positions and velocities, (W, n). commands: delayed commands, (W, I, S, n), with S steps per
+    interval. dt: durations of the intervals, (W, I) [s]. M and the gravity torque are evaluated once per interval.
     """
     with torch.no_grad():
         drives, prepared, positions = servo_drives(model), model.prepare(), []
         state, previous_bias = None, None
         for now, interval in zip(commands.unbind(1), dt.unbind(1), strict=True):
             pose = model.configuration(q, prepared)
-            # Between samples M and gravity change slowly, in contrast to springs and friction: evaluate them once per
-            # interval.
+            # Between samples, M and gravity change slowly, in contrast to springs and friction, so they are evaluated
+            # once per interval.
             bias = middle_bias = model.nonlinear_effects(pose, qd)
             # The bias is known only up to the start of the interval: extrapolate it to the middle.
             if previous_bias is not None:

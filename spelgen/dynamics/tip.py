@@ -67,7 +67,7 @@ def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> S
     The frames are built from spelgen's values of the URDF, since the URDF parser of pytorch-kinematics rounds to
     float32.
     """
-    import pytorch_kinematics as pk  # imported here: it imports matplotlib, which takes long
+    import pytorch_kinematics as pk  # The import is here, because it imports matplotlib, which takes long.
     from pytorch_kinematics.frame import Frame, Joint, Link
 
     first = last = Frame(root, Link(root), Joint())
@@ -107,7 +107,10 @@ def tip_kinematics(
 
 
 def last_link(robot: Robot, joints: Sequence[str]) -> str:
-    """Return the link after the last of the given joints, or the end of the fixed links that follow this link."""
+    """Return the child link of the last of the given joints, or the end of a chain of links fixed to this link.
+
+    The chain ends at a link with no fixed joint, or with several fixed joints, to its children.
+    """
     link = robot.joint[joints[-1]].child
     while True:
         fixed = [joint.child for joint in robot.joints_below[link] if joint.type == "fixed"]

@@ -35,9 +35,9 @@ def tip_frame(loaded: Arm) -> Tip:
 
 
 def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
-    """Return a mapping from each link to the body that carries the link, and to the pose of the link in its frame.
+    """Return, by the name of each link, the body that carries the link and the pose of the link, (4, 4), in its frame.
 
-    The body is an index, -1 for the root link; the pose is (4, 4). Angles of the URDF are not rounded.
+    The body is an index in `Chain.bodies`, or -1 for the root link. Angles of the URDF are not rounded.
     """
     chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
     poses: dict[str, tuple[int, np.ndarray]] = {}

@@ -1,4 +1,8 @@
-"""The motions that charts show: the predictions, torques and replays of median error and of largest error."""
+"""Selection of the motions that charts show.
+
+Of all predicted windows, of all torque curves and of all replayed logs, the one of median error and the one of largest
+error are selected.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -43,9 +47,10 @@ class DrawnMotion:
 class PredictedMotion(DrawnMotion):
     """A measured motion and its prediction, (T, n) each.
 
-    error: prediction error divided by the size of the motion, or RMS error [rad, m] of a replayed log. start: time of
-    the first sample in the log [s]; None for a log that is replayed as a whole. u: commands of position servos (T, n)
-    [rad, m]; such a motion has no velocities.
+    error: RMS over joints of the errors of q and qd at the end of the motion, each divided by the RMS change of q or qd
+    over all windows [1]; for a replayed log, RMS position error [rad, m]. start: time of the first sample in the log
+    [s]; None for a log that is replayed as a whole. u: commands of position servos (T, n) [rad, m]; such a motion has
+    no velocities.
     """
 
     start: float | None = None
@@ -86,7 +91,7 @@ def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
 
 
 def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
-    """Return the motion subsampled to about `max_samples` samples at most."""
+    """Return every k-th sample of the motion, with the smallest k that gives at most `max_samples` samples."""
     # Samples are omitted, not averaged: a filter would hide spikes, which the reported errors contain.
     stride = -(-len(motion.t) // max_samples)
     arrays = {name: values for name, values in vars(motion).items() if isinstance(values, np.ndarray)}
@@ -110,7 +115,8 @@ def predicted_motion(trajectory: str, windows: Windows, states: States, k: int =
 def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
     """Return the measured and the predicted motion of a replayed log of position servos.
 
-    error: (T-1, n) predicted minus measured positions [rad, m] at all samples except the first."""
+    error: (T-1, n) predicted minus measured positions [rad, m] at all samples except the first.
+    """
     return PredictedMotion(
         trajectory=log.name,
         error=number(float(np.sqrt(np.square(error).mean()))),
@@ -123,9 +129,13 @@ def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
 
 
 def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
-    """Return ten seconds of each log, subsampled for charts: from the middle, as logs begin and end at rest."""
+    """Return the middle ten seconds of each log, subsampled for charts.
+
+    The middle is used because logs begin and end at rest.
+    """
     motions = []
-    # At a low sample rate a filter gives no accelerations; torques are then shown per sample interval, see `_steps`.
+    # Logs of low sample rate have no usable accelerations: mean accelerations and torques of each sample interval are
+    # shown instead.
     slow = [piece for piece in logs.pieces if not shows_accelerations(piece.sample_rate)]
     for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
@@ -149,7 +159,8 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
         inputs = np.eye(q.shape[-1])
-        if isinstance(model, PortHamiltonian):  # the input matrix G may couple motors and joints
+        # The input matrix G of a model may couple motors and joints; other dynamics have G = 1.
+        if isinstance(model, PortHamiltonian):
             inputs = model.input_matrix(q).numpy()
         gravity = model.gravity(q)
         curves = {
@@ -164,7 +175,7 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
     measured = _at_joints(inputs, samples.tau)
     # After the filter, samples are evenly spaced.
     t = np.arange(len(samples.q)) / samples.rate
-    # The friction term of the model includes the constant torque offset.
+    # The friction term is the model's torque minus the stored terms, so it includes the constant torque offset.
     stored = curves["inertia"] + curves["Coriolis"] + curves["gravity"]
     works = {
         "work of the drives": measured,

@@ -71,7 +71,7 @@ def evaluate(
         logs: test logs of the same arm.
         arm: result of ``load_arm``, or the path of a URDF; by default the arm of the fit. It is needed for the URDF as
             a baseline, and for tip errors.
-        baselines: name -> dynamics, evaluated in addition to the baselines of `baselines.registry`, for example
+        baselines: dynamics by name, evaluated in addition to the baselines of `baselines.registry`, for example
             ``{"truth": identify(...).dynamics}``.
         preprocessing: filter and delay of states and torques; by default the preprocessing of the fit.
         steps: prediction horizons [samples].
@@ -92,7 +92,8 @@ def evaluate(
         require_joints(trajectory, tested.joints)
     notes = check(logs, tested.joints, tested.model.joint_types)
     seen = [trajectory.name for trajectory in logs if trajectory.name in tested.trained_on]
-    if seen:  # names are compared, as a run records only the names of its logs
+    # Test logs that were also training logs are detected by their names, because a run does not store the logs.
+    if seen:
         message = (
             f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
         )
@@ -172,7 +173,8 @@ def _evaluate_torques(
             expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
             do="omit --quick",
         )
-    # Joints with coarsely quantised torque are found after the errors: only the assessment omits these joints.
+    # Joints with coarsely quantised torque are omitted from the assessment only, so they are determined after the
+    # errors are computed.
     steps = coarse_torques(logs, tested.joints, notes) if torque else {}
     masses = {}
     if truth is not None:
@@ -218,7 +220,8 @@ def _tip(tested: Subject, notes: list[Diagnostic]) -> TipPosition | None:
     try:
         tip = tested.spec.options.tip if tested.spec else None
         return tip_kinematics(tested.urdf, tip, joints=tested.joints).position
-    except (ValueError, SpelgenError) as error:  # the evaluation continues without this result
+    # The evaluation continues without tip errors if the URDF has an error.
+    except (ValueError, SpelgenError) as error:
         message = f"no tip errors: {in_one_line(error)}"
         notes.append(Diagnostic("info", "no-tip", tested.urdf.name, None, message))
         return None

@@ -56,13 +56,16 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     cache = dynamics.prepare()
     pose = dynamics.at(q, prepared=cache)
     p = dynamics.momentum(pose, qd)
-    # Inputs are constant per interval. At a sample both values are used: of the next and of the previous interval.
+    # The torque is constant in each interval. The trapezoidal rule needs the torque at both ends of an interval, so at
+    # a sample the torques of the following and of the preceding interval are both evaluated.
     inputs = torch.stack([torch.cat([tau, tau[:, -1:]], dim=1), torch.cat([tau[:, :1], tau], dim=1)])
     _, (at_start, at_end) = dynamics.port_hamiltonian_rhs(pose, p, inputs, cache, *known_past(dynamics, z))
-    residual = p.diff(dim=1) / dt - (at_start[:, :-1] + at_end[:, 1:]) / 2  # d in each interval, (W, past, n)
+    # residual of the momentum balance in each interval, d (W, past, n)
+    residual = p.diff(dim=1) / dt - (at_start[:, :-1] + at_end[:, 1:]) / 2
     gain = 1 - torch.exp(-dt / TUNING.observer_time_constant)
     r = torch.zeros_like(residual[:, 0])
-    response = torch.zeros_like(gain[:, 0])  # response of the filter to d = 1
+    # step response of the observer: its output for a constant disturbance of 1
+    response = torch.zeros_like(gain[:, 0])
     for k in range(past):
         r = r + gain[:, k] * (residual[:, k] - r)
         response = response + gain[:, k] * (1 - response)
@@ -71,7 +74,10 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
 
 def without_past(windows: Windows, past: int) -> Windows:
-    """Return the windows without their first `past` steps; z is still the friction state before these steps."""
+    """Return the windows without their first `past` steps.
+
+    The friction state z is not updated: it belongs to the first sample of the given windows.
+    """
     dt, q, qd, tau = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
     return Windows(dt, q, qd, tau, windows.z)
 
@@ -118,9 +124,10 @@ class Horizon:
 class EvaluatedLogs:
     """Test logs, cut at gaps and filtered.
 
-    pieces: segments without gaps, from which windows are cut. samples: torques and accelerations of logs that are dense
-    enough for a filter, see `dynamics_samples`. used: the preprocessing. reach: break-away displacements (n, K) [rad,
-    m] of the friction bristles.
+    pieces: segments without gaps, from which windows are cut. samples: filtered torques and accelerations of the logs
+    whose sample rate is high enough to differentiate twice (see `dynamics_samples`). used: preprocessing (filter and
+    torque delay) of these logs. reach: break-away displacements of the K friction bristles of each joint, (n, K) [rad,
+    m].
     """
 
     pieces: Sequence[Trajectory]
@@ -140,11 +147,14 @@ class EvaluatedLogs:
         return max(map(len, self.pieces)) - 1
 
     def stride(self, span: int, window_count: int) -> int:
-        """Return the samples from the start of a window to the next, for `window_count` windows of `span` steps."""
+        """Return the number of samples between the starts of consecutive windows.
+
+        There are then about `window_count` windows of `span` steps.
+        """
         return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // window_count)
 
     def starts(self, span: int, window_count: int) -> list[tuple[Trajectory, int]]:
-        """Return the piece and the index of the first sample of each window; see `stride` for the arguments."""
+        """Return the piece and the index of the first sample of about `window_count` windows of `span` steps."""
         stride = self.stride(span, window_count)
         return [(piece, k) for piece in self.pieces for k in range(0, len(piece) - span, stride)]
 
@@ -157,9 +167,10 @@ class EvaluatedLogs:
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Predictions of W windows.
+    """Predictions of W windows of K samples.
 
-    starts: piece and index of the first sample of each window. states: predicted q and qd (W, K-1, n) per predictor.
+    starts: piece and index of the first sample of each window. states: predicted q and qd of each predictor at the
+    samples after the first, (W, K-1, n) each [rad, m, per second].
     """
 
     windows: Windows
@@ -170,7 +181,10 @@ class Predictions:
 def horizon_lengths(
     logs: EvaluatedLogs, steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
 ) -> dict[str, int]:
-    """Return the number of samples per name of a horizon. A horizon longer than every trajectory only gives a note."""
+    """Return the length of each horizon [samples], by the name of the horizon, such as "1 s".
+
+    A horizon that is longer than every trajectory is omitted, and a note is appended to `notes`.
+    """
     lengths = {counted(k, "step"): k for k in steps}
     lengths |= {f"{duration:g} s": round(duration * logs.rate) for duration in seconds}
     possible = {}
@@ -225,14 +239,17 @@ def predict(
 def end_errors(
     states: States, windows: Windows, joint_types: Sequence[str], tip: TipPosition | None
 ) -> StateErrors:
-    """Return the errors at the last sample of the windows. states: predicted q and qd (W, K-1, n)."""
+    """Return the errors at the last sample of W windows of K samples.
+
+    states: predicted q and qd at the samples after the first, (W, K-1, n) each.
+    """
     q, qd = (predicted[:, -1] for predicted in states)  # (W, n)
     measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
     # Angles of revolute joints are compared modulo a revolution. The RMS is used instead of the mean absolute error,
     # since large errors decide whether a simulation is usable.
     q_error = _rms(position_difference(q, measured_q, joint_types))
     qd_error = _rms(qd - measured_qd)
-    # Errors are divided by the RMS motion over the horizon, so that joints and horizons can be compared.
+    # Errors are divided by the RMS change of q and qd over the horizon, so that joints and horizons can be compared.
     q_relative = q_error / _rms(position_difference(measured_q, windows.q[:, 0], joint_types))
     qd_relative = qd_error / _rms(measured_qd - windows.qd[:, 0])
     mean = torch.cat([q_relative, qd_relative]).mean(dim=0, keepdim=True)
@@ -245,5 +262,5 @@ def end_errors(
 
 
 def _rms(values: Tensor) -> Tensor:
-    """Return the root mean square over the first dimension (windows), (W, ...) -> (...)."""
+    """Return the root mean square of values (W, ...) over the W windows, (...)."""
     return values.square().mean(dim=0).sqrt()

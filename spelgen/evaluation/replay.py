@@ -39,7 +39,7 @@ class Replay:
 
 
 PositionErrors = tuple[Trajectory, np.ndarray]
-"""A log, and predicted minus measured positions at the end of each interval, (K, n) [rad, m]."""
+"""A log of K + 1 samples, and predicted minus measured positions after each of its K intervals, (K, n) [rad, m]."""
 
 
 class ServoModel:
@@ -51,13 +51,18 @@ class ServoModel:
         self._model = without_idle_residuals(model)
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the predicted positions of each part, (K, n) [rad, m]. Shorter parts of the batch are padded."""
+        """Return the predicted positions of each part: an array (K, n) [rad, m] for a part of K + 1 samples.
+
+        The first sample, the initial state, is not predicted. Parts are padded to one length for the rollout; the
+        padding is removed from the result. q, qd: initial positions and velocities of the parts, (parts, n).
+        """
         # All parts form one batch, so they have the same number of integrator steps: the largest that a part needs.
         steps = max(steps_between(log) for log, _ in parts)
         lengths = [rows.stop - rows.start - 1 for _, rows in parts]
         commands, intervals = [], []
         for (log, rows), length in zip(parts, lengths, strict=True):
-            # A batch is used because the operations of a rollout are small: many parts take as long as one.
+            # One batch of all parts is used, because the operations of a rollout are small: many parts take as long as
+            # one.
             padding = (0, max(lengths) - length)
             delayed = delayed_commands(log, rows, float(self._model.servo.delay), steps)
             commands.append(np.pad(delayed, (padding, (0, 0), (0, 0)), mode="edge"))
@@ -105,9 +110,10 @@ def replays(
 def _replay(
     name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
-    """Return the errors of all predictors, and the position errors (K, n) [rad, m] of the model on each part.
+    """Return the errors of all predictors, and the position errors of the model on each part.
 
-    qd: (parts, n) initial velocities [rad/s, m/s].
+    The position errors are (K, n) [rad, m] for a part of K + 1 samples; the first sample, the initial state, has no
+    error. qd: (parts, n) initial velocities [rad/s, m/s].
     """
     q = np.stack([log.q[rows.start] for log, rows in parts])
     measured = [log.q[rows][1:] for log, rows in parts]
@@ -120,7 +126,11 @@ def _replay(
 
 
 def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
-    """Return RMS errors per log and per joint. names: log of each part. errors: (K, n) [rad, m] of each part."""
+    """Return RMS errors per log and per joint.
+
+    names: name of the log of each part. errors: position errors of each part, (K, n) [rad, m] for a part of K + 1
+    samples.
+    """
     by_name: dict[str, list[np.ndarray]] = {}
     # A log with gaps consists of several parts with the same name.
     for name, error in zip(names, errors, strict=True):

@@ -59,7 +59,8 @@ class Invariants:
 
     least_eigenvalue: smallest eigenvalue of M over 100,000 random q, divided by the mean eigenvalue; it must be
     positive. energy_rise: largest rise of H in one of 10,000 steps of 1 ms without input, divided by the largest
-    kinetic energy; it must not be positive, except for rounding. None: nothing moved.
+    kinetic energy; it must not be positive, except for rounding. energy_rise is None if the simulated arm did not move,
+    so that the kinetic energy is zero, or if the motion diverged.
     """
 
     least_eigenvalue: float
@@ -67,8 +68,10 @@ class Invariants:
 
 
 def invariants(model: ArmModel, windows: Windows, low: Tensor, high: Tensor) -> Invariants:
-    """Return the smallest eigenvalue of M over random q in [low, high] (n,), and the largest rise of H in unforced
-    rollouts from the first states of the windows.
+    """Return the smallest eigenvalue of M over random q, and the largest rise of the energy H without input.
+
+    model: model with M and H. windows: windows whose first states are the initial states of the motion without input.
+    low, high: bounds of q, (n,) [rad, m].
     """
     with torch.no_grad():
         return Invariants(_least_eigenvalue(model, low, high), _energy_rise(model, windows))

@@ -96,7 +96,10 @@ class Subject:
 
 
 def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = None) -> Subject:
-    """Return the subject of an evaluation. tested: a model, a fit or the folder of a run. arm: see `evaluate`."""
+    """Return the subject of an evaluation.
+
+    tested: a model, a fit or the folder of a run. arm: arm, or path of its URDF; None: the arm of the fit.
+    """
     if isinstance(tested, str | Path):
         tested = load_run(tested)
     model, fit = (tested.model, tested) if isinstance(tested, Fit) else (tested, None)
@@ -121,6 +124,8 @@ def read_test_logs(
     # By default the mapping of the training logs is used, since test logs usually come from the same logger.
     if mapping is None:
         mapping = record.mapping
-    elif isinstance(mapping, str | Path) and run.urdf.exists():  # a mapping may contain all joints of a URDF
+    # The names in a mapping are checked against all joints of the URDF, not only the joints of the model: one mapping
+    # may be used for several models of an arm.
+    elif isinstance(mapping, str | Path) and run.urdf.exists():
         mapping = load_mapping(mapping, read_urdf(run.urdf).joint)
     return read_logs(paths, spec.joint_names, mapping, "test", joint_types=spec.joint_types)

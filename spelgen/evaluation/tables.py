@@ -20,7 +20,7 @@ OBSERVER = (
 )
 
 Numbers = Mapping[str, float | None]
-"""Column -> number; None for an unknown number."""
+"""Numbers of a row, by the name of the column; None for an unknown number."""
 MASS_TITLE = "Error of the mass matrix, relative to the true one (at positions of the test logs)"
 CSV_HEAD = ("table", "row", "predictor", "value")
 LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
@@ -61,7 +61,7 @@ class Table:
 
     @property
     def columns(self) -> list[str]:
-        """Return the names of all columns, in the order of the rows."""
+        """Return the names of all columns, in the order of their first occurrence in the rows."""
         return list(dict.fromkeys(name for row in self.rows for name in row.values))
 
     def text(self) -> str:
@@ -80,7 +80,7 @@ class Table:
 
 
 def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
-    """Return a table of ranked rows. rows: label of a row -> column -> number."""
+    """Return a table of ranked rows. rows: label of each row, and the numbers of the row per column."""
     return Table(title, tuple(map(Row, rows, rows.values())), note)
 
 
@@ -226,7 +226,7 @@ def _by_joint(
 
 
 def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | None]]) -> dict[str, Numbers]:
-    """Return rows per joint: label of a joint -> predictor -> error. errors: predictor -> error of each joint."""
+    """Return a row per label with the errors of all predictors. errors: errors of all joints per predictor."""
     return {label: {name: values[k] for name, values in errors.items()} for k, label in enumerate(labels)}
 
 
@@ -234,7 +234,8 @@ def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | Non
 class Figure:
     """One of the few figures that summarise an evaluation.
 
-    unit: for "variance" or "motion" the value is a fraction of the torque's variance or of the motion.
+    unit: a unit; or "variance", for a fraction of the variance of the torque; or "motion", for a fraction of the RMS
+    change of q and qd over the horizon.
     """
 
     name: str

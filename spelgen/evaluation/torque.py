@@ -69,7 +69,8 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
     """Return the friction state (T, n, K) of K bristles and the direction of motion (T, n), in [-1, 1].
 
-    Methods of `dynamics` have these last arguments; arguments that a model lacks are omitted (see `known_past`).
+    The returned values are the last arguments of the methods of `dynamics`. A value for which a model has no argument
+    is omitted (see `known_past`).
     """
     past = (None if x is None else torch.from_numpy(x) for x in (samples.z, samples.direction))
     return known_past(dynamics, *past)
@@ -87,7 +88,8 @@ def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """Return the nMSE of each joint, (n,), for residual and torque (T, n); NaN for a joint of constant torque."""
     deviation = torque.std(axis=0)
     largest = np.abs(torque).max(axis=0, initial=0.0)
-    varies = deviation > LEAST_SQUARES.negligible * largest  # otherwise constant up to rounding
+    # A torque whose standard deviation is at the level of rounding errors counts as constant.
+    varies = deviation > LEAST_SQUARES.negligible * largest
     # A residual that is not finite becomes infinity: NaN means constant torque.
     squares = np.nan_to_num(np.square(residual).mean(axis=0), nan=np.inf, posinf=np.inf)
     nmse: np.ndarray = np.full_like(squares, np.nan)
@@ -104,7 +106,10 @@ def _mean(nmse: np.ndarray) -> float | None:
 def coarse_torques(
     logs: Sequence[Trajectory], joints: Sequence[str], notes: list[Diagnostic]
 ) -> dict[str, float]:
-    """Return joint -> quantisation step [Nm, N], for joints whose torque is not much larger than it; add notes."""
+    """Return the quantisation step [Nm, N] of the joints whose torque varies by only a few steps, per joint.
+
+    A note about each of these joints is appended to `notes`.
+    """
     steps = {}
     for k, joint in enumerate(joints):
         # A log without quantisation counts as infinite; the median is finite if most logs are quantised.

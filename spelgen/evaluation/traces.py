@@ -43,7 +43,11 @@ class Quantiles:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Errors over the time of a prediction [s], per predictor: divided by the motion, and of the tip [mm] if known."""
+    """Quantiles of the prediction error over the time of a prediction [s], per predictor.
+
+    relative: errors of q and qd, divided by the RMS change of q and qd since the start of a window [1]. tip_mm:
+    position error of the tip [mm], empty without a URDF. windows: number of predictions.
+    """
 
     seconds: Curve
     windows: int
@@ -95,11 +99,11 @@ def motion_traces(
 ) -> Traces:
     """Return all curves of an arm under torques.
 
-    dynamics: name of a predictor -> dynamics. predictions: predictions over the longest horizon.
+    dynamics: dynamics by the name of the predictor. predictions: predictions over the longest horizon.
     """
     growth: Growth | None = None
     predicted: tuple[PredictedMotion, ...] = ()
-    # At rest there are no relative errors, because errors are divided by the motion.
+    # If the arm is at rest, relative errors are undefined (division by a change of zero).
     if predictions is not None and predictions.windows.q.diff(dim=1).abs().max() >= AT_REST:
         errors = _relative_errors(predictions, logs.joint_types)
         growth = _growth(predictions, errors, tip)
@@ -123,9 +127,10 @@ def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
 
 
 def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> dict[str, Tensor]:
-    """Return the RMS over joints of errors of position and velocity of each predictor, (W, K-1).
+    """Return the RMS over joints of the relative errors of position and velocity of each predictor, (W, K-1) [1].
 
-    Errors are divided by their scales (see `loss_scales`). W: windows; K: samples, the first of which has no error.
+    An error is divided by the RMS change of the position or velocity since the start of a window (see `loss_scales`).
+    There are W windows of K samples; the first sample, the initial state, has no error.
     """
     windows = predictions.windows
     scales = loss_scales(windows, joint_types)
@@ -188,7 +193,8 @@ def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Traj
     q = joined_column(pieces, "q")
     # The quantile excludes the fastest samples, which are often spikes of differentiated positions.
     fast = np.quantile(np.abs(joined_column(pieces, "qd")), 0.995, axis=0)
-    grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense near zero, where friction reverses
+    # The speeds are dense near zero, where friction reverses.
+    grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)
     speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n)
     alone = torch.diag_embed(speeds)  # (81, n, n): only one joint moves at a time
     positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)

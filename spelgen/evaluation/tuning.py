@@ -27,9 +27,11 @@ class EvaluationTuning:
     # [1] Fraction of the torque variance that a model must explain for gravity compensation: on most logs gravity
     # and friction explain about this fraction.
     explained_for_gravity: float = 0.8
-    # [1] Largest prediction error, divided by the motion, for which the assessment recommends simulation.
+    # [1] Largest relative prediction error (RMS error / RMS change of q and qd over the horizon) for which the
+    # assessment recommends simulation.
     close_prediction: float = 0.1
-    # [1] Largest prediction error, divided by the motion, for which the assessment recommends rough simulation.
+    # [1] Largest relative prediction error (RMS error / RMS change of q and qd over the horizon) for which the
+    # assessment recommends rough simulation.
     rough_prediction: float = 0.3
     # [1] Motion below this fraction of a joint's largest velocity is called slow.
     slow: float = 0.1

@@ -61,7 +61,8 @@ def verdict(
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
     elastic = next((x for x in results.diagnostics if x.code == ELASTIC), None)
     if elastic is not None:
-        # a rigid model is not called good where its structure is wrong
+        # A rigid model is wrong near the resonance of an elastic joint, even if its errors on these logs are small. The
+        # sentence therefore does not begin with "Good enough".
         band = f"; below it, usable for {listed(uses.good)}" if uses.good else ""
         sentence = f"Not valid near the resonance of an elastic joint{band}"
     if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):
@@ -147,7 +148,7 @@ def _assess_replays(results: Measurements, uses: _Uses) -> None:
 
 
 def _relative(errors: StateErrors | None) -> float:
-    """Return the mean error divided by the motion; infinity if the error is unknown."""
+    """Return the mean relative error, RMS error / RMS change over the horizon [1]; infinity if it is unknown."""
     error = None if errors is None else errors.mean_relative_rms
     return math.inf if error is None else error
 
@@ -179,9 +180,11 @@ def _better_baselines(results: Measurements) -> list[str]:
 
 
 def _worst_joint(results: Measurements) -> tuple[str, str, str]:
-    """Return the joint of the largest torque error, or of the largest motion error if only motion fails.
+    """Return the worst joint, a speed, and a sentence about the joint.
 
-    Also return the word for the speed at which its torque error is larger, and a sentence about the joint.
+    The joint is the joint of the largest torque error, or of the largest motion error if only the motion has a large
+    error. The speed is " near standstill", " at speed" or "": the motion in which the torque error of the joint is
+    larger.
     """
     joint, error = _worst_torque(results)
     moving, motion_error = _worst_motion(results)
@@ -197,7 +200,10 @@ def _worst_joint(results: Measurements) -> tuple[str, str, str]:
 
 
 def _worst_motion(results: Measurements) -> tuple[str, float]:
-    """Return the joint of the largest relative error at the longest horizon, and the error divided by the motion."""
+    """Return the joint of the largest relative position error at the longest horizon, and this error.
+
+    The relative error is the RMS error divided by the RMS change over the horizon [1].
+    """
     for last in results.horizons[-1:]:
         errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN
         if np.isfinite(errors).all():
@@ -206,7 +212,10 @@ def _worst_motion(results: Measurements) -> tuple[str, float]:
 
 
 def _slow_or_fast(results: Measurements, k: int) -> str:
-    """Return the words for slow or fast motion of joint k: for the larger torque residual, or "" if neither is."""
+    """Return the words for slow or for fast motion of joint k, whichever has the larger torque residual.
+
+    The result is "" if the residuals are similar, or if the logs contain too few slow or fast samples.
+    """
     if not results.traces.torques:
         return ""
     residuals, speeds = [], []
@@ -234,7 +243,8 @@ def _recommendations(
 ) -> dict[str, str]:
     """Return motions to record, with reasons, the most useful first.
 
-    worst: joint of the largest error. speed: words for the speed of larger error, see `_worst_joint`.
+    worst: joint of the largest error. speed: " near standstill", " at speed" or "", the motion in which the torque
+    error of this joint is larger.
     """
     recommendations = {}
     trained = identified.get("coverage") or {}

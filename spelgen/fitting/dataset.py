@@ -29,8 +29,8 @@ class RunOptions:
     device: torch device. threads: number of threads of torch. resume: continue from the checkpoint of the run folder;
     the result is the same as without an interruption. force: replace a run in the folder. progress: show the progress
     on stderr. mapping: names and units of the columns of the logs; the run folder gets a copy. notes: diagnostics of
-    steps before the fit, reported with the diagnostics of the fit. began: start of the allowed time
-    (`time.monotonic`) [s]; None: now.
+    steps before the fit, reported with the diagnostics of the fit. began: time from which the time limit of the fit
+    counts (`time.monotonic`) [s]; None: now.
     """
 
     device: str = "cpu"
@@ -48,8 +48,8 @@ class FitRequest:
     """The arguments of a fit.
 
     validation: fraction of the logs that is set aside for validation, or the validation trajectories. urdf: URDF file
-    of the robot, None if unknown. began: start of the allowed time (`time.monotonic`) [s]. folder: run folder, None if
-    the fit writes no files.
+    of the robot, None if unknown. began: time from which the time limit of the fit counts (`time.monotonic`) [s].
+    folder: run folder, None if the fit writes no files.
     """
 
     model: ArmModel
@@ -71,7 +71,7 @@ class FitRequest:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PreparedLogs:
-    """Facts about the checked logs, which the run folder records.
+    """Properties of the checked logs that are written to the run folder.
 
     preprocessing: filter, gaps and delay, with all automatic values resolved. digest: SHA-256 of all numbers of the
     logs; a fit resumes only on logs with the same digest. training_names, validation_names: names of the trajectories.
@@ -135,7 +135,8 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
     return TrainingData(
         training=training,
         validation=validation,
-        # scales of the training windows only: validation logs must not change the loss function
+        # The scales are computed from the training windows only, since validation logs must not change the loss
+        # function.
         scales=loss_scales(training, model.joint_types),
         preprocessing=resolved,
         training_names=[x.name for x in split.training],
@@ -200,9 +201,10 @@ class Validation:
         return total / self.size
 
     def substeps(self, present: int | None = None) -> int:
-        """Return the number of integration steps per sample interval: the prescribed number, or a chosen one.
+        """Return the number of integration steps per sample interval.
 
-        The number is chosen by `choose_substeps`; present: lower bound of the choice.
+        The number is the given one, or else the smallest number with a small integration error (see `choose_substeps`).
+        present: lower bound of the number; None: 1.
         """
         if self.solver != "rk4":
             return 1

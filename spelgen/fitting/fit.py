@@ -45,7 +45,7 @@ Rates = Callable[[], Sequence[float]]
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Options of a fit whose objective may depend on the logs.
+    """Options of a fit whose objective need not be given: it may be chosen from the logs.
 
     objective: name of the objective; None: `default_objective` chooses it. options: values of options by name; an
     option that does not apply to the objective is an error. defaults: values by name for options that are not given;
@@ -104,9 +104,9 @@ def fit(
     request = FitRequest(model, logs, config, preprocessing, validation, seed, urdf, options, began, folder)
     objective = objective_of(request)
     if run is not None and not options.resume:
-        # checked before the logs are filtered and cut into windows, which may take minutes
+        # The folder is checked before the logs are filtered and cut into windows, which may take minutes.
         run.require_free(force=options.force)
-    # the folder is created and locked after the check of the options: a wrong option creates no folder
+    # The folder is created and locked after the check of the options, so that a wrong option creates no folder.
     with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
         return _Fitting(request, objective, run).fitted()
@@ -137,11 +137,13 @@ class _Fitting:
             mapping = self.record.mapping.model_dump(mode="json", exclude_defaults=True)
             if mapping:
                 write_json(self.run.mapping, mapping)
-            write_json(self.run.config, self.record.to_dict())  # marks a complete run, which can be resumed
+            # config.json is written last: a folder with this file has all files that a resumed fit needs.
+            write_json(self.run.config, self.record.to_dict())
         status = self._run()
         model, checkpoint = request.model, Checkpoint.model_validate(objective.checkpoint())
         model.load_state_dict(checkpoint.best_weights)
-        model.requires_grad_(True)  # the objective may have disabled gradients of some parameters
+        # The objective may have disabled the gradients of some parameters.
+        model.requires_grad_(True)
         return Fit(
             model=model,
             history=objective.history,
@@ -164,14 +166,17 @@ class _Fitting:
             raise RunError(
                 "a checkpoint of another model", file=run.checkpoint, do="start a new run"
             ) from error
-        run.write_metrics(self.objective.history)  # drops epochs after the checkpoint: they are run again
-        self.baselines = run.read_baselines()  # still valid: a run resumes only on the same logs
+        # Lines of epochs after the checkpoint are removed from metrics.jsonl: these epochs are run again.
+        run.write_metrics(self.objective.history)
+        # The baselines of the interrupted run are valid, because a run resumes only on the same logs.
+        self.baselines = run.read_baselines()
 
     def _save(self) -> None:
         """Write the checkpoint, the best weights and the history."""
         if self.run is not None:
             checkpoint = self.objective.checkpoint()
-            # The checkpoint is written after the metrics: if it is not written, a resumed run drops the last lines.
+            # The metrics are written before the checkpoint: after an interruption between the two, a resumed run
+            # removes the surplus lines from the metrics.
             self.run.write_metrics(self.objective.history)
             self.run.save(checkpoint["best_weights"], checkpoint)
 
@@ -257,7 +262,8 @@ def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rat
     objective, defaults = chosen.objective, chosen.defaults
     if objective is None:
         objective = default_objective(model, rates)
-        if rigid_bodies and objective == "rollout":  # for rigid bodies the regularizer is off by default
+        # If the objective was chosen from the logs, rigid bodies have no regularizer by default.
+        if rigid_bodies and objective == "rollout":
             defaults = {"urdf_weight": 0.0, **defaults}
     return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.options, defaults=defaults)
 

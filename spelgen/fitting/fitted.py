@@ -86,7 +86,10 @@ class Fit:
 
     @property
     def torque_nmse(self) -> dict[str, float]:
-        """Joint name -> mean squared torque error / variance of the torque; joints with constant torque are omitted."""
+        """Mean squared torque error divided by the variance of the torque, per joint name.
+
+        Joints with constant torque are omitted.
+        """
         by_joint = zip(self.model.joint_names, self.checkpoint.torque_nmse, strict=False)
         return {joint: nmse for joint, nmse in by_joint if math.isfinite(nmse)}
 
@@ -144,14 +147,14 @@ class Fit:
         reach = bristle_reach(self.model)
         tau, deviation = np.full_like(trajectory.q, np.nan), np.full_like(trajectory.q, np.nan)
         for start, stop in pairwise(gap_ends(trajectory.t, self.preprocessing.gap)):
-            # a single sample has no acceleration
+            # A single sample between two gaps has no acceleration, so its torque remains NaN.
             if stop - start < 2:
                 continue
             piece = trajectory[start:stop]
             # The zero-phase filter needs a few samples for its transient.
             if self.preprocessing.cutoff and len(piece) > 3:
                 piece = low_pass(piece, self.preprocessing.cutoff)
-            # accelerations are not logged
+            # Accelerations are not logged, so they are the derivative of the filtered velocity.
             qdd = np.gradient(piece.qd, piece.t, axis=0)
             motion = piece.q, piece.qd, qdd, bristles_along(piece.q, reach)
             if std:
@@ -178,7 +181,8 @@ class Fit:
         for x in samples:
             squares = np.square(self._torque(x.q, x.qd, x.qdd, x.z, x.direction) - x.tau).mean(axis=0)
             variance = x.tau.var(axis=0)
-            varies = variance > 0  # a constant torque cannot be explained
+            # The nMSE of a constant torque is undefined (division by zero), so joints of constant torque are omitted.
+            varies = variance > 0
             scores.append(1 - (squares[varies] / variance[varies]).mean())
         return float(np.mean(scores))
 
@@ -193,7 +197,7 @@ class Fit:
             run.start(spec, self.urdf, force=force)
             run.write_metrics(self.history)
             run.save(self.model.state_dict(), self.checkpoint.content)
-            # config.json is written last, since it marks a complete run
+            # config.json is written last: a folder with this file has all files of a run.
             if self.baselines:
                 write_json(run.baseline, self.baselines)
             write_json(run.config, self.record.to_dict())
@@ -245,8 +249,9 @@ def load_run(folder: Path | str) -> Fit:
     Raises RunError and ModuleError.
     """
     run = RunFolder(folder)
-    record = run.read_record()  # a missing run is reported before its model is assembled
-    # no gradients: a loaded model is for predictions, and derivatives would need memory
+    # The record is read first, so that a missing run is reported before its model is assembled.
+    record = run.read_record()
+    # Gradients are disabled, because a loaded model is used for predictions, and derivatives would need memory.
     return Fit(
         model=fitted_model(run).requires_grad_(False).eval(),
         history=run.read_metrics(),

@@ -76,13 +76,13 @@ class SolverResult(Generic[Parameters]):
 
 
 class LeastSquaresProblem(Protocol[Parameters]):
-    """Nonlinear least-squares problem: the cost of parameters x is computed from a residual, or from sums of squares.
+    """Nonlinear least-squares problem, whose cost is computed from the residual of parameters x.
 
-    Sums of squares replace the residual if the residual is too large.
+    If the residual vector is too large for the memory, its sum of squares per joint is used in its place.
     """
 
     def residual(self, x: Parameters) -> Tensor:
-        """Return the residual of the samples, (T, n), or the sum of its squares per joint, (n,); see `cost`."""
+        """Return the residual of T samples, (T, n), or its sum of squares per joint, (n,), as `cost` needs it."""
 
     def cost(self, x: Parameters, residual: Tensor) -> float:
         """Return the cost at x, computed from the result of `residual` at x; infinite if the residual diverged."""
@@ -128,7 +128,7 @@ def levenberg_marquardt(
         min_relative_decrease: the solver ends if the decrease, divided by the cost after the step, is smaller.
         callback: is called with the state after each accepted step.
     """
-    # computed even if max_steps is 0: the result contains normal equations
+    # The normal equations are computed even if max_steps is 0, because the result contains them.
     normal = problem.normal_equations(state.x, state.residual)
     for number in range(max_steps):
         if number:
@@ -171,9 +171,10 @@ def _best_candidate(
     step: Tensor,
     predicted: float,
 ) -> SolverState[Parameters]:
-    """Return the state of minimum cost among the candidates of a step, up to the first with a high gain ratio.
+    """Return the state of minimum cost among the candidates of a step.
 
-    predicted: predicted decrease of the cost, the denominator of the gain ratio.
+    Candidates after the first one with a high gain ratio are not evaluated. The gain ratio is the decrease of the cost
+    divided by its predicted decrease. predicted: predicted decrease of the cost.
     """
     best = replace(state, cost=float("inf"))
     for x in problem.candidates(state.x, step):

@@ -45,12 +45,12 @@ class MomentumObjective(Objective):
         self.allowed = math.inf if minutes is None else 60 * minutes  # [s]
 
     def prepare(self) -> PreparedLogs:
-        """See `Objective`."""
+        """Check, split and filter the logs, cut windows, and make the regularizer. Raises LogError."""
         self.data = prepare_data(self.request, self.config.window, self.config.stride)
         self.config = self.config.resolved(len(self.data.training))
         self.regularizer = None
         if self.config.urdf_weight:
-            # the unit of M is the mean M of the initial model, also if the run is resumed
+            # The regularizer is made from the initial model, whose mean M is its unit of M, also if a run is resumed.
             self.regularizer = urdf_regularizer(self.request.urdf, self.model, self.data.training, self.notes)
         return self.data
 
@@ -67,7 +67,7 @@ class MomentumObjective(Objective):
         self.model.load_state_dict(self.best_weights)
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """See `Objective`."""
+        """Run the momentum stage, unless it was completed before the run was resumed; return the status."""
         status: Status = "finished"
         if not self.momentum_done:
             self._start_clock()
@@ -78,7 +78,7 @@ class MomentumObjective(Objective):
         return status
 
     def checkpoint(self) -> Content:
-        """See `Objective`."""
+        """Return the content of checkpoint.pt: best weights, their validation loss, and progress of the fit."""
         return {name: vars(self)[name] for name in self.saved_attributes}
 
     def _set_up(self) -> None:

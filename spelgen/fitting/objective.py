@@ -73,7 +73,10 @@ class Objective(ABC):
 
 
 def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -> Record:
-    """Return the record of a fit before it runs. It contains only the options that apply to the model, resolved."""
+    """Return the record of a fit before it runs.
+
+    The record contains only the options that apply to the model, with their defaults filled in.
+    """
     model, spec, options = request.model, spec_of(request.model), request.options
     notes = [note for note in (*prepared.diagnostics, *options.notes) if note.severity == "warning"]
     record = Record(
@@ -94,7 +97,8 @@ def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -
         mapping=options.mapping or LogMapping(input=model.input_quantity),
         device=options.device,
         threads=options.threads,
-        # warnings about logs and links; diagnostics of the run are about the command and do not describe the model
+        # Only warnings about logs and links are recorded. Diagnostics of the run are about the command and do not
+        # describe the model.
         warnings=[f"{note.where}: {note.message}" for note in notes if note.where != "run"],
     )
     known: Content = {}

@@ -18,7 +18,8 @@ from spelgen.logs.windows import Windows
 
 Loss = Callable[[Windows], Tensor]
 LearningRate = Callable[[int], float]
-Summands = Callable[[], Iterable[Tensor]]  # yields the terms of a loss: only one graph is in memory at a time
+# Function that yields the terms of a loss, so that the graph of only one term is in memory at a time.
+Summands = Callable[[], Iterable[Tensor]]
 
 
 class WindowOptimizer(ABC):
@@ -81,11 +82,12 @@ class MiniBatchAdamW(WindowOptimizer):
         )
 
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
-        """See `WindowOptimizer`."""
+        """Take AdamW steps on random batches of windows; return the mean loss, NaN if a loss is not finite."""
         rows, size = steps * self._batch, len(windows)
         # Batches are cut from passes over all windows in random order, so that windows are used about equally often.
         passes = [torch.randperm(size, generator=self._generator) for _ in range(-(-rows // size))]
-        total: Tensor | float = 0.0  # stays on the device: float() in each step would wait for a GPU
+        # The sum remains on the device of the losses, since float() in each step would wait for a GPU.
+        total: Tensor | float = 0.0
         for step, batch in enumerate(torch.cat(passes)[:rows].split(self._batch)):
             for group in self._optimizer.param_groups:
                 group["lr"] = learning_rate(step) * group["factor"]
@@ -132,16 +134,17 @@ class LBFGS(WindowOptimizer):
             self._parameters,
             history_size=TUNING.lbfgs_history,
             line_search_fn="strong_wolfe",
-            # tighter than torch's defaults, since simulated logs are fitted to many digits: `stalled` ends the fit
+            # The tolerances are smaller than torch's defaults, since simulated logs are fitted to many digits. The
+            # property `stalled` ends the fit.
             tolerance_grad=1e-12,
             tolerance_change=1e-15,
         )
-        # last: loss at the end of the last call, without and with the penalty. waits: number of successive calls
-        # without progress.
+        # `last` is the loss at the end of the last call, without and with the penalty. `waits` is the number of
+        # successive calls without progress.
         self._optimizer.param_groups[0].update(last=(math.inf, math.inf), waits=0)
 
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
-        """Return the loss at the end; NaN if no evaluation was finite. See `WindowOptimizer`."""
+        """Minimise the loss of all windows; return the loss at the end, NaN if no evaluation was finite."""
         return self.minimise(lambda: [loss(windows)], steps)
 
     def minimise(self, summands: Summands, steps: int) -> float:
@@ -174,7 +177,10 @@ class LBFGS(WindowOptimizer):
         return waits > 1
 
     def _evaluated(self, summands: Summands) -> Tensor:
-        """Compute the gradients and return the penalised loss, (); a large number if they are not finite."""
+        """Compute the gradients and return the penalised loss, ().
+
+        The result is a large number if the loss or a gradient is not finite.
+        """
         self._optimizer.zero_grad()
         try:
             value = torch.zeros((), dtype=torch.float64)
@@ -204,7 +210,7 @@ def minimise(model: torch.nn.Module, summands: Summands, evaluations: int, weigh
         model: model whose weights are fitted, if they require a gradient.
         summands: function that yields the terms of the loss.
         evaluations: maximum number of evaluations of the loss, rounded up to a multiple of `TUNING.lbfgs_call`.
-        weight_decay: see `LBFGS`.
+        weight_decay: factor of half the sum of squares of all matrices, which is added to the loss.
     """
     optimizer, count = LBFGS(model, weight_decay), 0
     while count < evaluations and not optimizer.stalled:

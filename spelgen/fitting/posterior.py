@@ -50,9 +50,10 @@ class Uncertain(NamedTuple):
 
 
 class Propagated(NamedTuple):
-    """Value of a function of the model, (...), and its derivative times R, (..., k).
+    """Value of a function of the model, (...), and its derivative df/dx R, (..., k).
 
-    The norm of ``root`` over k is the standard deviation of the value.
+    R R^T is the covariance of the fitted parameters x, with R (K, k). The norm of ``root`` over k is the standard
+    deviation of the value.
     """
 
     value: Tensor
@@ -82,13 +83,17 @@ class Posterior:
         return Uncertain(value.numpy(), root.norm(dim=-1).numpy())
 
     def propagate(self, function: Callable[[ArmModel], Tensor]) -> Propagated:
-        """Return the value (...) of a function of the model, and its derivative times R, (..., k)."""
+        """Return the value (...) of a function of the model, and its derivative df/dx R, (..., k).
+
+        R R^T is the covariance of the fitted parameters x.
+        """
 
         def at(x: Tensor) -> Tensor:
             """Return the value of the function at parameters x, (K,)."""
             return evaluate_with(self.model, self._vector.unflatten(x), function)
 
-        # central differences over this part of a standard deviation: linear, and far above rounding errors
+        # Step of the central differences, in standard deviations: small enough that the function is linear, and large
+        # enough that rounding errors are negligible.
         part = 1e-4
         with torch.no_grad():
             columns = [(at(self._x + part * x) - at(self._x - part * x)) / (2 * part) for x in self._root.mT]
@@ -123,7 +128,8 @@ class Posterior:
             inverse = torch.linalg.inv(inputs + torch.diag((~inputs.any(dim=1)).double()))
         variance = (inverse.square() @ torch.from_numpy(self.torque_std).square()).expand_as(q).clone()
         samples = DynamicsSamples("", motion[0], motion[1], motion[2], np.zeros_like(motion[0]), *motion[3:])
-        size = 2048  # samples per block: the Jacobian of all samples of a log may not fit into memory
+        # Samples are processed in blocks, since the Jacobian of all samples of a log may not fit into memory.
+        size = 2048
         for first in range(0, len(q), size):
             block = TorqueSamples.of([samples[first : first + size]])
             rows = torch.zeros(block.count, model.n, root.shape[1]).double()
@@ -156,9 +162,10 @@ class Posterior:
 
     @cached_property
     def drives(self) -> dict[str, tuple[Interval, ...]]:
-        """Quantity -> intervals of the joints: armature, viscous and Coulomb friction, torque offset, trained gain.
+        """Intervals of the joints, by the name of the quantity.
 
-        Viscous and Coulomb friction approximate the fitted friction by least squares up to the typical speed.
+        The quantities are armature, viscous and Coulomb friction, torque offset, and trained gain. Viscous and Coulomb
+        friction approximate the fitted friction by least squares up to the typical speed.
         """
         model, inputs = self.model, self.model.inputs
         trained = inputs.gain_rows.tolist() if isinstance(inputs, MotorInputs) else []
@@ -184,7 +191,10 @@ class Posterior:
 
     @property
     def drive_columns(self) -> dict[str, list[str]]:
-        """Columns of the table of drives: quantity -> n texts of value and unit; an empty text if there is no value."""
+        """Columns of the table of drives, by the name of the quantity.
+
+        A column has n texts of value and unit; a text is empty if the joint has no value.
+        """
         columns = {}
         for quantity, of_joints in self.drives.items():
             cells = {x.name: f"{x.text} {x.unit}".rstrip() for x in of_joints}
@@ -241,16 +251,17 @@ class Posterior:
 
     @cached_property
     def _constants(self) -> Propagated:
-        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with their derivatives times R."""
+        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with their derivatives df/dx R."""
         return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
 
     def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         return constants_regressor(self.model.chain, motors_of(self.model), q, qd, qdd)
 
     def _linear(self, value: Tensor, rows: Tensor) -> Uncertain:
-        """Return a value (...) with its standard deviation.
+        """Return a value (...) that is linear in inertial parameters and armatures, with its standard deviation.
 
-        rows: (..., 10 B + n), derivatives of the value with respect to the inertial parameters and armatures.
+        rows: (..., 10 B + n), derivatives of the value with respect to the inertial parameters of B bodies and the
+        armatures.
         """
         return Uncertain(value.numpy(), (rows @ self._constants.root).norm(dim=-1).numpy())
 
@@ -281,9 +292,8 @@ def posterior_of(
         do = "restore it from a copy, or fit again"
         raise RunError("a posterior of another model", file=file, element="posterior", do=do)
     late = Interval("torque delay", delay, delay_std, "s") if delay else None
-    model = (
-        copy.deepcopy(model).double().cpu().requires_grad_(False)
-    )  # a copy: the caller may change its model
+    # The posterior keeps a copy of the model, because the caller may change the model.
+    model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     return Posterior(model, covariance, torque_std.numpy(), late)
 
 
@@ -306,9 +316,11 @@ def _friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
     places = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
     q = torch.from_numpy([x.center for x in joints] + places)
     with torch.no_grad():
-        load = model.gravity(q) @ torch.linalg.inv(motors_of(model))  # gravity torque on the drives, (P, n)
+        # gravity torque on the drives at P random positions, (P, n)
+        load = model.gravity(q) @ torch.linalg.inv(motors_of(model))
         factor = friction_factor(model, q)
-    # in units of the typical speed; dense at low speeds, which determine the Stribeck effect and the intercept
+    # Speeds are in units of the typical speed. They are dense at low speeds, which determine the Stribeck effect and
+    # the intercept.
     speeds = np.geomspace(0.02, 1.0, 25)
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 

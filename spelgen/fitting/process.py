@@ -84,7 +84,7 @@ def locked(folder: Path | None) -> Iterator[None]:
     # folders that are created here; they are removed again if the fit writes nothing into them
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     file = folder / LOCK
-    # fail at once instead of waiting: the user may not know of the other process
+    # An error is raised at once, without waiting for the lock: the user may not know of the other process.
     lock = FileLock(file, timeout=0)
     with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -103,7 +103,8 @@ def locked(folder: Path | None) -> Iterator[None]:
         file.unlink(missing_ok=True)
         lock.release()
         for path in created:
-            if not any(path.iterdir()):  # the fit wrote nothing
+            # A new folder that is still empty is removed: the fit wrote nothing into it.
+            if not any(path.iterdir()):
                 path.rmdir()
 
 

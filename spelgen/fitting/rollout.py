@@ -73,7 +73,7 @@ def _adaptive_step(
     Dormand and Prince, J. Comput. Appl. Math. 6 (1980), differentiated through the solver. All windows are solved
     together, with time in units of their own intervals.
     """
-    from torchdiffeq import odeint  # imported only if needed: the import takes half a second
+    from torchdiffeq import odeint  # imported only if needed, since the import takes half a second
 
     def rate(t: Tensor, state: Tensor) -> Tensor:
         """Return the derivative of the state (q, p), (W, 2 n), with respect to time in units of the interval."""
@@ -86,14 +86,15 @@ def _adaptive_step(
 
 
 def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequence[str]) -> Tensor:
-    """Return the signed distance (..., n) [rad, m]: the difference, for revolute joints the geodesic distance on SO(3).
+    """Return predicted minus measured positions, (..., n) [rad, m]; for revolute joints wrapped to +-pi.
 
-    For rotations about a common axis, R = exp(q e), the geodesic distance |log(R^T R')| / sqrt(2) is the wrapped angle
-    |q' - q - 2 pi round((q' - q) / 2 pi)|: the log map of SPEL eq. 8 without matrices.
+    For rotations about a common axis, R = exp(q e), the geodesic distance |log(R^T R')| / sqrt(2) on SO(3) is the
+    wrapped angle |q' - q - 2 pi round((q' - q) / 2 pi)|. This is the position error in the loss (eq. 8) of the paper
+    whose model is the preset `spel`, computed without matrices.
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
-    # detached: the derivative of the wrapped angle with respect to q' is one
+    # The number of turns is detached, since the derivative of the wrapped angle with respect to q' is one.
     turns = torch.round(difference.detach() / (2 * math.pi))
     return difference - 2 * math.pi * torch.where(revolute, turns, 0.0)
 
@@ -101,8 +102,8 @@ def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequen
 class LossScales(NamedTuple):
     """Units in which losses measure errors of q, qd and tau.
 
-    q, qd: (K-1, n) [rad, m, per second], RMS change since the first sample of a window, for each further sample and
-    each joint. tau: (n,) [Nm, N], standard deviation.
+    q, qd: (K-1, n) [rad, m, per second], RMS change since the first sample of a window of K samples, for each further
+    sample and each joint. tau: (n,) [Nm, N], standard deviation.
     """
 
     q: Tensor
@@ -137,7 +138,7 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
 def _scale(mean_square: Tensor) -> Tensor:
     """Return the square roots of mean squares (..., n), each at least 1 % of the largest root of the n joints."""
     root = mean_square.sqrt()
-    # 1e-9: positive even if nothing varies, since errors are divided by the scale
+    # The bound 1e-9 keeps the scale positive even if nothing varies, since errors are divided by the scale.
     smallest = (1e-2 * root.amax(dim=-1, keepdim=True)).clamp(min=1e-9)
     return torch.maximum(root, smallest)
 
@@ -145,7 +146,10 @@ def _scale(mean_square: Tensor) -> Tensor:
 def rollout_errors(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> Tensor:
-    """Return the errors of the rollout in units of ``scales``, (W, K-1, 2n): n positions, then n velocities."""
+    """Return the errors of the rollout in units of ``scales``, (W, K-1, 2n): n positions, then n velocities.
+
+    There are W windows of K samples; the first sample of a window is the initial state and has no error.
+    """
     q, qd = roll_out(model, windows, substeps, solver)
     position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q
     return torch.cat([position, (qd - windows.qd[:, 1:]) / scales.qd], dim=-1)
@@ -154,11 +158,11 @@ def rollout_errors(
 def rollout_loss(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> Tensor:
-    """Return the mean square of `rollout_errors`, (): the loss of SPEL eq. 8 with other units.
+    """Return the mean square of `rollout_errors`, () [1].
 
-    The paper sums squared geodesic distances [rad^2] and velocity errors [rad^2/s^2] over joints and samples. With
-    scaled errors, all joints and samples have the same weight, and a prediction that the initial state does not change
-    has loss 1.
+    This is the loss (eq. 8) of the paper whose model is the preset `spel`, with other units. The paper sums squared
+    geodesic distances [rad^2] and velocity errors [rad^2/s^2] over joints and samples. With scaled errors, all joints
+    and samples have the same weight, and a prediction that the initial state does not change has loss 1.
     """
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
@@ -176,8 +180,8 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
         scales: the scale of the torque, (n,) [Nm, N], is used.
     """
     q, qd, tau, dt = windows.q, windows.qd, windows.tau, windows.dt.unsqueeze(-1)
-    # M is not constrained to be positive definite here: it is not inverted, since velocities are measured, and with the
-    # constraint the descent would end at the boundary.
+    # M is not constrained to be positive definite here. The velocities are measured, so that M need not be inverted;
+    # and a gradient descent with the constraint would stop at the boundary of the indefinite matrices.
     with mass_as_learned(model):
         configuration = model.configuration(q, model.prepare())
     p = (configuration.mass @ qd.unsqueeze(-1)).squeeze(-1)
@@ -219,7 +223,10 @@ def integration_error(coarse: Tensor, fine: Tensor) -> float:
 
 
 def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
-    """Return the minimum number of rk4 steps per sample interval, at least `start`, with a small integration error."""
+    """Return the minimum number of rk4 steps per sample interval, at least `start`, that is accurate enough.
+
+    The integration error of the rollouts is then below `TUNING.integration_fraction` of the error of the model.
+    """
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.max_substeps:
         # Half the step size divides the error of rk4 by 16, so the difference between both rollouts is about the error

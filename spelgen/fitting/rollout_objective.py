@@ -75,7 +75,7 @@ class RolloutObjective(MomentumObjective):
         return end
 
     def checkpoint(self) -> Content:
-        """See `Objective`."""
+        """Return the content of checkpoint.pt: the state of the fit after the last epoch, and its best weights."""
         state = {"model": self.model.state_dict(), "optimizer": self.optimizer.state_dict()}
         return super().checkpoint() | state | {"generator": self.generator.get_state()}
 
@@ -114,7 +114,7 @@ class RolloutObjective(MomentumObjective):
     def _run_epoch(self) -> Content:
         """Run one epoch and return its line of metrics.jsonl; repeat it at half the learning rate if it diverges."""
         while True:
-            # the state before the epoch, from which a diverged epoch is repeated
+            # This is the state before the epoch, from which a diverged epoch is repeated.
             state = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             steps, start = self._steps_in_time(), self.seconds_now()
             # the mean loss is NaN if the loss or the gradient of any step is not finite
@@ -153,7 +153,11 @@ class RolloutObjective(MomentumObjective):
         return self.learning_rate_factor * self.learning_rate(fraction)
 
     def _done(self, ahead: int = 0) -> float:
-        """Return the completed fraction of all steps after ``ahead`` more steps, or of the allowed time if larger."""
+        """Return the progress of the fit, 0 to 1, after ``ahead`` more steps.
+
+        The progress is the completed fraction of all steps, or the elapsed fraction of the allowed time if it is
+        larger.
+        """
         # If the time is limited, the learning-rate schedule must end with the time, not with the last epoch.
         steps = self.config.epochs * self.epoch_steps
         return max((self.step + ahead) / steps, self.fraction(self.seconds))

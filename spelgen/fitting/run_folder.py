@@ -62,7 +62,8 @@ class RunFolder:
             content[self.urdf] = urdf_bytes(urdf)  # a xacro file is expanded
         if urdf is not None and (settings := urdf.with_suffix(".yaml")).is_file():
             content[self.settings] = settings.read_bytes()
-        # config.json, the first of the files, is removed first: after an interruption the folder is no run
+        # config.json, the first of the files, is removed first. A folder without this file is not treated as a run if
+        # the removal is interrupted.
         for file in vars(self).values():
             if file != self.path:
                 remove(file)
@@ -107,7 +108,10 @@ class RunFolder:
         return RunError("no such run", file=self.path, expected=expected, do="make one with `spelgen train`")
 
     def read_record(self) -> Record:
-        """Return config.json. Raises RunError if it is absent, broken, or has a key absent or of another type."""
+        """Return config.json.
+
+        Raises RunError if the file is absent or broken, lacks a key, or has a key of another type.
+        """
         return require(Record, self.read_json(self.config), self.config)
 
     def read_baselines(self) -> Content:
@@ -115,7 +119,10 @@ class RunFolder:
         return self.read_json(self.baseline) if self.baseline.exists() else {}
 
     def load_checkpoint(self) -> Checkpoint:
-        """Return checkpoint.pt. Raises RunError if it is absent, broken, or has a key absent or of another type."""
+        """Return checkpoint.pt.
+
+        Raises RunError if the file is absent or broken, lacks a key, or has a key of another type.
+        """
         checkpoint = require(Checkpoint, self.load_state(self.checkpoint), self.checkpoint)
         _require_finite(checkpoint.best_weights, self.checkpoint)
         return checkpoint

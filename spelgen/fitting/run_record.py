@@ -70,7 +70,8 @@ class Record(BaseModel):
     @classmethod
     def _of_the_objective(cls, options: object, info: ValidationInfo) -> object:
         """Return the options as an object of the objective's configuration class."""
-        if "objective" not in info.data:  # the objective is invalid, which pydantic reports
+        # Without this key the objective was invalid. pydantic reports that error, so the options are not checked.
+        if "objective" not in info.data:
             return FitConfig()
         try:
             return validated(CONFIGS[info.data["objective"]], options)
@@ -122,9 +123,10 @@ class Checkpoint(BaseModel):
     """The content of checkpoint.pt: the progress of a fit, and the state from which its objective resumes.
 
     seconds: duration of the fit [s]. substeps: integrator steps per sample interval. torque_nmse: mean squared torque
-    error divided by the variance of the torque, per joint. posterior: see `fitting.posterior`; None except for rigid
-    bodies fitted to torques. rollbacks, learning_rate_factor and momentum_done are states of fits to windows. Further
-    keys are states of an objective; torch checks their content.
+    error divided by the variance of the torque, per joint. posterior: covariance and torque residual (see
+    `posterior_of`); None except for rigid bodies fitted to torques. rollbacks: number of repeated epochs of a fit to
+    windows. learning_rate_factor: factor on the learning rate after these repetitions. momentum_done: whether the
+    momentum stage has ended. Further keys are states of an objective; torch checks their content.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")

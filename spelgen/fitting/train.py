@@ -47,7 +47,8 @@ def train(
     robot = None
     notes: list[Diagnostic] = []
     if options.resume:
-        record = run.read_record()  # a missing run is reported before anything is read
+        # The record is read first, so that a missing run is reported before the logs are read.
+        record = run.read_record()
         config = config or record.config
         seed = record.seed if seed is None else seed
         validation = validation or record.validation_fraction

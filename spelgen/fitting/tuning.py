@@ -65,7 +65,8 @@ class FittingTuning:
     max_substeps: int = 32
     # [1] Largest integration error, as a fraction of the model's error.
     integration_fraction: float = 0.03
-    # [1] Lower bound of the model's error in this fraction, in units of the scales of the loss.
+    # [1] Lower bound of the model's error in the comparison with the integration error, in units of the scales of the
+    # loss.
     min_model_error: float = 1e-2
 
     # Rollouts by dopri5 (`fitting.rollout`).

@@ -33,7 +33,10 @@ class UrdfRegularizer(NamedTuple):
     gravity_scale: Tensor
 
     def loss(self, model: ArmModel) -> Tensor:
-        """Return the mean squared difference between model and URDF in the variation of M and in gravity, () [1]."""
+        """Return the mean squared difference between model and URDF, () [1].
+
+        The difference has two terms: the whitened variation of M with q, and the gravity torque divided by its scale.
+        """
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
         return variation.square().sum(dim=(-2, -1)).mean() / gravity.shape[-1] + gravity.square().mean()
@@ -85,7 +88,7 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
         whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
     gravity = dynamics.gravity(q)
     scale = gravity.square().mean(dim=0).sqrt()
-    # 1.0: if no joint has a gravity torque, the unit is arbitrary
+    # If no joint has a gravity torque, the unit is arbitrary: it is 1.
     scale = scale.clamp(min=TUNING.min_gravity_scale * scale.max().item() or 1.0)
     return UrdfRegularizer(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
 

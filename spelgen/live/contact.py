@@ -11,8 +11,9 @@ from spelgen.live.tuning import TUNING
 
 
 class ContactState(NamedTuple):
-    """External torques and thresholds, (n,) [Nm, N]. touched: mask (n,) of torques above their thresholds. force: force
-    at the tip in root axes, (3,) [N].
+    """External torques and their thresholds, (n,) [Nm, N].
+
+    touched: mask (n,) of torques above their thresholds. force: force at the tip in root axes, (3,) [N].
     """
 
     external_torque: np.ndarray
@@ -79,7 +80,8 @@ class ContactObserver:
         else:
             step = t - self.t
             gains = np.full((len(inputs), 1), 1 - np.exp(-rate * step))
-            # Twice the bandwidth: the difference between two estimates of dp/dt shows how fast dp/dt changes.
+            # The second filter of the momenta (row 4) has twice the bandwidth of the first (row 3). The difference
+            # between both estimates of dp/dt shows how fast dp/dt changes.
             gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
             # The estimated disturbance of a joint in contact contains the contact torque: do not update the baseline.
@@ -107,7 +109,7 @@ def tip_force(jacobian: np.ndarray, torque: np.ndarray, threshold: np.ndarray) -
     """
     weighted = jacobian / threshold**2
     matrix = weighted @ jacobian.T
-    # regularization: a force component that affects no joint torque is estimated as zero
+    # With this regularization, a force component that affects no joint torque is estimated as zero.
     matrix += 1e-3 * np.trace(matrix) / 3 * np.eye(3)
     force: np.ndarray = np.linalg.solve(matrix, weighted @ torque)
     return force

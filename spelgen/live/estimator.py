@@ -29,9 +29,9 @@ class EstimatorState:
     """Estimates after a sample; vectors are (n,).
 
     t: time of the sample [s]. refusal: "used", or the reason for which the sample was refused or used only in part.
-    contact: see `ContactState`. payload: last reported payload. load_changed: whether a change of the payload was
-    detected at this sample. friction_scale: current friction divided by the friction of the model [1]. disturbance:
-    slow torque that neither model nor payload explains [Nm, N].
+    contact: external torques, their thresholds, and the force at the tip. payload: last reported payload. load_changed:
+    whether a change of the payload was detected at this sample. friction_scale: current friction divided by the
+    friction of the model [1]. disturbance: slow torque that neither model nor payload explains [Nm, N].
     """
 
     t: float
@@ -159,7 +159,8 @@ class Estimator:
         with torch.no_grad():
             torque = self.model.inverse_dynamics(*at, *past)
             friction = self.model.friction_torque(*at[:2], *past)
-            # the payload is fixed to the last body
+            # The payload is fixed to the last body, whose ten inertial parameters are the last columns of the
+            # regressor.
             regressor = regressor_of(self.model.chain, *at)[..., -10:]
             load = regressor @ torch.from_numpy(self.payload.parameters)
             decay = np.zeros(1)

@@ -123,7 +123,7 @@ class LoadFilter:
         noise = self.noise.white[joint] ** 2 + TUNING.uncertainty * block.uncertainty[joint] ** 2
         expected = float(row @ covariance[columns]) + noise
         residual = float(block.y[joint] - self.x[columns] @ row)
-        # Huber's weights: an outlier is given a larger variance
+        # Huber's weights: the variance of an outlier is increased, so that its influence is bounded.
         variance = max(expected, residual**2 / TUNING.outlier**2)
         gain = covariance / variance
         if block.moving[joint]:
@@ -150,7 +150,8 @@ class JointFilters:
         """Start with states of zero.
 
         Args:
-            deviations: prior standard deviations of the states, (..., n, K); the one of d is also the stationary one.
+            deviations: prior standard deviations of the states, (..., n, K); the prior standard deviation of d is also
+                the stationary standard deviation of d.
             white: standard deviations of white noise, (..., n) [Nm, N].
             time_constant: time constant of d, (..., n) [s].
             drifts: whether a is a random walk, and joints at rest update d, too.
@@ -196,10 +197,12 @@ class JointFilters:
 
 
 class PayloadEstimate:
-    """The payload filter, and temporarily two copies for the hypotheses of a changed load and of a contact.
+    """The payload filter and, after a surprising block, two copies of it that represent hypotheses.
 
-    The rows of a block (one per joint and filter) are distributed over the samples of the next block, to limit the
-    computing time per sample. moved: time in motion since the start or the last change of the load [s].
+    One copy is for the hypothesis that the load has changed, the other for the hypothesis of a contact. Both exist
+    until a change of the load is accepted or both hypotheses are dropped. The rows of a block (one per joint and
+    filter) are distributed over the samples of the next block, to limit the computing time per sample. moved: time in
+    motion since the start or the last change of the load [s].
     """
 
     def __init__(self, levels: NoiseLevels) -> None:
@@ -221,7 +224,10 @@ class PayloadEstimate:
         self.rows = self._rows(block)
 
     def step(self) -> None:
-        """Process the number of rows that is due at each sample."""
+        """Process the next few rows of the current block.
+
+        The number per sample is such that all rows are processed before the next block is complete.
+        """
         self.samples += 1
         for _ in range(self.per_sample):
             next(self.rows, None)

@@ -86,7 +86,8 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
         tested.append((fitted_to(fit, others), fold))
     levels = find_levels(tested, effort, tip)
-    # Serialization rounds the numbers: return the same numbers as a later read of the run folder.
+    # Serialization rounds the numbers. The rounded numbers are returned, so that a later read of the run folder gives
+    # the same ones.
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
 
@@ -163,7 +164,8 @@ def find_levels(
     """
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    # These levels have no noise yet: they are needed to compute the samples from which the noise is estimated.
+    # These `NoiseLevels` have limits and no noise values: the samples from which the noise is estimated depend on the
+    # limits.
     levels = NoiseLevels.model_construct(
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
@@ -185,9 +187,10 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
     """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
 
     The logs are without payload, so each estimated payload is an error. Windows of consecutive blocks are independent
-    trials. Two normalised squared errors are averaged over the trials together with the prior: of the mass, and of mass
-    and first moments. The factor is the largest average over both errors and all window lengths: errors of the model
-    average out slowly, so that longer windows may have larger normalised errors.
+    trials. Each trial has two normalised squared errors: of the mass, and of the mass and first moments. Each error is
+    averaged over the trials; the prior value counts as `prior_trials` more trials. The factor is the largest average
+    over both errors and all window lengths: errors of the model average out slowly, so that longer windows may have
+    larger normalised errors.
     """
     factors = []
     for window in TUNING.trial_blocks:
@@ -234,7 +237,7 @@ def _likelihood(
 
     Args:
         segments: consecutive blocks of each log.
-        grid: time constant [s] and ratio at each of G points, (G, 2); see `block_noise`.
+        grid: time constant of d [s], and ratio of the standard deviations of d and w, at each of G points, (G, 2).
         scale: standard deviations of white noise, (G, n) [Nm, N].
     """
     constant, ratio = grid.T[:, :, None]

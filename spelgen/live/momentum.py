@@ -47,7 +47,8 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
         q, qd: positions and velocities, (T, n).
         point: position of the point in the frame of the last body, (3,) [m].
     """
-    # The columns of homogeneous transforms replace points of the bodies.
+    # `forward` transforms points of the bodies. The columns of the identity are passed as points, so that the result
+    # contains the whole homogeneous transform of each body.
     pose = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
     velocities, _, turning = chain.motion(pose, qd)
     frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(-2, -3)  # (T, 1, 4, 4)
@@ -61,7 +62,8 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
     weight = torch.zeros_like(velocity)
     weight[..., 3] = -chain.base.flatten()
     directions, vectors = torch.stack([jacobian, rate, jacobian]), torch.stack([velocity, velocity, weight])
-    # tr(direction J vector^T) is linear in the pseudo-inertia J of the payload
+    # The entries of P and N are tr(A J B^T), with the pseudo-inertia J of the payload, A in `directions` and B in
+    # `vectors`. The entries of A^T B are therefore the coefficients of the entries of J.
     products = torch.einsum("ktnxa,ktxb->ktnab", directions, vectors)
     units = pseudo_inertia(torch.eye(10).to(q))
     momentum, centrifugal, weighed = torch.tensordot(products, units, dims=([-2, -1], [1, 2]))

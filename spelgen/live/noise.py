@@ -43,11 +43,11 @@ class NoiseLevels(BaseModel):
     drift, load: noise of the blocks of the drift filter and of the payload filter. observer: standard deviation of the
     momentum observer for a moving joint [Nm, N]. resting: additional threshold for a joint at rest, which is three
     standard deviations of the additional noise [Nm, N] and decreases with exp(-|qd| / resting_speed). resting_speed:
-    [rad/s, m/s]. peak_start, peak_scale: start and scale of the exponential tail of the normalised observer's peaks;
-    the tail is the largest fifth of the peaks. load_variance: factor on the covariance of estimated payloads, an
-    estimate with load_freedom degrees of freedom. speed: largest speed of the training logs [rad/s, m/s]. encoder:
-    encoder step of positions [rad, m]. effort: torque limit [Nm, N]. minutes: duration of the training logs [min].
-    point: position of the tip in the frame of the last body, (3,) [m].
+    [rad/s, m/s]. peak_start, peak_scale: start and scale of the exponential tail of the peaks of the external torque
+    divided by its standard deviation; the tail is the largest fifth of the peaks. load_variance: factor on the
+    covariance of estimated payloads, an estimate with load_freedom degrees of freedom. speed: largest speed of the
+    training logs [rad/s, m/s]. encoder: encoder step of positions [rad, m]. effort: torque limit [Nm, N]. minutes:
+    duration of the training logs [min]. point: position of the tip in the frame of the last body, (3,) [m].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -76,8 +76,9 @@ class NoiseLevels(BaseModel):
     def load_quantile(self) -> float:
         """Half width of 95 % intervals of a payload, in standard deviations: Student's t, for an estimated variance.
 
-        `load_variance` was estimated without a payload, and is used as is to decide whether there is one. With a
-        payload, friction and its errors are larger, so that the variance in the intervals is at least the prior value.
+        `load_variance` was estimated without a payload; the decision between payload and no payload uses it unchanged.
+        Intervals use at least its prior value, because with a payload, friction and its errors are larger than in the
+        training logs.
         """
         with_load = max(TUNING.prior_variance / self.load_variance, 1.0)
         return float(stdtrit(self.load_freedom, 0.975)) * math.sqrt(with_load)
@@ -102,7 +103,7 @@ class NoiseLevels(BaseModel):
         return 60 / TUNING.window * TUNING.tail * len(self.observer)
 
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
-        """Return the thresholds of the normalised observer, (n,) [1].
+        """Return the thresholds of the external torque divided by its standard deviation, (n,) [1].
 
         alarms_per_minute: rate of false alarms of all joints together [1/min].
         """

@@ -68,7 +68,11 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
 
 
 def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quantile: float) -> Payload:
-    """Return the payload; arguments: see `find_payload`. Raises LinAlgError if a matrix is not positive definite."""
+    """Return the payload. Raises LinAlgError if a matrix is not positive definite.
+
+    mean, covariance: estimate of the payload filter, (10,) and (10, 10), including the filter's prior. factor: factor
+    on the covariance of the likelihood. quantile: half width of the 95 % intervals in standard deviations.
+    """
     precision = _inverse(covariance)
     linear = precision @ mean / factor
     precision = (precision - np.diag(TUNING.load_prior**-2.0)) / factor
@@ -123,7 +127,8 @@ def _at_scale(
             step = inverse @ gradient
             decrement = gradient @ step
             theta = theta - step / (1 + math.sqrt(2 * decrement) if decrement > 0.01 else 1)
-            # Newton's method converges quadratically, so this decrement is small enough.
+            # At the intermediate weights a decrement of 0.1 suffices, since only the start at the next weight depends
+            # on the result. At the final weight it must be 1e-12, which quadratic convergence reaches in a few steps.
             if decrement < (0.1 if power else 1e-12):
                 break
     inertia = np.einsum("i,iab->ab", theta, _UNITS)

@@ -75,7 +75,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
         log_mapping = stated if mapping is None else _mapping(mapping, list(arm.robot.joint), stated)
         if arm.settings.input == "position":
             log_mapping = log_mapping.model_copy(update={"input": "position"})
-        # joints without limits may be logged as angles within one turn: their wraps are removed
+        # Joints without limits may be logged as angles within one turn, so the wraps of their angles are removed.
         log_mapping = log_mapping.with_turns(arm.turning_joints)
         return LogSource(tuple(arm.chain.joint_names), tuple(arm.chain.joint_types), log_mapping)
     if isinstance(arm, JointNames):
@@ -91,8 +91,11 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
 
 
 def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
-    """Return a mapping as a LogMapping; keys that a file or a dict does not have are from the settings, `stated`."""
-    # a LogMapping is complete and replaces the mapping of the settings; a file or a dict overrides single keys
+    """Return a mapping as a LogMapping.
+
+    stated: mapping in the arm's settings, from which keys are taken that a mapping file or a dict does not contain.
+    """
+    # A LogMapping is complete and replaces the mapping of the settings. A file or a dict overrides single keys.
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):

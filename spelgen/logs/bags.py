@@ -53,9 +53,10 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[TimedState]:
-    """Return the joint states with times [ns] of a single clock: the header's, or the recorder's without stamps.
+    """Return the joint states with times [ns] of one clock.
 
-    Both clocks are never mixed, since they may differ by hours.
+    The times are the stamps of the message headers or, if no message has a stamp, the times of the recorder. Both
+    clocks are never mixed, since they may differ by hours.
     """
     # a stamp of 0 means that the publisher has set none
     stamped = [(stamp, state) for stamp, _, state in messages if stamp]
@@ -102,7 +103,8 @@ def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[st
         got = f"joint states of {', '.join(other_names) or 'no joint'} only"
         raise LogError(got, file=path, expected=", ".join(names), do=_names_line(names, list(other_names)))
     columns = {"t": (np.array(times) - times[0]) * 1e-9}
-    for quantity, by_joint in zip(FIELDS, np.array(rows).transpose(1, 2, 0), strict=True):  # (3, n, T)
+    # array of the three quantities q, qd and tau of n joints at T times, (3, n, T)
+    for quantity, by_joint in zip(FIELDS, np.array(rows).transpose(1, 2, 0), strict=True):
         if not np.isnan(by_joint).all():
             for name, values in zip(names, by_joint, strict=True):
                 columns[PLAIN[quantity].replace("{joint}", name)] = values
@@ -112,8 +114,8 @@ def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[st
 def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     """Return the advice to map joint names to names in the log.
 
-    names: names of the joints that were not found. logged: joint names in the log. If exactly one logged name ends with
-    each joint's name, as with a prefix, the advice contains the settings.
+    names: names of the joints that were not found. logged: joint names in the log. If every joint name is the end of
+    exactly one logged name, as with a common prefix, the advice contains the settings that map the names.
     """
     found = {name: [x for x in logged if x.endswith(name)] for name in names}
     if any(len(each) != 1 for each in found.values()):

@@ -103,7 +103,7 @@ def run_checks(
     """Return the checks that find a fault of `subject`, with their findings. accepted: codes of checks to omit."""
     results: dict[str, tuple[Check[Subject], Advice]] = {}
     for check in checks:
-        # one message per cause: velocities in degrees would also fail the check of derivatives
+        # Each cause has one message. Velocities in degrees, for example, would also fail the check of derivatives.
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         advice = check.find(subject)
@@ -115,7 +115,7 @@ def run_checks(
 def find_no_torques(signals: JointSignals) -> str | None:
     """Find recordings in which the torques of all joints are always 0."""
     trajectory = signals.trajectory
-    # reported for the first joint only, since the finding concerns all joints
+    # The finding is reported for the first joint only, since it concerns all joints.
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"
@@ -215,7 +215,8 @@ class LogChecks:
 
     Trajectories are added one at a time, so that only one of them has to be in memory.
 
-    products: (2n, 2n) sum of `velocity_products` over all trajectories.
+    products: (2n, 2n) Gram matrix of the increments of the integrals of qd and of q, summed over all trajectories (see
+    `velocity_products`).
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
@@ -254,7 +255,7 @@ class LogChecks:
         summary = Findings()
         groups: dict[tuple[AnyCheck, str], list[str]] = {}
         for (group, check), occurrences in self._results.items():
-            # e.g. a joint at rest in one trajectory is no fault if it moves in another one
+            # A joint at rest in one trajectory, for example, is no fault if it moves in another one.
             if not check.everywhere or len(occurrences) == self._count:
                 is_error = check.severity == "error" or occurrences[0][0].is_line
                 groups.setdefault((check, "" if is_error else group), []).append(group)
@@ -274,7 +275,8 @@ class LogChecks:
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
         """Return settings of the group `logs` that correct a fault. entries: keys per faulty joint.
 
-        If most joints of a type need another unit, joints of this type whose motion does not show a unit get it, too.
+        A unit that most joints of a type need is also set for the joints of this type whose motion is too small to
+        determine the unit.
         """
         first, *_ = entries
         units, kinds = entries[first].get("units", {}), dict(zip(self._joints, self._kinds, strict=True))

@@ -24,9 +24,9 @@ AUTOMATIC = Preprocessing()
 class DynamicsSamples:
     """Samples of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N], each (T, n); tau as logged.
 
-    z: (T, n, K) [rad, m] bristle states of friction, computed from the history of motion; None if not computed.
-    direction: (T, n) smoothed sign of the velocity for dry friction without a state, with the same filter as tau;
-    None if not computed. rate: sample rate [Hz].
+    z: (T, n, K) [rad, m] states of the K friction bristles of each joint, computed from the history of motion; None if
+    not computed. direction: (T, n) smoothed sign of the velocity for dry friction without a state, with the same filter
+    as tau; None if not computed. rate: sample rate [Hz].
     """
 
     name: str
@@ -71,7 +71,8 @@ def dynamics_samples(
         if not pieces or not shows_accelerations(trajectory.sample_rate):
             continue
         columns = [_columns(piece, pauses, preprocessing.acceleration_cutoff, reach) for piece in pieces]
-        joined = columns[0]  # a single segment, which may be hours long, is not copied
+        # A single piece, which may be hours long, is not copied.
+        joined = columns[0]
         if len(columns) > 1:
             joined = list(map(np.concatenate, zip(*columns, strict=True)))
         samples.append(DynamicsSamples(trajectory.name, *joined))
@@ -92,7 +93,8 @@ def _columns(
     """Return the columns of `DynamicsSamples` for one piece, at the samples at which a joint moves.
 
     The columns are q, qd, qdd, tau (T, n) and, if `reach` is given, z (T, n, K) and the direction of friction (T, n).
-    pauses: see `dynamics_samples`. cutoff: cutoff of the low-pass filter [Hz]; None: no filter.
+    pauses: whether samples at rest between the first and the last motion are included. cutoff: cutoff of the low-pass
+    filter [Hz]; None: no filter.
     """
     rate, times, t = piece.sample_rate, piece.t, regular_times(piece.t, FREQUENCY)
     is_denser = rate > 1.5 * FREQUENCY
@@ -120,12 +122,14 @@ def _columns(
         selected[moving[0] : moving[-1]] = True
     columns = [q, qd, np.gradient(qd, t, axis=0), tau]
     if reach is not None and reach.elements:
-        # The filter smooths the steps of the torque at reversals of a joint. The friction state is filtered equally:
-        # otherwise its steps would be wrong by up to one sample, an error that is confounded with inertia.
+        # The filter smooths the steps of the torque at reversals of a joint. The friction state has the same filter:
+        # the steps of an unfiltered state would differ in time from the steps of the torque by up to one sample, an
+        # error that is confounded with inertia.
         path, speed = piece.q, piece.qd
         if cutoff is not None:
             path, speed = interpolated(t, q, times), interpolated(t, qd, times)
-        z = np.moveaxis(bristles_along(path, reach), 2, 0)  # one element at a time, to limit the memory
+        # One bristle is filtered at a time, to limit the memory.
+        z = np.moveaxis(bristles_along(path, reach), 2, 0)
         columns.append(np.stack(list(map(sampled, z)), axis=2))
         direction = direction_along(speed, reach)
         if direction is not None:

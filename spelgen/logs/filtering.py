@@ -66,13 +66,15 @@ def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndar
     return np.ascontiguousarray(filtered)  # the filter returns a reversed view, which torch does not accept
 
 
-# cached: a design takes as long as filtering one minute of a joint, and the logs of a robot have few rates
+# Cached, because the design of the filter takes as long as filtering one minute of a joint, and the logs of a robot
+# have few sample rates.
 @lru_cache(maxsize=8)
 def _sections(rate: float, cutoff: float) -> np.ndarray:
     """Return the second-order sections (S, 6) of the Butterworth filter for a sample rate and a cutoff [Hz]."""
     from scipy.signal import butter
 
-    # fourth order, applied forward and backward, as in the publications of the recorded logs
+    # The filter has the order 4 and is applied forward and backward, as in the papers that published the recorded logs
+    # on which this package is evaluated.
     return np.asarray(butter(4, cutoff, fs=rate, output="sos"))
 
 
@@ -90,7 +92,7 @@ def resampled(t: np.ndarray, signals: np.ndarray, times: np.ndarray, rate: float
 
     # linear interpolation between distant samples would cut off the peaks of the motion
     kind = "linear" if is_dense(rate) else "cubic"
-    # extrapolation: by rounding errors the last time may be after the last sample
+    # Extrapolation is allowed, because by rounding errors the last time may be after the last sample.
     return np.asarray(interp1d(t, signals, kind, axis=0, fill_value="extrapolate")(times))
 
 

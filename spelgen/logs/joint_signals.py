@@ -193,13 +193,14 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
     if signals.kind != "prismatic" and name in ("q", "u"):
         # candidates for the size of a revolution in logged units: angles without a stated unit may be in degrees
         turns = [2 * np.pi / abs(scale), *([360.0] if unit is None else [])]
-    # lost samples and outliers are removed: their jumps are not due to a register
+    # Lost samples and outliers are removed, because their jumps are not due to a register.
     values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
     for turn in turns:
         word = read_as_words((values - offset) / scale, turn)
         if word is None:
             continue
-        # commands may jump by themselves, so that decoding must bring them closer to the positions
+        # Commands may have genuine jumps. A decoding of commands is therefore accepted only if it brings the commands
+        # closer to the measured positions.
         if name == "u":
             q = signals.q[~is_lost(signals.signal("u"))]
             if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
@@ -220,7 +221,7 @@ def find_elastic(signals: JointSignals) -> str | None:
     """Find joints whose apparent inertia shows the resonance of an elastic gear or belt (see the module)."""
     piece = max(split_at_gaps(signals.trajectory), key=len)
     rate, k = piece.sample_rate, signals.number
-    # samples of a segment of 2 s, which gives a frequency resolution of 0.5 Hz
+    # number of samples of a segment of 2 s, whose spectrum has a frequency resolution of 0.5 Hz
     length = round(2.0 * rate)
     is_long = shows_accelerations(rate) and len(piece) >= 4 * length
     if not (is_long and piece.tau.size and np.ptp(piece.tau[:, k])):
@@ -234,7 +235,8 @@ def find_elastic(signals: JointSignals) -> str | None:
     candidates = []
     # a resonance at up to 1.5 times the highest excited frequency still changes the apparent inertia noticeably
     for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
-        # H is multiplied by 1 - (f / f_0)^2: otherwise its pole would give a band at the resonance too much weight
+        # The apparent inertia H is multiplied by 1 - (f / f_0)^2, since its pole would give a band at the resonance f_0
+        # too much weight.
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error([factor, ones], factor * inertia)
         # the resonance of a link with less than a tenth of the motor's inertia is not visible
@@ -284,7 +286,8 @@ def _apparent_inertia(
     firsts = np.unique(np.searchsorted(frequency, edges))
     (moved, driven), together = np.add.reduceat(power, firsts, axis=1), np.add.reduceat(cross, firsts)
     means = np.add.reduceat(frequency, firsts) / np.diff(np.append(firsts, len(frequency)))
-    # coherent bands: squared in-phase coherence above 0.85, and enough motion for a ratio that is not noise
+    # A band is coherent if its squared in-phase coherence is above 0.85, and if it has enough motion for a ratio that
+    # is not noise.
     coherent = together**2 > 0.85 * moved * driven
     coherent &= moved > 1e-3 * moved.max(initial=0.0)
     return means[coherent], together[coherent] / moved[coherent]
@@ -293,7 +296,8 @@ def _apparent_inertia(
 def _relative_error(columns: Sequence[np.ndarray], values: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the relative RMS residual of a least-squares fit, and the coefficients (C,).
 
-    columns: C regressor columns (B,). values: (B,) the fitted values, whose RMS is the reference.
+    columns: C columns of the regressor, (B,) each for B frequency bands. values: (B,) dependent variable, whose RMS is
+    the reference of the residual.
     """
     matrix = np.stack(columns, axis=1)
     x = np.linalg.lstsq(matrix, values, rcond=None)[0]

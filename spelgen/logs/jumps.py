@@ -125,11 +125,12 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
-    """Return a mask (T,) of the rows of a log (T, C) that are repeated although the arm moves, and the copies per row.
+    """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
     positions: number of leading columns that are positions. A block of k equal rows consists of repeats if the arm
     moved meanwhile: then the step at its end is as large as k steps of the motion that follows. Equal rows of an arm at
-    rest are no repeats, unless the rows of motions occur n times each: then only every n-th row at rest is kept.
+    rest are no repeats, with one exception: if the rows during motion occur m times each, the logger writes each row m
+    times, and only every m-th of the rows at rest is kept.
     """
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
     lengths = np.diff(np.append(starts, len(columns)))
@@ -183,7 +184,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
     values: (T,) in logged units. turn: one revolution in logged units; None for a joint that does not rotate.
     """
-    if len(values) < 4:  # the median step might itself be a jump
+    # The median step of so few values might itself be a jump.
+    if len(values) < 4:
         return None
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
@@ -202,7 +204,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        # words that overflow have a range of one period (plus 1 % for noise); negative words exceed the sign bit
+        # The decoding of words that overflow needs a range of at most one period (plus 1 % for noise). The decoding of
+        # a sign bit needs values above the sign bit, which represent the negative numbers.
         readings = []
         if np.ptp(values) < 1.01 * size:
             readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))
@@ -210,7 +213,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
             jumps = np.abs(np.diff(reading.values))
-            # a wrong decoding is rejected: it shortens large steps of motion by one period, but they remain large
+            # A wrong decoding is rejected: it shortens large steps of the motion by one period, but the steps remain
+            # large.
             if np.median(jumps[rows]) > TUNING.jump * usual:
                 continue
             bends = np.abs(np.diff(reading.values, 2))

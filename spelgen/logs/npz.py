@@ -53,7 +53,8 @@ class NpzArrays:
     def column(self, name: str) -> pa.Array:
         """Return an array as a column of a table; a matrix becomes a column of lists."""
         array = self[name]
-        # converted to double precision and native byte order, since Arrow rejects other ones
+        # The array is converted to double precision and native byte order, since Arrow rejects other types and byte
+        # orders.
         wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
         values = pa.array(array.astype(wide).ravel())
         return pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if array.ndim == 2 else values

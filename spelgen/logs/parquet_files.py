@@ -19,7 +19,8 @@ from spelgen.settings.yaml_document import YamlDocument, validated
 INFO = "meta/info.json"  # description of a LeRobot data set, within the folder of the data set
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
 ENDING = ".pos"
-LARGEST_NORMALISED = 100.001  # 100 in single precision
+# Largest normalised position: 100, with a tolerance for rounding to single precision.
+LARGEST_NORMALISED = 100.001
 
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -27,7 +28,7 @@ def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list
     schema = pa.parquet.read_schema(file)
     layout = table_layout(schema, joints, mapping, file)
     columns = stored_columns(layout, schema.names)
-    # without pre-buffering, which would keep the compressed file in memory in addition to the table
+    # Pre-buffering is disabled, because it would keep the compressed file in memory in addition to the table.
     return [(layout, pa.parquet.read_table(file, columns=columns, pre_buffer=False))]
 
 

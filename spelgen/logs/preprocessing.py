@@ -96,6 +96,7 @@ class Preprocessing:
     def moved(self, trajectories: Sequence[Trajectory]) -> Sequence[Trajectory]:
         """Return the trajectories with torques shifted back by `torque_delay`, to the times at which they acted."""
         delay = self.torque_delay
-        if not delay:  # most logs have no delay, and unchanged trajectories need not be validated again
+        # Most logs have no delay: the unchanged trajectories are returned, which need not be validated again.
+        if not delay:
             return trajectories
         return [replace(x, tau=earlier(x.t, x.tau, delay)) for x in trajectories]

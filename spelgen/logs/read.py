@@ -87,14 +87,16 @@ def _read(
 ) -> list[Trajectory]:
     """Return the trajectories of all files, collected in `segments`; raise the first error of each file, as one error.
 
-    source: joints and mapping. role, joint_types: see `read_logs`.
+    source: joints and mapping. role: "train" or "test", if only the files of a folder with this name are read; None:
+    all files. joint_types: types of the joints, for the check of the units in the mapping.
     """
     collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))
     files, errors = log_files(paths, role)
     for file in files:
         try:
             tables = read_tables(file, source.joints, source.mapping)
-            while tables:  # a table is removed from the list, so that its memory is free after it was added
+            # A table is removed from the list before it is added, so that its memory can be freed afterwards.
+            while tables:
                 segments.add(*tables.pop(0))
         except LogError as error:
             errors.append(error)
@@ -112,8 +114,9 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     """Write trajectories to one Parquet or CSV file, as the suffix of the path states; return the path.
 
     The file is complete, or not written if an error occurs. The column `trajectory` contains the names of the
-    trajectories. `read_logs` returns the same numbers from both formats. arm: see `read_logs`. Raises LogError for
-    another suffix, if there are no trajectories, and for trajectories whose number of joints differs from the arm's.
+    trajectories. `read_logs` returns the same numbers from both formats. arm: result of `load_arm`, a model, or the
+    names of the joints. Raises LogError for another suffix, if there are no trajectories, and for trajectories whose
+    number of joints differs from the arm's.
     """
     path, joints = Path(path), log_source(arm).joints
     if path.suffix not in (".parquet", ".csv"):

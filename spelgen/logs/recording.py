@@ -111,7 +111,7 @@ def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> R
         rows = outlier_rows(quantity, values)
         if ("qd", joint) in columns:
             rows |= stale_rows(quantity, values, data[:, 0], columns["q", joint], columns["qd", joint])
-        # jumps of commands are no faults
+        # Jumps of commands are no faults, since a command may jump at any time.
         if quantity != "u" and rows.any():
             outliers |= rows
             dropped.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
@@ -255,7 +255,7 @@ def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
 
     moved = values.copy()
     for rows in _pieces(t):
-        # a cubic spline, since linear interpolation would attenuate high frequencies of the torques
+        # A cubic spline is used, since linear interpolation would attenuate high frequencies of the torques.
         spline = CubicSpline(t[rows], values[rows])
         moved[rows] = spline(np.clip(t[rows] + delay, t[rows][0], t[rows][-1]))
     return moved

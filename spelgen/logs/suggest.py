@@ -117,7 +117,8 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
             lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
     used = {column.name for named in by_joint.values() for column in named.values()}
     unused = [x.name for quantity in by_joint for x in columns_of[quantity] if x.name not in used]
-    if unused:  # e.g. columns of a gripper, or of another arm with similar names
+    # Unused columns are, for example, columns of a gripper, or of another arm with similar names.
+    if unused:
         lines.append(f"# not used: {shortened(unused, TUNING.listed)}")
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     return _suggestion(lines, missing, "column")
@@ -161,7 +162,9 @@ def _column_name(name: str) -> ColumnName:
 def _by_quantity(
     columns: Sequence[ColumnName], commands: bool, joints: Sequence[str]
 ) -> dict[str, list[ColumnName]]:
-    """Return the columns per quantity, which the words in a column's name determine, or else its unit.
+    """Return the columns of each quantity, by the name of the quantity.
+
+    The quantity of a column is determined by the words in its name or, if these do not determine it, by its unit.
 
     commands: True for logs with commanded positions "u" instead of velocities and torques. joints: names of the joints;
     a joint's name in a column's name does not count as a word for commands, even if it is one.

@@ -58,7 +58,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         columns = ("t", *self.quantities)
         for column in columns:
-            # converts lists and tensors; the frozen dataclass does not allow a normal assignment
+            # This converts lists and tensors to arrays. The frozen dataclass does not allow a normal assignment.
             object.__setattr__(self, column, self._as_array(column))
         if self.t.ndim != 1 or not self.t.size:
             raise self.error(f"an array of shape {self.t.shape}", "(T,), a time for each sample", column="t")
@@ -117,7 +117,10 @@ class Trajectory:
 
     @property
     def regular_steps(self) -> np.ndarray:
-        """Time steps between samples [s], without the gaps: a pause of a minute could halve the sample rate."""
+        """Time steps between samples [s], gaps excluded.
+
+        Gaps are excluded because a gap of a minute would bias the mean sample rate.
+        """
         steps = np.diff(self.t)
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 
@@ -192,12 +195,13 @@ def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
 def split_at_gaps(
     trajectory: Trajectory, gap: float = GAP, hole: float = 0.0, *, shortest: int = 1
 ) -> list[Trajectory]:
-    """Return the gap-free pieces of a trajectory that have at least `shortest` samples, in order, all with its name.
+    """Return the gap-free pieces with at least `shortest` samples, in order.
 
-    gap, hole: see `gap_ends`.
+    Each piece has the name of the trajectory. A gap is a time step longer than `gap` median steps and longer than
+    `hole` [s].
     """
     ends = gap_ends(trajectory.t, gap, hole)
-    # a trajectory without gaps is returned itself, since a copy would be validated again
+    # A trajectory without gaps is returned itself, since a copy would be validated again.
     pieces = [trajectory[start:stop] for start, stop in pairwise(ends)] if len(ends) > 2 else [trajectory]
     return [piece for piece in pieces if len(piece) >= shortest]
 
@@ -240,7 +244,7 @@ LogRows = tuple[Trajectory, slice]
 
 def steps_between(trajectory: Trajectory, longest: float = 3.4e-3) -> int:
     """Return the number of integration steps per sample interval, so that a step is at most ``longest`` [s]."""
-    # default of 3.4 ms: with longer steps, fits of position servos had armatures biased by a few per cent
+    # The default is 3.4 ms: with longer steps, fits of position servos had armatures biased by a few per cent.
     return max(1, math.ceil(1 / (trajectory.sample_rate * longest) - 1e-6))
 
 
@@ -257,9 +261,8 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
     previous = np.concatenate([u[:1], u[:-1]])  # the command held until each sample
-    corners = np.concatenate(
-        [t[:1] - 1e3, t]
-    )  # [s] the first command is assumed to have been held for a long time before the recording
+    # [s] The first command is assumed to have been held for a long time before the recording.
+    corners = np.concatenate([t[:1] - 1e3, t])
     integral = np.zeros((len(t) + 1, u.shape[1]))
     integral[1:] = np.cumsum(np.diff(corners)[:, None] * previous, axis=0)
     edges = samples[:-1, None] + np.diff(samples)[:, None] * np.arange(steps) / steps

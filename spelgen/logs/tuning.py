@@ -67,8 +67,8 @@ class SampleTuning:
 TUNING, SIGNALS, SAMPLES = LogTuning(), SignalCheckTuning(), SampleTuning()
 
 SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff  # [Hz] lowest sample rate for accelerations
-# [1] Tolerance factor for comparisons of sample rates with a bound: loggers with a nominal rate of 50 Hz have measured
-# rates of 49.95 Hz or 50.1 Hz.
+# [1] A sample rate that is below a bound by up to this factor still satisfies the bound: loggers with a nominal rate of
+# 50 Hz have measured rates of 49.95 Hz or 50.1 Hz.
 FAST = 1.002
 
 

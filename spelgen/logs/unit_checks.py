@@ -28,13 +28,17 @@ UNITS = {
 
 
 def velocity_products(trajectory: Trajectory) -> np.ndarray:
-    """Return the Gram matrix (2n, 2n) of increments over ten samples: of the integrals of qd (n), then of q (n)."""
-    # imported here, since the import takes half a second
+    """Return the Gram matrix (2n, 2n) of the increments of 2n signals over ten samples.
+
+    Rows 0 to n-1 are the integrals of qd, rows n to 2n-1 are q.
+    """
+    # SciPy is imported here, since the import takes half a second.
     from scipy.integrate import cumulative_trapezoid
 
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
     for piece in split_at_gaps(trajectory, shortest=2):
-        # increments over several samples: between neighbours the quantisation step may be larger than the change of q
+        # Increments over several samples are used, because between neighbouring samples the quantisation step may be
+        # larger than the change of q.
         span = min(SIGNALS.increments, len(piece) - 1)
         integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
         positions = np.concatenate([integral, piece.q], axis=1)
@@ -47,7 +51,8 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the factors (n,) between dq/dt and qd of each joint, and the correlations (n, n) of all qd and dq/dt.
 
     A factor times qd is dq/dt in the least-squares sense. Correlation (i, j) is between qd of joint i and dq/dt of
-    joint j; it is NaN if one of these joints is at rest. products: see `velocity_products`.
+    joint j; it is NaN if one of these joints is at rest. products: (2n, 2n) Gram matrix of the increments of the
+    integrals of qd, then of q.
     """
     n = len(products) // 2
     qd_squares, q_squares = np.split(products.diagonal(), 2)
@@ -59,8 +64,9 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def find_units(signals: JointSignals) -> str | Advice | None:
     """Find wrong units of q or qd: a range of q of more than two turns, or dq/dt that is a multiple of qd."""
     mapping, joint = signals.trajectory.mapping, signals.joint
+    # dq/dt is wrong because the times are in another unit, which another check reports.
     if signals.step > SIGNALS.slowest_step:
-        return None  # the times are in another unit
+        return None
     is_far = np.ptp(signals.q) > TURNS and signals.kind != "prismatic" and not signals.turns
     is_far &= mapping.unit("q", joint) is None
     message = f"q that changes {signals.factor:.3g} times as fast as qd"
@@ -108,7 +114,8 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
         message = f"q that changes {signals.factor:.3g} times as fast as qd"
         unit = next((x for x in TIMES if x != "s" and signals.changes_by(TIMES[x])), None)
     elif signals.number:
-        return None  # reported for the first joint only, since all joints share the times
+        # The finding is reported for the first joint only, since all joints share the times.
+        return None
     elif unit is not None:
         message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
     if unit is None or is_stated:
@@ -134,7 +141,8 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         return None
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
-        return message  # too few increments for evidence: two samples always have a correlation of 1 or -1
+        # The increments are too few for advice: two samples always have a correlation of 1 or -1.
+        return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
         return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
@@ -178,7 +186,8 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
 
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Find velocities without sign: qd is |dq/dt|."""
-    # share: qd has no sign if its extreme velocity of one sign is below 5 % of its extreme velocity of the other sign
+    # `share` is a threshold: qd has no sign if its extreme velocity of one sign is below 5 % of its extreme velocity of
+    # the other sign.
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
     lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
     # velocities of both signs are not magnitudes, and differentiated ones cannot lack their sign

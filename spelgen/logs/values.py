@@ -32,7 +32,8 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
     """
     times, unit = _clock(table, layout)
     if start is not None:
-        # subtracted as integers before the conversion: doubles near 1.7e18 ns are 256 ns apart
+        # The start is subtracted from the integers, before the conversion to doubles: doubles near 1.7e18 ns are 256 ns
+        # apart.
         times = pa.compute.subtract(times, start)
     logged = [_floats(times, layout.columns[0], layout, rows)]
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)

@@ -114,8 +114,12 @@ def cut_windows(
 
 
 def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> torch.Tensor:
-    """Return values (T, n) cut into windows, (W, window, n); see `cut_windows` for `stride` and `decimation`."""
-    # contiguous, since torch does not accept reversed views
+    """Return values (T, n) cut into W windows, (W, window, n).
+
+    stride: number of values between the starts of consecutive windows. decimation: number of values between
+    neighbouring samples of a window.
+    """
+    # The array is made contiguous, since torch does not accept reversed views.
     windows = torch.tensor(np.ascontiguousarray(values)).unfold(0, (window - 1) * decimation + 1, stride)
     return windows[..., ::decimation].transpose(1, 2)
 

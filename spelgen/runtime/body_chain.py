@@ -1,4 +1,4 @@
-"""The bodies of an arm: their inertial parameters, and the motion of their masses."""
+"""The bodies of an arm: inertial parameters, and the motion of the four point masses of each body."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,7 +18,9 @@ class ChainConfiguration(NamedTuple):
     place: Tensor  # positions [m] times square roots of the masses, (..., 3, bodies, 4)
     mass: Tensor  # square roots of the masses, (..., 1, bodies, 4)
     axes: Tensor  # twist of a body per rate of its own joint, (..., 6, bodies)
-    jacobian: Tensor  # d(points) / d(displacement of a body's own joint), (..., bodies, 12 bodies)
+    # Derivatives of the points' coordinates, times square roots of the masses, with respect to the
+    # displacement of each body's own joint, (..., bodies, 12 bodies): 3 coordinates of 4 points per body.
+    jacobian: Tensor
     weight: Tensor  # -gravity times square roots of the masses, (..., 12 bodies)
 
 
@@ -28,9 +30,9 @@ class BodyChain(nn.Module):
     Twists are (angular, linear) in the base frame (Featherstone, Rigid Body Dynamics Algorithms, 2008);
     frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). Each body is represented by four
     point masses with the same inertia: the columns (position, 1) * sqrt(mass) of a matrix root of the
-    body's pseudo-inertia. Only the frames are computed one body after the other. Sums over carrying or
-    carried bodies are products with a mask, because for small arms the time is proportional to the
-    number of tensor operations.
+    body's pseudo-inertia. Only the frames are computed recursively. Sums over the bodies that a joint
+    carries, or over the joints that carry a body, are products with a mask, because for small arms the
+    time is proportional to the number of tensor operations.
     """
 
     def __init__(
@@ -57,10 +59,10 @@ class BodyChain(nn.Module):
         first, second = (start @ rate).flatten(1), (start @ rate @ rate).flatten(1)
         by_feature = [-second, turns.unsqueeze(-1) * first, (1 - turns).unsqueeze(-1) * first]
         # Linear map, (16 bodies, 3 bodies), from cosines, sines and values of the displacements to the
-        # frames of the bodies relative to their parents.
+        # frames of the bodies relative to their parents; `fixed` is the constant term of the map.
         blocks = [torch.ops.aten.block_diag([*x.unsqueeze(-1)]) for x in by_feature]
         self.table = nn.Buffer(torch.cat(blocks, dim=1))
-        self.fixed = nn.Buffer((start.flatten(1) + second).flatten())  # constant term
+        self.fixed = nn.Buffer((start.flatten(1) + second).flatten())
         # Linear map, (6, 12), from a twist to the 3 x 4 matrix that maps (position, 1) of a point to
         # its velocity.
         unit = torch.eye(3).double()
@@ -80,7 +82,11 @@ class BodyChain(nn.Module):
         self.base = nn.Buffer(-vector(gravity)[:, None, None])
 
     def forward(self, q: Tensor, points: Tensor) -> ChainConfiguration:
-        """Return the cache at q, (..., n), of points in body frames, block diagonal, (4 bodies, 4 bodies)."""
+        """Return the configuration cache at q, (..., n) [rad, m].
+
+        points: point masses of the bodies in body frames, four columns (position, 1) * sqrt(mass) per
+        body, as a block diagonal matrix, (4 bodies, 4 bodies).
+        """
         # The displacements of all bodies, including mimic joints, are linear functions of q.
         value = q @ self.ratios.mT + self.offset
         features = torch.cat([value.cos(), value.sin(), value], dim=-1)
@@ -120,11 +126,12 @@ class BodyChain(nn.Module):
         return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
     def accelerations(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
-        """Return accelerations of the points (qdd = 0), less gravity, times root masses, (..., 12 bodies)."""
+        """Return the points' accelerations at qdd = 0 minus gravity, times sqrt(mass), (..., 12 bodies)."""
         velocity, twists, turning = self.motion(cache, qd)
         steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
         w, (a, u) = twists[..., :3, :, None], steady.unsqueeze(-1).chunk(2, dim=-3)
-        # At constant joint rates, a point p with velocity v has the acceleration w x v + w' x p + u'.
+        # (w, u) is the twist of a body, (w', u') its time derivative at constant joint rates: the point p
+        # with velocity v then has the acceleration w x v + w' x p + u'. In the code, a is w', u is u'.
         turned = torch.linalg.cross(w, velocity, dim=-3) + torch.linalg.cross(a, cache.place, dim=-3)
         return torch.addcmul(turned, u, cache.mass).flatten(-3) + cache.weight
 
@@ -159,7 +166,10 @@ def chain_of_links(joints: Sequence[Joint], links: Sequence[Link], gravity: Row)
 
 
 def body_factor(parameters: Tensor) -> Tensor:
-    """Return the matrix T, upper triangular, from log-Cholesky parameters in the same places, (..., 4, 4)."""
+    """Return the upper triangular matrix T of ``InertialParameters``, (..., 4, 4).
+
+    parameters: log-Cholesky parameters, (..., 4, 4), each at the place of its entry of T.
+    """
     logarithms = parameters.diagonal(dim1=-2, dim2=-1)
     sizes, mass = logarithms[..., :3], logarithms[..., 3:] / 2
     scale = torch.cat([sizes + mass, mass], dim=-1).exp()

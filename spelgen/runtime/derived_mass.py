@@ -19,7 +19,10 @@ from spelgen.runtime.rows import Constant, Function, Joint, vector
 
 
 class LinearMass(nn.Module):
-    """Base class of an M that is linear in functions of q and constants: the constants and the armature."""
+    """Base class of mass matrices M that are linear in functions of q and in constants.
+
+    It has the trained constants and the armature (rotor inertia).
+    """
 
     parameter_groups = (
         ("raw_constants", "mass_constants", "kg m^2, kg m, kg"),
@@ -68,7 +71,7 @@ class ConstantMass(LinearMass):
         return self.entries(*self.constants().unbind()) + torch.diag(self.armature())
 
     def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return M, (..., n, n), and the encoding, (..., 2 n), as the shape of the derivatives of M."""
+        """Return M, (..., n, n), and the encoding, (..., 2 n), which gives zero derivatives their shape."""
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Tensor) -> Tensor:
@@ -86,9 +89,10 @@ class DerivedMass(LinearMass):
 
     The result is positive definite for all q and all parameters. C is the nominal mean of M. M is
     replaced by M' = C + t (M - C) if M - margin C is not positive definite, where t is the largest of
-    1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin, and |.| is an upper bound of the norm relative to
-    C. Since t is piecewise constant, the derivatives of M' are t times the derivatives of M. C has the
-    same zeros and linear relations between entries as M, so M' has them, too.
+    1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin, and |X| is an upper bound of the spectral norm of
+    L^-1 X L^-T, with C = L L^T. Since t is piecewise constant, the derivatives of M' are t times the
+    derivatives of M. C has the same zeros and linear relations between entries as M, so M' has them,
+    too.
     """
 
     def __init__(
@@ -104,12 +108,14 @@ class DerivedMass(LinearMass):
         super().__init__(joints, entries, constants=constants, functions=functions)
         self.network = network
         center = self._by_outputs()[-1].detach()
-        self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)  # C, margin C
+        # `center` is C, the nominal mean of M; M - `smallest` must be positive definite.
+        self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # Factors on the entries of M - C: the Frobenius norm of the product is an upper bound of the
-        # norm of M - C relative to C, divided by 1 - margin.
+        # Factors on the entries of M - C: the Frobenius norm of the product is |M - C| / (1 - margin).
+        # It is an upper bound of the spectral norm, since the smallest eigenvalue of C with a diagonal
+        # scaled to one is `eigenvalue`.
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
@@ -158,7 +164,11 @@ class DerivedMass(LinearMass):
 
 
 class DenseIntermediates(NamedTuple):
-    """Intermediate values of ``DenseMass.forward`` for the derivatives of M, in the symbols of the class."""
+    """Intermediate values of ``DenseMass.forward`` for the derivatives of M.
+
+    M is (U^-1 A)^T diag(1 / e) U^-1 A, with a lower triangular U, e > 0, and constant A, see
+    ``DenseMass``.
+    """
 
     network: Intermediates
     factor: Tensor  # U without its diagonal of ones, (..., 3 n, 3 n)
@@ -217,12 +227,15 @@ class DenseMass(nn.Module):
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return U without its diagonal of ones, (..., 3 n, 3 n), and e, (..., 3 n), from network outputs."""
+        """Return U and e of M^-1 = C U diag(e) U^T C^T from the outputs of the network.
+
+        U, (..., 3 n, 3 n), is returned without its diagonal of ones; e is (..., 3 n).
+        """
         entries, scale = raw.tensor_split((len(self.below),), dim=-1)
         return self._lower(entries), F.softplus(scale)
 
     def _lower(self, entries: Tensor) -> Tensor:
-        """Return a matrix, (..., 3 n, 3 n), with entries below the diagonal, rows in sequence, else zero."""
+        """Return the strictly lower triangular matrix, (..., 3 n, 3 n), of entries, rows in sequence."""
         rows = entries.new_zeros(*entries.shape[:-1], self.size * self.size)
         rows = rows.index_copy(-1, self.below, entries)
         return rows.reshape(*entries.shape[:-1], self.size, self.size)

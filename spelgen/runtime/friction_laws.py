@@ -24,10 +24,10 @@ class FrictionConstants(NamedTuple):
     stribeck: Tensor  # additional dry friction at low velocity [Nm, N]
     stribeck_velocity: Tensor  # [rad/s, m/s]
     load_dependence: Tensor  # dry friction per magnitude of the gravity torque [1]
-    stribeck_rounding: Tensor  # relative to the Stribeck velocity [1]
+    stribeck_rounding: Tensor  # rounding of the Stribeck curve at rest, per Stribeck velocity [1]
     coulomb_smoothing_velocity: Tensor  # width of the sign change of dry friction [rad/s, m/s]
-    min_load: Tensor  # [Nm, N]
-    bristle_fractions: Tensor  # of dry friction, (n, K); the sum over K is 1, or 0 at joints without bristles
+    min_load: Tensor  # load at zero gravity torque, so that |gravity torque| is smoothed at zero [Nm, N]
+    bristle_fractions: Tensor  # fraction of dry friction per bristle, (n, K); sum 1, or 0 without bristles
     bristle_reach: Tensor  # break-away displacements, (n, K) [rad, m]
     memoryless: Tensor  # 1: dry friction depends on velocity only, 0: on bristles
 
@@ -42,7 +42,7 @@ class FrictionConstants(NamedTuple):
         # (1 + x / 8)^-8 approximates exp(-x). With the rounding r, x = (1 + r) v^2 / (v + r) is
         # approximately v^2 for large r and v for small r.
         slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
-        slow = slow.square().square().square()  # three squares: ** 8 takes twice the time
+        slow = slow.square().square().square()  # Squaring three times takes half the time of ** 8.
         # The load is a smooth approximation of |gravity torque|.
         load = (gravity.square() + self.min_load**2).sqrt()
         return self.coulomb + self.stribeck * slow + self.load_dependence * load
@@ -169,7 +169,7 @@ class SlidingFriction(FrictionLaws):
         self.memoryless.fill_(1.0)
         self.raw_coulomb_smoothing_velocity = nn.Parameter(torch.zeros_like(self.speed))
         del self.raw_bristle_fractions
-        self.register_buffer("raw_bristle_fractions", self.reach)  # (n, 0)
+        self.register_buffer("raw_bristle_fractions", self.reach)  # (n, 0), since there are no bristles
 
     def prepare(self) -> FrictionConstants:
         """Return the constants in SI units."""

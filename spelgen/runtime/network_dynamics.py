@@ -106,7 +106,11 @@ class NetworkDynamics(PortHamiltonian):
 
 
 class DenseInputDynamics(NetworkDynamics):
-    """A model of networks with a diagonal G(q), from a network with three outputs per joint."""
+    """A model of networks with a diagonal G(q).
+
+    The network of G has three outputs per joint, one per axis. Only the output of the z axis, about
+    or along which the joint moves, is used.
+    """
 
     def __init__(self, *, input_network: MaskedNetwork, **parts: Any) -> None:
         super().__init__(**parts)
@@ -138,8 +142,8 @@ class NetworkFriction(nn.Module):
     """Base class of dissipation matrices D(q, qd) from a network, in units of typical friction and speed."""
 
     prepare: Callable[[], Parameters]  # returns the parameter cache
-    # Returns D(q, qd) right, (..., n, k), from encoded positions, qd, parameter cache and right, (...,
-    # n, k).
+    # Returns the product of D(q, qd) and a matrix, (..., n, k). The arguments are the encoded positions,
+    # qd, the parameter cache, and the matrix, (..., n, k).
     forward: Callable[[Tensor, Tensor, Parameters, Tensor], Tensor]
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork) -> None:

@@ -16,7 +16,10 @@ SPACING = 2 / (GRID - 1)
 
 
 class JointEncoding(nn.Module):
-    """Encoding of positions, (..., 2 n): cos q of all joints, then sin q; prismatic joints: scaled q, 0."""
+    """Encoding of positions, (..., 2 n): cos q of all n joints, then sin q of all joints.
+
+    A prismatic joint has the scaled q in place of cos q, and 0 in place of sin q.
+    """
 
     def __init__(self, joints: Sequence[Joint]) -> None:
         super().__init__()
@@ -109,7 +112,8 @@ class MaskedNetwork(nn.Module):
 
     points = 0  # number of bumps of an edge's function; 0: each edge has one weight
 
-    # Returns offset + output_map y, (..., rows), for the outputs y, and intermediates for derivatives.
+    # Returns offset + output_map y, (..., rows), for the outputs y of the network before this linear map
+    # (see ``prepare``), and intermediate values for derivatives.
     forward: Callable[[Tensor, Layers], tuple[Tensor, Intermediates]]
     vjp: Callable[[Intermediates, Tensor], Tensor]  # cotangent (..., rows) times the Jacobian: (..., inputs)
     jvp: Callable[[Intermediates, Tensor], Tensor]  # Jacobian times a tangent: (..., rows)
@@ -126,7 +130,9 @@ class MaskedNetwork(nn.Module):
         min_units: int = 1,
     ) -> None:
         super().__init__()
-        slopes = torch.ones((), dtype=torch.float64)  # of the initial edge functions
+        # The initial weights of an edge are a random number times `slopes`: 1 for a single weight, or
+        # heights of bumps that increase linearly over the grid, so that the function is nearly linear.
+        slopes = torch.ones((), dtype=torch.float64)
         if self.points:
             slopes = torch.linspace(-1, 1, self.points, dtype=torch.float64)
             self.grid = nn.Buffer(slopes / SPACING)
@@ -142,7 +148,10 @@ class MaskedNetwork(nn.Module):
         nn.init.zeros_(self.weights[-1])  # The initial outputs are zero.
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return masked layers of a network whose output is offset (rows,) + output_map (rows, outputs) y."""
+        """Return masked layers of a network that computes offset + output_map y, with y from this network.
+
+        y has shape (..., outputs). offset: (rows,); output_map: (rows, outputs).
+        """
         weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
         biases = list(self.biases)
         weights[-1], biases[-1] = output_map @ weights[-1], offset + output_map @ biases[-1]
@@ -161,7 +170,7 @@ class MaskedMLP(MaskedNetwork):
         return F.linear(layer, *layers[-1]), (hidden, layers)
 
     def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
-        """Return cotangent, (..., rows), times d/d encoded, by a reverse sweep; (..., inputs)."""
+        """Return a cotangent, (..., rows), times the network's Jacobian, (..., inputs), in reverse mode."""
         hidden, layers = intermediates
         layer: Tensor = cotangent @ layers[-1][0]
         for (weight, _), value in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
@@ -170,7 +179,7 @@ class MaskedMLP(MaskedNetwork):
         return layer
 
     def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
-        """Return d/d encoded times a tangent, by a forward sweep; (..., rows)."""
+        """Return the network's Jacobian times a tangent, (..., inputs): (..., rows), in forward mode."""
         hidden, layers = intermediates
         for (weight, _), value in zip(layers[:-1], hidden, strict=True):
             tangent = torch.ops.aten.tanh_backward(F.linear(tangent, weight), value)
@@ -208,7 +217,7 @@ class MaskedKAN(MaskedNetwork):
         return F.linear(bumps[-1].height.flatten(-2), *layers[-1]), (bumps, hidden, layers)
 
     def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
-        """Return cotangent, (..., rows), times d/d encoded, by a reverse sweep; (..., inputs)."""
+        """Return a cotangent, (..., rows), times the network's Jacobian, (..., inputs), in reverse mode."""
         bumps, hidden, layers = intermediates
         layer = self._bumps_vjp(bumps[-1], cotangent @ layers[-1][0])
         for index in reversed(range(len(hidden))):
@@ -221,7 +230,7 @@ class MaskedKAN(MaskedNetwork):
         return (-2 / SPACING) * (bumps.distance * bumps.height * cotangent).sum(dim=-1)
 
     def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
-        """Return d/d encoded times a tangent, by a forward sweep; (..., rows)."""
+        """Return the network's Jacobian times a tangent, (..., inputs): (..., rows), in forward mode."""
         bumps, hidden, layers = intermediates
         for index, (weight, _) in enumerate(layers):
             slopes = bumps[index].distance * bumps[index].height

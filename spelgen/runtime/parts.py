@@ -10,10 +10,11 @@ Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
 Entries = Callable[..., Tensor]  # M, (..., n, n), from functions and constants, (...) each
 Layers = tuple[tuple[Tensor, Tensor], ...]  # masked weights, and biases, of each layer of a network
-# The following types are Any, because each model and each part of a model has its own type.
+# The following types are Any, because each model and each part of a model has named tuples of its own
+# for these quantities.
 Intermediates = Any  # values of a forward pass that its derivatives need
-Parameters = Any  # parameter cache: all that depends on the parameters only
-Configuration = Any  # configuration cache: all that depends on q only
+Parameters = Any  # parameter cache: quantities that depend on trained parameters only
+Configuration = Any  # configuration cache: quantities that depend on q, for given parameters
 Position = Any  # q, (..., n), or the configuration at q
 
 
@@ -21,7 +22,7 @@ class Mass(Protocol):
     """Interface of a mass matrix M(q) with explicit derivatives."""
 
     def prepare(self) -> Parameters:
-        """Return the parameter cache: all that depends on the parameters only."""
+        """Return the parameter cache: quantities that depend on trained parameters only."""
 
     def forward(self, encoded: Tensor, parameters: Parameters) -> tuple[Tensor, Intermediates]:
         """Return M(q), (..., n, n), and intermediate values for its derivatives."""

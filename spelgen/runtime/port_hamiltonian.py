@@ -12,7 +12,8 @@ from spelgen.runtime.rows import Joint
 
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     """Return the product of a matrix, (..., n, m), and a vector, (..., m)."""
-    if vector.dim() == 1:  # one operation: for a single state their number determines the time
+    # A single operation: for a single state, the number of operations determines the time.
+    if vector.dim() == 1:
         return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 

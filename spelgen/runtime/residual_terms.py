@@ -24,7 +24,7 @@ LARGEST = math.log(10.0)
 
 
 class ResidualParameters(NamedTuple):
-    """All that depends on the parameters only."""
+    """Parameter cache of ``ResidualTerms``: quantities that depend on trained parameters only."""
 
     splines: Tensor  # coefficients of the torque [Nm, N] and of the friction factor, (n, SPLINES, 2)
     ripple: Tensor  # amplitudes of cosines, then sines [Nm], (n, 2 HARMONICS + 4)
@@ -35,25 +35,26 @@ class ResidualParameters(NamedTuple):
 
 
 class ResidualConfiguration(NamedTuple):
-    """All that depends on q only."""
+    """Configuration cache of ``ResidualTerms``: quantities at positions q, (..., n) [rad, m]."""
 
     q: Tensor
-    encoded: Tensor
+    encoded: Tensor  # encoded positions, the inputs of the networks, see ``JointEncoding``
     torque: Tensor  # dV/dq due to functions of single joints, (..., n) [Nm, N]
     friction: Tensor  # factor on friction, (..., n)
-    mass: Tensor  # R(q), (..., n, n)
+    mass: Tensor  # R(q), the residual term of M, (..., n, n)
     slope: Tensor | None  # d tanh(y) / dy for the outputs y of R's network, (..., functions)
-    intermediates: Intermediates  # of the network of R
+    intermediates: Intermediates  # intermediate values of R's network, for derivatives
     parameters: ResidualParameters
 
 
 class ResidualTerms(nn.Module):
     """Residual terms: R(q) is added to M, terms are added to V, and a factor multiplies friction.
 
-    Each joint has a torque dV/dq that is a function of its position: a sum of cubic B-splines over the
-    joint's range and, for a revolute joint, of harmonics of a revolution of the joint and of the motor,
-    in units of typical friction. The friction factor of a joint is the exponential of another sum of
-    splines, between 0.1 and 10. Sums of splines are zero at the ends of the range.
+    Each joint has a torque dV/dq that is a function of its position, in units of typical friction. It is
+    a sum of cubic B-splines over the joint's range. A revolute joint has in addition harmonics of its
+    rotation and of the rotation of its motor. The friction factor of a joint is the exponential of
+    another sum of splines, between 0.1 and 10. Sums of splines fall to zero within three knot
+    spacings beyond the ends of the range.
 
     R is ``entries(*functions, *constants)``. Each function is a bound times the tanh of an output of
     ``network``, each constant a bound times the tanh of a parameter; the ``bounds`` make armature + R
@@ -109,9 +110,9 @@ class ResidualTerms(nn.Module):
         # 1 / |coefficient| of each function and constant in each entry of M; a very large number, which
         # causes no bound, for the coefficient zero.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
-        # R may reduce the armature by at most 90 %. This share is divided by the largest number of
-        # terms in a row of M.
-        self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())  # per term
+        # R may reduce the armature by at most 90 %. Each term in a row of M gets an equal share: 0.9
+        # divided by the largest number of terms in a row.
+        self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
@@ -123,8 +124,8 @@ class ResidualTerms(nn.Module):
         """Return bounds of the functions and constants, (functions + constants,), for an armature (n, n).
 
         For d = 1 / (row sums of |armature^-1|), armature - diag(d) is positive semi-definite. If the
-        row sums of |R| / sqrt(d d^T) are at most one, diag(d) - R is also positive semi-definite. Both
-        follow from diagonal dominance.
+        row sums of |R| / sqrt(d d^T) are less than one, diag(d) + R is positive definite. Both follow
+        from diagonal dominance. The sum of both matrices, armature + R, is then positive definite.
         """
         root = torch.linalg.inv(armature).abs().sum(dim=-1).rsqrt()
         smallest: Tensor = (root.unsqueeze(-1) * root * self.inverse).amin(dim=(-2, -1))
@@ -155,7 +156,7 @@ class ResidualTerms(nn.Module):
         )
 
     def at(self, q: Tensor, parameters: ResidualParameters) -> ResidualConfiguration:
-        """Return all that depends on q, (..., n), only."""
+        """Return the configuration cache at q, (..., n) [rad, m]."""
         encoded = self.encoding.forward(q)
         splines = torch.einsum("...ik,ikm->...im", self.splines(q), parameters.splines)
         # The splines of torque and friction factor have the same basis, so one product gives both.
@@ -242,7 +243,7 @@ class ResidualDynamics(RigidBodyDynamics):
         return prepared._replace(residual=self.residuals.prepare(prepared.armature))
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return all that depends on q, (..., n), only."""
+        """Return the configuration cache at q, (..., n) [rad, m]; the residual R is part of its M."""
         cache = super().configuration(q, prepared)
         if self.residuals is None:
             return cache

@@ -15,7 +15,7 @@ from spelgen.runtime.rows import Joint, Link, vector
 
 
 class RigidParameters(NamedTuple):
-    """All that depends on the parameters only."""
+    """Parameter cache of ``RigidBodyDynamics``: quantities that depend on trained parameters only."""
 
     points: Tensor  # point masses in body frames, block diagonal, (4 bodies, 4 bodies)
     armature: Tensor  # rotor inertia, added to M, (n, n)
@@ -24,7 +24,7 @@ class RigidParameters(NamedTuple):
 
 
 class RigidConfiguration(NamedTuple):
-    """All that depends on q only."""
+    """Configuration cache of ``RigidBodyDynamics``: quantities at positions q, (..., n) [rad, m]."""
 
     chain: ChainConfiguration
     mass: Tensor  # M(q), (..., n, n)
@@ -77,7 +77,8 @@ class RigidBodyDynamics(PortHamiltonian):
         # parameter, because only a fit to torques sets it.
         self.raw_friction_compensation = nn.Buffer(torch.zeros_like(self.actuated))
         motors = None if motor_speeds is None else torch.stack([vector(row) for row in motor_speeds])
-        # `motors`: from joint speeds to motor speeds, (n, n); `loads`: its inverse.
+        # `motors` is C, (n, n), which maps joint speeds to motor speeds. `loads` is C^-1, whose transpose
+        # maps joint torques to motor torques.
         self.register_buffer("motors", motors)
         self.register_buffer("loads", None if motors is None else torch.linalg.inv(motors))
 
@@ -216,5 +217,8 @@ class RigidBodyDynamics(PortHamiltonian):
         return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
 
     def input_force(self, cache: RigidConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
-        """Return the force G (tau - torque_offset) + friction_compensation * qd, (..., n) [Nm, N]."""
+        """Return the generalized force G (tau - b) + k qd, (..., n) [Nm, N].
+
+        b is the torque offset of the sensors, k the friction compensation of the drives.
+        """
         return super().input_force(cache, qd, tau - self.torque_offset) + self.friction_compensation * qd

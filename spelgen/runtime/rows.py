@@ -1,4 +1,7 @@
-"""Classes of the rows of an emitted module: joints, links, and functions and constants of the mass matrix."""
+"""Classes of the entries of the tables in an emitted module.
+
+The tables list joints and links, and functions and constants of the mass matrix.
+"""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -27,7 +30,8 @@ class Joint(NamedTuple):
     friction: float  # typical magnitude of the friction torque [Nm, N]
     armature: float  # nominal rotor inertia times gear^2 [kg m^2, kg]
     gear: float = 1.0  # motor revolutions per revolution of the joint
-    typical_range: tuple[float, float] | None = None  # center, half range; None: see limits
+    # Center and half range of the working range [rad, m]; None: computed from the limits.
+    typical_range: tuple[float, float] | None = None
 
     @property
     def center(self) -> float:
@@ -51,7 +55,7 @@ class Link(NamedTuple):
 
     name: str
     parent: str | None  # name of the link that carries the joint; None: the base
-    joint: str  # name; its coordinate q moves the link by ratio * q + offset
+    joint: str  # name of the joint whose coordinate q displaces the link by ratio * q + offset
     position: Triple  # origin in the parent's frame, at displacement 0 [m]
     mass: float  # [kg]
     center_of_mass: Triple  # in the joint's frame [m]

@@ -1,1 +1,1 @@
-"""Arm -> Structure: zero, constant and varying entries of M and V, and a minimal set of functions for M."""
+"""Derive the structure of an arm: zero, constant and varying entries of M and V, and minimal functions for M."""

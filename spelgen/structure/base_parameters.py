@@ -1,4 +1,4 @@
-"""Base inertial parameters of an arm: the minimal set of combinations in which M and V are linear, exactly.
+"""Base inertial parameters of an arm, in exact arithmetic: the minimal set of combinations in which M, V are linear.
 
 Each entry of M(q), and V(q) - V(q0), is linear in the ten inertial parameters of each body; its coefficients are a row
 of a matrix (the energy regressor). Rows at random rational configurations span the row space of this matrix; the
@@ -42,7 +42,7 @@ class BaseParameter:
 @lru_cache(maxsize=16)
 def base_parameter_count(arm: Chain) -> int:
     """Return the rank of the inverse-dynamics regressor, which is the number of base parameters."""
-    points = 7  # sufficient for most arms of up to seven joints
+    points = 7  # This number is sufficient for most arms of up to seven joints.
     while True:
         rows = regressor_rows(arm, points + 2)
         rank = field.rank(rows)
@@ -52,7 +52,7 @@ def base_parameter_count(arm: Chain) -> int:
         points *= 2
 
 
-@lru_cache(maxsize=16)  # cached, since least squares, checks of logs and closed forms use the same arm
+@lru_cache(maxsize=16)  # Least squares, checks of logs and closed forms use the same arm.
 def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     """Return the base parameters of ``arm``, in the order of the bodies from the root."""
     indices = [INERTIAL_PARAMETERS.index(name) for name in BASE_ORDER]

@@ -83,10 +83,10 @@ def _constants(
     constant: tuple[np.ndarray, np.ndarray],
     basis: tuple[np.ndarray, np.ndarray],
 ) -> tuple[Term, ...]:
-    """Return the constant terms: a basis of M - sum_j f_j B_j.
+    """Return the constant terms of M: a basis of the span of M - sum_j f_j B_j, with the varying terms f_j(q) B_j.
 
-    constant: samples of this difference, (S, entries), in the prime field and in double precision. basis: the m
-    matrices B_j, (m, entries), in the prime field and in double precision.
+    constant: S samples of this difference, (S, entries), in the prime field and in double precision. basis: the m
+    matrices B_j, (m, entries), in the prime field and in double precision. entries: n(n+1)/2, of the lower triangle.
     """
     # Row reduction prefers pivots in the first columns. The entries of M that depend on the fewest joints come
     # first, so that these entries define the constants.
@@ -98,7 +98,8 @@ def _constants(
     row_values = _solved(constant[1][:, bound], constant[1])
     constants = []
     for pivot, row, values in zip(bound, rows, row_values, strict=True):
-        # The constant is the entry of M at the pivot minus the contribution of the outputs to this entry.
+        # The constant is the entry of M at the pivot minus the contribution of the varying terms f_j B_j to this
+        # entry.
         weights, weight_values = _single(spans, pivot)
         for j, output in enumerate(functionals):
             coefficient = int(basis[0][j, pivot])
@@ -125,8 +126,8 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
         while missing:
             pairs = next(candidates)
             weights = np.array([w for w, _ in pairs], dtype=np.uint64).reshape(-1, len(spans.keys))
-            # A row has the values of a functional on a basis of U: functionals with equal rows agree on all changes
-            # of M, and count as equal.
+            # A row has the values of a functional on a basis of U, the span of all changes of M: functionals with
+            # equal rows agree on all changes of M, and count as equal.
             rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
             # The pivot columns of the transposed matrix are the rows that are linearly independent of earlier rows.
             independent = field.pivots(field.row_basis(rows.T))
@@ -156,7 +157,8 @@ def _candidates(
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the functionals may depend on.
-        outside: echelon basis of the changes of M caused by all other joints, (m, dim U), in the basis of U.
+        outside: echelon basis of the m-dimensional span of the changes of M caused by all other joints, (m, dim U), as
+            coordinates in the basis `spans.varying` of U, the span of all changes of M.
         tried: indices of the entries that were candidates for a set of joints before; they are skipped. This function
             adds its candidates.
     """
@@ -178,7 +180,8 @@ def _candidates(
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []
     for row in sorted(kernel, key=np.count_nonzero):
-        # A row of the null space is 1 at one free entry; all other nonzero elements are at pivots.
+        # A row of the null space is 1 at one entry without a pivot; all other nonzero elements of the row are at the
+        # entries with pivots (`bound`).
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0

@@ -79,9 +79,9 @@ class Budget:
 
 
 class Expansion:
-    """The recorded recursion of ``arm`` for polynomials in s1, c1, q1, s2, ...
+    """The recorded operations of the recursion for M and V of ``arm``, which give polynomials in s1, c1, q1, s2, ...
 
-    s, c and q are sine, cosine and position of a coordinate (``Position``).
+    s, c and q with a number are sine, cosine and position of the coordinate with this number, from 1 (``Position``).
     """
 
     def __init__(self, arm: Chain):
@@ -104,7 +104,7 @@ class Expansion:
         element: the recorded expression of the entry. parameter: the index of the inertial parameter, 10 body + i.
         Raises TooLarge.
         """
-        # The keys are identities of recorded operations: a subexpression that occurs twice is computed once.
+        # The keys are the id() of recorded operations, so that a subexpression that occurs twice is computed once.
         values: dict[int, Value] = {}
         for index, leaf in enumerate(self._parameters):
             values[id(leaf)] = int(index == parameter)

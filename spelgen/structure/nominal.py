@@ -1,4 +1,4 @@
-"""Initial values and scales of the numbers of a model, from the inertial parameters of the URDF.
+"""Initial values and scales of the outputs and parameters of a model, from the inertial parameters of the URDF.
 
 These values affect the training of a model, not its structure. If the inertials of a URDF are absent or physically
 inconsistent, default bodies of 1 kg are used.
@@ -23,7 +23,10 @@ from spelgen.structure.structure import Structure
 
 @dataclass(frozen=True)
 class Nominal:
-    """Means and standard deviations over the joint ranges, rounded to six digits for reproducibility across machines.
+    """Means and standard deviations of the terms of M, of V and of torques, for the bodies of the URDF.
+
+    They are computed over random positions in the joint ranges, and rounded to six digits for reproducibility across
+    machines.
 
     ``output_means`` and ``output_scales`` have one value per output of the structure, ``constants`` and
     ``constant_scales`` one per constant; all other tuples have one value per coordinate. ``potential_scale``: standard
@@ -68,7 +71,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
     # Lower bounds of the scales: an output that hardly varies for the nominal parameters may vary for the true ones.
     output_floor = 0.05 * (np.abs(output_rows) @ typical)
     constant_floor = 0.05 * (np.abs(constant_rows) @ typical)
-    # The scale of a joint's friction is the torque that its drive carries: gravity, and unit acceleration.
+    # Friction is scaled by the torque that a joint's drive needs for gravity and for unit acceleration.
     torque = _gravity_torque(arm, q, inertias)
     inertial = np.sqrt((mass[:, diagonal] ** 2).mean(axis=0))
     return Nominal(
@@ -76,7 +79,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
         output_scales=_rounded(np.maximum(outputs.std(axis=0), output_floor), zero_below=0.0),
         constants=_rounded(constants),
         constant_scales=_rounded(np.maximum(np.abs(constants), constant_floor), zero_below=0.0),
-        # V is determined up to a constant: its standard deviation is the scale, not its magnitude.
+        # V is determined up to a constant, so that its scale is its standard deviation and not its magnitude.
         potential_scale=_round(max(float(potential.std()), 1e-3)),
         joint_torque=_rounded(np.hypot(torque, inertial)),
         mass_sensitivities=_sensitivities(_mass_changes(arm, q, inertias, mass, typical)),
@@ -104,7 +107,10 @@ def working_range(coordinate: Coordinate) -> tuple[float, float]:
 
 
 def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
-    """Return the functionals of m terms as rows over the lower triangle of M, (m, n(n+1)/2)."""
+    """Return, for each of m terms, the coefficients of its linear functional of M, (m, n(n+1)/2).
+
+    The columns are the entries of the lower triangle of M, row after row.
+    """
     rows = [row_of(term.functional, n) for term in terms]
     return np.reshape(rows, (-1, n * (n + 1) // 2))
 
@@ -133,8 +139,8 @@ def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | 
 def _default_inertia(arm: Chain, index: int) -> list[float]:
     """Return the inertial parameters (m, h, I) of a sphere of 1 kg about the origin of the body's joint.
 
-    Its centre is half-way to the next joint; for the last body, or a next joint closer than 0.2 m, it is at
-    (0.1, 0, 0.1) m.
+    The centre of the sphere is half-way to the next joint. For the last body, or if the next joint is closer than
+    0.2 m, the centre is at (0.1, 0, 0.1) m in the frame of the body's joint.
     """
     gyration = 0.1  # [m] radius of gyration
     center = np.zeros(3)
@@ -169,7 +175,8 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
 
 def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
     """Return the root mean square over q (S, n) of the gravity torque dV/dq, (n,) [Nm, N]."""
-    step = 1e-4  # [rad, m] of central differences: their relative error of 1e-8 is small enough for scales
+    # [rad, m] Step of the central differences. Their relative error of 1e-8 is small enough for scales.
+    step = 1e-4
     shifts = step * np.eye(q.shape[1])[:, None]
     _, forward = float_energies(arm, q + shifts, inertias)
     _, backward = float_energies(arm, q - shifts, inertias)
@@ -191,13 +198,17 @@ def _mass_changes(
     """
     moved = np.stack([q] * q.shape[1])
     for index in range(q.shape[1]):
-        moved[index, :, index] = np.roll(q[:, index], 1)  # the position of the sample before
+        # Coordinate `index` gets its value in the preceding sample; all other coordinates are unchanged.
+        moved[index, :, index] = np.roll(q[:, index], 1)
     moved_mass, _ = float_energies(arm, moved, inertias)
     return np.asarray(np.sqrt((((moved_mass - mass) / typical) ** 2).mean(axis=(1, 2))))
 
 
 def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
-    """Return magnitudes (n,) divided by the largest, and at least 0.02, so that every joint remains an input."""
+    """Return magnitudes (n,) divided by the largest magnitude, and at least 0.02.
+
+    They scale the inputs of networks; the lower bound keeps every joint as an input.
+    """
     if magnitudes.max() <= 0:
         return (1.0,) * len(magnitudes)
     return _rounded(np.maximum(magnitudes / magnitudes.max(), 0.02), 3)
@@ -257,8 +268,9 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # [1] Relative to the largest eigenvalue. J of a slender body is consistent with a small smallest eigenvalue:
-    # eigenvalues are raised to this fraction only if the smallest one is below its square.
+    # [1] Fraction of the largest eigenvalue to which smaller eigenvalues of J are raised. They are raised only if the
+    # smallest one is below fraction^2 times the largest one, because J of a slender body is consistent although its
+    # smallest eigenvalue is small.
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)

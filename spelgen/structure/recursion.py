@@ -31,7 +31,8 @@ TENSOR = tuple(combinations_with_replacement(range(3), 2))
 class Position(NamedTuple):
     """The position of a coordinate q: cosine and sine of q / d, and q itself.
 
-    d is the integer of ``base_denominators``; it is 1 for a coordinate without mimic joints.
+    d is an integer for which the angles of all joints of the coordinate, mimic joints included, are integer multiples
+    of q / d, up to a constant (see ``base_denominators``). It is 1 without mimic joints.
     """
 
     cos: Element
@@ -60,7 +61,8 @@ class _Inertia(NamedTuple):
 class _Pose(NamedTuple):
     """The pose of a joint's frame in its parent body, or the motion of a joint.
 
-    Rows of the rotation, and the translation, list nonzero elements as (index, element); 1 and -1 are integers.
+    The representation is sparse: each row of the rotation, and the translation, is a sequence of pairs (index, element)
+    of the nonzero elements. The elements 1 and -1 are Python integers.
     """
 
     rotation: tuple[Terms, ...]
@@ -126,7 +128,8 @@ def coefficients(
 ) -> list[Element]:
     """Return the coefficients of the inertial parameters in the entries of M, row after row, and then in V.
 
-    units: one unit vector (10 B,) for each of the 10 B parameters of B bodies, as an element of the ring.
+    units: the 10 B unit vectors, (10 B,) each, one for each inertial parameter of B bodies. The elements of the ring
+    are vectors (10 B,), so that an element is a row of coefficients.
     """
     inertias = [units[10 * body : 10 * body + 10] for body in range(len(arm.bodies))]
     result = energies(arm, positions, inertias, number)
@@ -198,10 +201,10 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
 def _column(
     arm: Chain, poses: Sequence[_Pose], motions: Sequence[_Pose], index: int, inertia: _Inertia
 ) -> Iterator[tuple[Body, Element]]:
-    """Yield (ancestor, entry) for the joint of a body and the joints of all its ancestors, itself first.
+    """Yield (ancestor, entry) for a body itself, and then for each of its ancestors.
 
-    Each entry is the element of the mass matrix of the two joints, as if all joints were independent. inertia: the
-    composite inertia of the body and all its descendants.
+    The entry is the element of the mass matrix for the joints of the body and of the ancestor, as if all joints were
+    independent. index: of the body in `arm.bodies`. inertia: composite inertia of the body and all its descendants.
     """
     body = arm.bodies[index]
     # The wrench that gives the composite body a unit acceleration about (or along) its z axis: force z x h and moment
@@ -226,9 +229,9 @@ def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
 
 
 def _moved_inertia(motion: _Pose, inertia: _Inertia) -> _Inertia:
-    """Return an inertia in the joint's frame at q = 0, from the inertia in the joint's moved frame.
+    """Return an inertia in the joint's frame at q = 0, from the inertia in the frame that moves with the joint.
 
-    motion: rotation about z, or translation along z, of the joint.
+    motion: rotation about z, or translation along z, of the joint at its current position.
     """
     if motion.translation:
         return _translated(motion.translation, inertia)
@@ -268,13 +271,17 @@ def _turned(pose: _Pose, vector: Vector) -> Vector:
 
 
 def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
-    """Return the inertia about an origin displaced by -p, p = ``offset``, by h + m p and the parallel-axis theorem."""
+    """Return the inertia about an origin displaced by -p, p = ``offset``, by the parallel-axis theorem.
+
+    The first moment h changes to h + m p, with the mass m.
+    """
     if not offset:
         return inertia
     moment: list[Element] = list(inertia.moment)
     tensor = dict(zip(TENSOR, inertia.tensor, strict=True))
     for axis, length in offset:
-        # With k = h + (h + m p), I increases by (p.k) 1 - (p k^T + k p^T) / 2: one term per component of p.
+        # With the mass m, the first moment h, p = `offset` and k = h + (h + m p), the tensor I increases by
+        # (p.k) 1 - (p k^T + k p^T) / 2. The loops add one term per nonzero component of p.
         moment[axis] = moment[axis] + length * inertia.mass
     for axis, length in offset:
         double = length * (inertia.moment[axis] + moment[axis])
@@ -289,7 +296,7 @@ def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
 
 
 def _terms(row: Sequence[Fraction], number: Number) -> Terms:
-    # 1 and -1 remain integers, because `_dot` needs no multiplication for them.
+    # The numbers 1 and -1 remain integers, so that `_dot` can add or subtract in place of a multiplication.
     return tuple((i, int(x) if abs(x) == 1 else number(x)) for i, x in enumerate(row) if x)
 
 

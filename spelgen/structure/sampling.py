@@ -112,9 +112,10 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 
 
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
-    """Return the values of one coordinate in all blocks of samples, (blocks, S).
+    """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S).
 
-    values: (2 S,); block ``index`` + 1 gets the second half, all other blocks get the first half.
+    values: (2 S,). Block ``index`` + 1, in which only this coordinate differs from block 0, gets the second half of the
+    values; all other blocks get the first half.
     """
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
@@ -156,7 +157,10 @@ class Spans:
 
     @cached_property
     def change_bases(self) -> list[np.ndarray]:
-        """Echelon basis of T_k for each joint k, (dim T_k, entries)."""
+        """Echelon basis, for each joint k, of T_k, the span of the changes of M if only joint k moves.
+
+        Each basis is (dim T_k, entries).
+        """
         return list(map(field.row_basis, self.changes))
 
     @cached_property
@@ -166,7 +170,10 @@ class Spans:
 
     @cached_property
     def varying(self) -> np.ndarray:
-        """Basis of U, (dim U, entries); with the columns in the order ``order`` it is an echelon form."""
+        """Basis of U, the span of all changes of M, (dim U, entries).
+
+        With its columns in the order ``order`` it is an echelon form.
+        """
         echelon = field.row_basis(np.concatenate(self.change_bases)[:, self.order])
         return echelon[:, np.argsort(self.order)]
 
@@ -184,9 +191,9 @@ class Spans:
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
 
     def outside(self, joints: frozenset[int]) -> np.ndarray:
-        """Return rows (m, dim U) that span the changes of M with the positions of joints not in ``joints``.
+        """Return m rows, (m, dim U), that span the changes of M with the positions of joints not in ``joints``.
 
-        U is the span of all changes of M; the rows are coordinates in its basis `varying`.
+        The rows are coordinates in the basis `varying` of U, the span of all changes of M.
         """
         first, last = min(joints), max(joints)
         # The joints before `first` and after `last` have cached echelon forms, which saves most of the time.
@@ -194,7 +201,10 @@ class Spans:
         return np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]])
 
     def changes_of(self, coordinates: np.ndarray) -> np.ndarray:
-        """Return changes of the entries of M, (m, entries), from their coordinates (m, dim U) in the basis of U."""
+        """Return m changes of the entries of M, (m, entries).
+
+        coordinates: of the changes in the basis `varying` of U, (m, dim U).
+        """
         free = np.ones(len(self.keys), dtype=bool)
         free[self._pivots] = False
         changes = np.zeros((len(coordinates), len(self.keys)), dtype=np.uint64)
@@ -204,27 +214,33 @@ class Spans:
 
     @cached_property
     def _pivots(self) -> list[int]:
-        """Pivot entries of M, whose changes are the coordinates in the basis of U."""
+        """Indices of the pivot entries of M: the changes of these entries are the coordinates in `varying`."""
         return [self.order[pivot] for pivot in field.pivots(self.varying[:, self.order])]
 
     @cached_property
     def _coordinates(self) -> list[np.ndarray]:
-        """Basis of T_k in the basis of U for each joint k, (dim T_k, dim U)."""
+        """Basis, for each joint k, of the changes of M with joint k, as coordinates in `varying`, (dim T_k, dim U)."""
         return [basis[:, self._pivots] for basis in self.change_bases]
 
     @cached_property
     def _nearer_root(self) -> list[np.ndarray]:
-        """Per joint, a basis (m, dim U) of the changes of M caused by joints nearer the root, in the basis of U."""
+        """Basis, for each joint, of the changes of M caused by joints nearer the root.
+
+        Each basis has m rows of coordinates in `varying`, (m, dim U).
+        """
         return _sums(self._coordinates)
 
     @cached_property
     def _nearer_tip(self) -> list[np.ndarray]:
-        """Per joint, a basis (m, dim U) of the changes of M caused by joints nearer the tip, in the basis of U."""
+        """Basis, for each joint, of the changes of M caused by joints nearer the tip.
+
+        Each basis has m rows of coordinates in `varying`, (m, dim U).
+        """
         return _sums(self._coordinates[::-1])[::-1]
 
 
 def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return one echelon basis (m, dim U) per basis: result k spans the sum of the spans of bases 0 to k - 1."""
+    """Return a list of echelon bases, (m, dim U) each; element k spans the sum of the spans of ``bases[:k]``."""
 
     def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
         return field.row_basis(np.concatenate([rows, basis]))

@@ -43,7 +43,8 @@ def servo_rank(arm: Chain) -> ServoRank:
     torque = drives.sum(axis=-1) + bodies.sum(axis=-1).reshape(samples, n)
     rows = np.zeros((samples, n, n, len(PARAMETERS)))
     for joint in range(n):
-        # The scaled kp is 1, so that the command error u - q, its column, is the torque of all other terms.
+        # The coefficient of kp is the command error u - q. Since the scaled kp is 1, the command error is equal to the
+        # torque of all other terms.
         rows[:, joint, joint, 0] = -torque[:, joint]
         rows[:, joint, joint, 1:] = drives[:, joint]
     system = np.concatenate([rows.reshape(samples * n, -1), bodies], axis=1)
@@ -52,7 +53,8 @@ def servo_rank(arm: Chain) -> ServoRank:
     _, null = _row_and_null_space(system / norms)
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
-    # [1] Smaller differences are rounding errors: null vectors have a thousand times the errors of the matrix.
+    # [1] Smaller differences are rounding errors; the errors of null vectors are about a thousand times the errors of
+    # the matrix.
     equal, kp = 1e-6, changes[:, :1]
     same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal  # (n, n)
     groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in same)
@@ -83,8 +85,8 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     mass = np.zeros((*potential.shape, n, n), dtype=complex)  # (S, n + 1, 10 B, n, n)
     for entry, (row, column) in enumerate(triangle(n)):
         mass[..., row, column] = mass[..., column, row] = triangles[..., entry]
-    # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq
-    # d/dt (M qd): the last direction is qd, and qd itself changes at the rate qdd.
+    # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq. For d/dt (M qd), M is differentiated along the last direction,
+    # qd, and qd itself changes at the rate qdd.
     momentum = np.einsum("spij,sj->sip", mass[:, n], qd + 1j * step * qdd)
     kinetic = np.einsum("skpij,si,sj->skp", mass[:, :n], qd, qd) / 2
     return np.asarray((momentum - kinetic + potential[:, :n]).imag / step)

@@ -62,11 +62,12 @@ class Structure:
         return sum(not output.joints or min(output.joints) >= first for output in self.outputs)
 
 
-@lru_cache(maxsize=16)  # cached, since the same arm is often used with several settings or logs
+@lru_cache(maxsize=16)  # The same arm is often used with several settings or logs.
 def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
-    """Return the structure of ``arm``; see ``Structure`` for ``assume``.
+    """Return the structure of ``arm``.
 
-    Raises ArmError if ``assume`` is ``inertials`` and a body has no inertial with mass.
+    assume: ``kinematics`` for a structure that is valid for all values of the inertial parameters, ``inertials`` for
+    the values in the URDF. Raises ArmError if ``assume`` is ``inertials`` and a body has no inertial with mass.
     """
     if assume == "inertials" and not arm.inertials_complete:
         raise ArmError(

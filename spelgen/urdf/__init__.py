@@ -1,1 +1,1 @@
-"""Bytes of a URDF -> Robot, with the values of the file."""
+"""Read a URDF into a `Robot` that has the values of the file, unchanged."""

@@ -1,4 +1,4 @@
-"""Bytes of a URDF file -> XML tree; unsafe content and other formats are errors."""
+"""Parse the bytes of a URDF file to an XML tree; unsafe content and other formats are errors."""
 
 import re
 from pathlib import Path
@@ -81,10 +81,13 @@ def _line_of(data: bytes, position: int) -> int:
 
 
 def _refuse_damage(path: Path, data: bytes) -> None:
-    """Raise UrdfError for unsafe declarations, and for damage for which the XML parser has no clear message."""
+    """Raise UrdfError for unsafe declarations, and for malformed content that the XML parser would not name clearly.
+
+    Such content is an empty file, conflict markers of git, or text before the XML declaration.
+    """
     if not data.strip():
         raise UrdfError("an empty file", file=path, expected="a URDF document")
-    # Conflict markers of git are the most common damage, and the message of the parser would not name them.
+    # Conflict markers of git are the most common defect, and the message of the parser would not name them.
     conflict = _CONFLICT.search(data)
     if conflict:
         line, do = _line_of(data, conflict.start()), "resolve the merge conflict first"
@@ -134,10 +137,10 @@ def _check_root(path: Path, root: etree._Element) -> None:
 
 
 def _check_xacro(path: Path, root: etree._Element) -> tuple[int, ...]:
-    """Return the lines of <xacro:property> elements. Raises UrdfError for other xacro elements.
+    """Return the line numbers of <xacro:property> elements, which may remain after expansion and have no effect.
 
-    Expanded documents may still contain properties, which have no effect. A number that refers to a property is an
-    error when the number is read.
+    Raises UrdfError for all other xacro elements, since the document is then not expanded. A number that refers to a
+    property is an error when the number is read.
     """
     errors, leftovers = [], []
     for element in root.iter(etree.Element):

@@ -1,4 +1,4 @@
-"""Element <link>, <joint> or <transmission> of a URDF -> dataclass; defects are reported, not repaired."""
+"""Read <link>, <joint> and <transmission> elements of a URDF into data classes; defects are reported, not repaired."""
 
 from collections.abc import Sequence
 
@@ -125,7 +125,7 @@ def _read_origin(parent: Element) -> tuple[Vector, Vector]:
 
 def _read_axis(joint: Element, kind: str | None) -> Vector:
     axis, error_count = joint.child("axis"), len(joint.notes.errors)
-    xyz = axis.triple("xyz", (1.0, 0.0, 0.0))  # the default of URDF
+    xyz = axis.triple("xyz", (1.0, 0.0, 0.0))  # URDF defines (1, 0, 0) as the default axis.
     # An axis of length zero is an error, because it cannot be normalised.
     if kind in MOVING and len(joint.notes.errors) == error_count and max(map(abs, xyz)) < 1e-9:
         do = f'give the {kind} joint an axis such as "0 0 1"'
@@ -147,7 +147,7 @@ def _read_mimic(mimic: Element) -> Mimic | None:
     if mimic.xml is None:
         return None
     leader = mimic.text("joint")
-    # An error and not a warning: the position of a mimic joint is undefined without a leader.
+    # A missing leader is an error and not a warning, because the position of the mimic joint is then undefined.
     if not leader:
         mimic.error("no joint", 'joint="..." naming the joint to follow')
         return None
@@ -156,7 +156,7 @@ def _read_mimic(mimic: Element) -> Mimic | None:
     if multiplier is None:
         multiplier = 1.0
     offset = mimic.number("offset") or 0.0
-    # The inverse of the multiplier has the same bound as all numbers of a URDF.
+    # A multiplier is an error if its inverse exceeds the bound of all numbers in a URDF.
     if multiplier and abs(multiplier) < 1 / MAX_MAGNITUDE:
         expected = f"0, or {1 / MAX_MAGNITUDE:g} at least"
         mimic.error(repr(mimic.text("multiplier")), expected, key="multiplier")

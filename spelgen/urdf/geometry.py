@@ -46,7 +46,8 @@ class LinkShape:
 class LinkShapes(NamedTuple):
     """The shapes that were read, and the shapes that could not be read.
 
-    unread: name of the link -> a text per shape: the name of a mesh file, or the reason.
+    unread: by the name of the link, a text for each of its unread shapes: the name of the mesh file, or the reason for
+    which the shape was not read.
     """
 
     shapes: tuple[LinkShape, ...]
@@ -54,7 +55,7 @@ class LinkShapes(NamedTuple):
 
     @property
     def unread_text(self) -> str:
-        """Text of the links with unread shapes: two links with their files, and the number of other links."""
+        """Text that lists the links with unread shapes: the first two with their files, and the number of others."""
         named = [f"{link} ({', '.join(names)})" for link, names in self.unread.items()]
         if len(named) > 2:
             named[2:] = [counted(len(named) - 2, "more link")]
@@ -103,7 +104,8 @@ def mesh_file(urdf: Path, name: str) -> Path:
     path = Path(path_text)
     inner = Path(*path.parts[scheme == "package" :])
     for file in (urdf.parent / inner, path, *(folder / inner for folder in urdf.parents)):
-        if os.path.isfile(file):  # unlike Path.is_file it raises no error for an invalid name
+        # Unlike Path.is_file, os.path.isfile raises no error for an invalid name.
+        if os.path.isfile(file):
             return file
     raise FileNotFoundError(name)
 
@@ -113,7 +115,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
 
     link: name of the link. A mesh has no triangles yet; see `_meshes`.
     """
-    import yourdfpy  # imports trimesh, which takes long
+    import yourdfpy  # The import is here, because yourdfpy imports trimesh, which takes long.
 
     # Each shape is parsed as a URDF of its own, so that an invalid shape does not affect the others.
     root = etree.Element("robot", name=link)
@@ -136,7 +138,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
             scale, file_name = geometry.mesh.scale, geometry.mesh.filename
             size = 1.0 if scale is None else scale
         numbers = np.broadcast_to(np.asarray(size, dtype=float), COUNTS[kind])
-    except Exception as error:  # absent or malformed attributes raise many types of errors
+    except Exception as error:  # Absent or malformed attributes raise many types of errors.
         raise ValueError("a shape that is not valid") from error
     if not (np.isfinite(pose).all() and np.isfinite(numbers).all()) or (kind != "mesh" and numbers.min() < 0):
         raise ValueError(f"a {kind} of negative or infinite size or place")
@@ -152,9 +154,11 @@ def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[s
     for shape in shapes:
         with suppress(FileNotFoundError):
             paths[shape.file, shape.size] = str(mesh_file(urdf, shape.file))
-    if not paths:  # no process is started without need: it takes seconds
+    # Without meshes no process is started, because a start takes seconds.
+    if not paths:
         return {}
-    # The task is ASCII JSON on stdin and not in the arguments, whose characters are limited by the locale.
+    # The list of meshes is passed as ASCII JSON on stdin and not as arguments, because the locale limits the characters
+    # of arguments.
     meshes = [(path, scale) for (_, scale), path in paths.items()]
     task = json.dumps({"faces": max(1, faces // len(shapes)), "meshes": meshes}).encode()
     command = [sys.executable, "-P", "-m", mesh_child.__name__]

@@ -48,7 +48,7 @@ def main(faces: int, meshes: list[tuple[str, list[float]]], output: IO[bytes]) -
         meshes: Path, and scale factors along x, y and z, of each mesh.
         output: Binary file to which the arrays are written as an NPZ archive.
     """
-    with suppress(ImportError):  # not on Windows
+    with suppress(ImportError):  # The module `resource` does not exist on Windows.
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (2**30,) * 2)
@@ -56,9 +56,11 @@ def main(faces: int, meshes: list[tuple[str, list[float]]], output: IO[bytes]) -
         resource.setrlimit(resource.RLIMIT_CPU, (30,) * 2)
     arrays: dict[str, np.ndarray] = {}
     for index, (path, scale) in enumerate(meshes):
-        gc.collect()  # meshes contain reference cycles, so that the meshes read before would fill the memory
-        # The readers of trimesh raise errors of any type. A mesh with an error gets no arrays, from which the parent
-        # process recognises it.
+        # Meshes contain reference cycles, which only the garbage collector frees: without it, meshes of previous
+        # iterations would fill the memory.
+        gc.collect()
+        # The readers of trimesh raise errors of any type. For a mesh with an error no arrays are written; the parent
+        # process recognises it by their absence.
         with suppress(Exception):
             mesh = _read(Path(path), scale, faces)
             arrays |= {f"v{index}": np.asarray(mesh.vertices), f"f{index}": np.asarray(mesh.faces)}

@@ -1,4 +1,4 @@
-"""URDF file -> Robot, with the values in the file: all elements are checked, and no defect is repaired silently."""
+"""Read a URDF file into a `Robot`; all elements are checked, and no defect is repaired silently."""
 
 import hashlib
 from collections.abc import Sequence
@@ -59,8 +59,8 @@ def read_urdf(path: Path) -> Robot:
         root="",
         diagnostics=(),
     )
-    # The root is searched only without errors: the child link of a joint that could not be read would look like a
-    # second root.
+    # The root link is determined only if there are no errors: the child link of a joint that could not be read would
+    # look like a second root.
     if not notes.errors:
         robot = _rooted(notes, root, robot)
     collect(sorted(notes.errors, key=lambda error: error.line or 0))
@@ -70,7 +70,8 @@ def read_urdf(path: Path) -> Robot:
 def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
     """Return the diagnostics of reading and of ``lint`` in the order of lines.
 
-    An absent <inertia> has a diagnostic of reading: the diagnostic of ``lint`` for a zero tensor is omitted.
+    For an absent <inertia>, ``notes`` contains a diagnostic already, and the diagnostic of ``lint`` for a zero tensor
+    is omitted.
     """
     absent = {remark.line for remark in notes.diagnostics if remark.code == "inertial-without-inertia"}
     warnings = [x for x in lint(robot) if x.code != "zero-inertia" or x.line not in absent]
@@ -158,7 +159,10 @@ def _is_circle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
 
 
 def _rooted(notes: Notes, root: etree._Element, robot: Robot) -> Robot:
-    """Return the robot with the name of its root link; errors are reported unless the links form one tree."""
+    """Return the robot with its field ``root`` set to the name of the root link.
+
+    Errors are added to ``notes`` unless the links form one tree. root: the <robot> element.
+    """
     children = {joint.child for joint in robot.joints}
     tops = [link for link in robot.links if link.name not in children]
     if len(tops) != 1:

@@ -81,9 +81,10 @@ class UrdfJoint(NamedTuple):
 
 
 class Transmission(NamedTuple):
-    """Actuators (name, reduction) that drive joints (name, reduction, offset); an absent number is None.
+    """A transmission: actuators that drive joints.
 
-    ``errors`` are the defects of the numbers; a step that needs the transmission raises them.
+    ``actuators`` are pairs (name, reduction), ``joints`` are tuples (name, reduction, offset [rad, m]); an absent
+    number is None. ``errors`` are the defects of the numbers; a step that needs the transmission raises them.
     """
 
     name: str

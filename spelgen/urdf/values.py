@@ -47,7 +47,10 @@ class Notes:
         self.diagnostics.append(Diagnostic("warning", code, where, line, message))
 
     def add_as_warnings(self, optional: Notes) -> None:
-        """Add the notes on a part of the file that a robot does not need; errors are added as warnings."""
+        """Add the notes on elements that a robot can do without, such as limits of fixed joints.
+
+        Errors are added as warnings, which state that the value is treated as absent.
+        """
         self.diagnostics += optional.diagnostics
         for error in optional.errors:
             message = f"got {error.got}, expected {error.expected}: taken as absent"

@@ -97,7 +97,7 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
 
 def main(path: str) -> None:
     """Write the expanded URDF to stdout, with the line breaks of the command ``xacro FILE``."""
-    with suppress(ImportError):  # not on Windows
+    with suppress(ImportError):  # The module `resource` does not exist on Windows.
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))

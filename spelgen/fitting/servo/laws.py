@@ -21,11 +21,15 @@ from spelgen.runtime.friction_laws import FrictionLaws
 
 
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return parameters with dead zones at the selected joints only; the module's docstring describes the selection."""
+    """Return the parameters with dead zones only at joints where a dead zone lowers the cost significantly.
+
+    The cost is the joint's negative log posterior. It must decrease by more than significance^2 / 2.
+    """
     problem = problem.reweighted(x)
     without, costs_without = _joint_minima(problem, x)
     with_zones, costs_with = _joint_minima(problem, with_dead_zones(problem, x, TUNING.dead_zone_fraction))
-    better = costs_with + TUNING.significance**2 / 2 < costs_without  # false for NaN, if a rollout diverged
+    # A cost is NaN if a rollout diverged. The comparison is then False, and no dead zone is selected.
+    better = costs_with + TUNING.significance**2 / 2 < costs_without
     joints, active = torch.where(better, with_zones.joints, without.joints), x.active.clone()
     active[problem.parameters.row(DEAD_ZONE)] = better
     return without_small_dead_zones(problem, replace(x, joints=joints, active=active))
@@ -51,7 +55,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
     p, n = x.joints.shape
     for _ in range(TUNING.joint_steps):
         normal = problem.normal_equations(x, errors)
-        # the Hessian and the negative gradient of each joint's own parameters: (n, p, p) and (n, p)
+        # Hessian and negative gradient with respect to the p parameters of each joint, (n, p, p) and (n, p)
         blocks = normal.curvature[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)
         joints = NormalEquations(blocks.permute(2, 0, 1), normal.descent[: p * n].view(p, n).mT)
         steps = joints.step(damping).clamp(-TUNING.max_step, TUNING.max_step)
@@ -71,7 +75,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
 
 
 def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
-    """Return parameters in which all joints have a dead zone, and all parameters are active.
+    """Return the parameters in which all joints have a dead zone, and all parameters are fitted (`active`).
 
     Half the dead zone is set to ``fraction`` times the static error, dry friction / kp. Coulomb friction is reduced by
     the same fraction, so that the static error remains about the same (exactly, if there is only Coulomb friction).
@@ -95,7 +99,8 @@ def sliding_friction(friction: FrictionLaws, qd: Tensor, gravity: Tensor) -> Ten
         qd: velocities, (..., n) [rad/s, m/s].
         gravity: gravity torques, (..., n) [Nm, N].
     """
-    speed = qd.abs() + 1e-9  # without 1e-9, the mean of a joint at rest would be 0 / 0
+    # Without the term 1e-9 the mean of a joint at rest would be 0 / 0.
+    speed = qd.abs() + 1e-9
     dry = friction.prepare().dry(qd, gravity) * speed
     mean: Tensor = dry.flatten(0, -2).sum(dim=0) / speed.flatten(0, -2).sum(dim=0)
     return mean

@@ -61,12 +61,13 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
     Errors within a window are correlated: the standard deviations count its K samples as one independent error.
 
     Args:
-        columns: (W, K, n, 5), the regressors of each joint.
-        errors: (W, K, n), command errors [rad, m].
+        columns: (W, K, n, 5), regressors of each joint: velocity, acceleration, direction of friction in [-1, 1],
+            torque of the bodies, and 1.
+        errors: (W, K, n), command errors [rad, m] at the K intervals of each of W windows.
     """
     matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, M, 5)
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
-    # gelsd, since torch's default driver chooses its pivots differently in each run
+    # The driver gelsd is used, because torch's default driver chooses its pivots differently in each run.
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution
     residual = target - matrix @ solution
     unscaled = torch.linalg.pinv(matrix.mT @ matrix).diagonal(dim1=-2, dim2=-1)
@@ -76,14 +77,16 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def fit_linear_servos(windows: ServoWindows) -> LinearServos:
-    """Return linear servos fitted to the samples after the burn-in, and a command delay fitted to all samples.
+    """Return the two baselines of a servo fit: linear second-order servos, and a pure command delay.
 
-    The command delay is for the baseline `DelayedCommand`, which predicts the delayed command as the position.
+    The servos of single joints are fitted to the samples after the burn-in. The delay, common to all joints, is fitted
+    to all samples. It is for the baseline `DelayedCommand`, which predicts the delayed command as the position.
     """
     q, qd = windows.q.numpy(), windows.qd.numpy()
     measured, dt = q[:, 1:], float(windows.dt.mean())
 
-    # cached: of the four unknowns that finite differences change in turn, only the delay changes the commands
+    # Cached, because the commands depend only on the delay: finite differences with respect to the other three unknowns
+    # have the same delay.
     @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
         """Return the mean command of each interval, (W, K-1, n)."""
@@ -102,7 +105,7 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
         column = slice(joint, joint + 1)
 
         def residual(x: np.ndarray, column: slice = column) -> np.ndarray:
-            """Return the position errors after the burn-in, (M,)."""
+            """Return the position errors of one joint after the burn-in, flattened, for the unknowns x (4,)."""
             u = commands(x[2])[..., column] + x[3]
             predicted = linear_response(
                 q[:, 0, column], qd[:, 0, column], u, dt, np.exp(x[:1]), np.exp(x[1:2])

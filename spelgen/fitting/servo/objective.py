@@ -56,7 +56,7 @@ class ServoObjective(Objective):
         self._steps = 0
 
     def prepare(self) -> PreparedLogs:
-        """See `Objective`."""
+        """Check the logs and cut them into windows. Raises LogError if a log has no commands or too few samples."""
         request, model = self.request, self.model
         self._logs = request.logs
         for log in self._logs:
@@ -91,7 +91,7 @@ class ServoObjective(Objective):
             self._begin_iteration(ServoParameters(**parameters))
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """See `Objective`."""
+        """Run the remaining outer iterations; ``save``, which writes a checkpoint, is called after each of them."""
         while len(self._iterates) < OUTER_ITERATIONS:
             x = self._minimized(progress)
             # Dead zones are selected after the first iteration: with the initial gains, gain errors would dominate.
@@ -106,7 +106,7 @@ class ServoObjective(Objective):
         """Return the parameters that minimize the cost of the current outer iteration."""
         problem, number = self._problem, len(self._iterates)
         show = partial(_show_progress, progress, number)
-        # smaller damping in the second and third outer iteration, which start near the minimum
+        # The damping is smaller in the second and third outer iteration, which start near the minimum.
         damping = DAMPING.initial_damping if number == 1 else TUNING.later_damping
         result = levenberg_marquardt(
             problem,
@@ -131,7 +131,7 @@ class ServoObjective(Objective):
         self._update_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
 
     def _set_up(self, weights: Content) -> None:
-        """Prepare the rollouts; weights: current state_dict of the model, which is the mean of the prior."""
+        """Create the rollouts of the first outer iteration; weights: state_dict of the model, the mean of the prior."""
         self._initial_weights = weights
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
         # standard deviation of the rounding error of encoders: step / sqrt(12), with a step of at least 1e-5 rad
@@ -144,15 +144,17 @@ class ServoObjective(Objective):
         if len(self._iterates) == OUTER_ITERATIONS - 1:
             rollouts = replace(rollouts, windows=self._windows)
             rollouts = rollouts.linearized(x, self._windows.motion())
-        elif self._iterates:  # half the integration steps are accurate enough for the first iteration only
+        # All integration steps are used from the second iteration on: half of them are accurate enough for the first
+        # iteration only.
+        elif self._iterates:
             rollouts = replace(rollouts, windows=replace(rollouts.windows, steps=self._windows.steps))
         if self._iterates:
             rollouts = rollouts.linearized(x, rollouts.predicted_motion(x))
         errors = rollouts.residual(x)
         self._rollouts, self._problem = rollouts, ServoProblem.of(rollouts, self._noise, errors)
-        rollouts.parameters.write(
-            x
-        )  # the checkpoint contains these weights: an interrupted fit has a usable model
+        # The checkpoint contains the weights of the model. They are set to x here, so that the checkpoint of an
+        # interrupted fit has a usable model.
+        rollouts.parameters.write(x)
         self._iterates.append(x)
         self._first_steps = self._steps
         self._update_checkpoint(float(errors.square().mean().sqrt()))

@@ -89,7 +89,7 @@ class ParameterMap:
         self.prior_mean = ServoParameters(joints, bodies, float(model.servo.delay), active)
 
     def row(self, name: str) -> int:
-        """Return the index of the first row of a parameter."""
+        """Return the index of the first row of `ServoParameters.joints` that belongs to the parameter ``name``."""
         return self.names.index(name)
 
     def named(self, joints: Tensor) -> dict[str, Tensor]:

@@ -127,7 +127,10 @@ class ServoProblem:
         return self.with_prior(self.window_equations(x, errors), x)
 
     def with_prior(self, windows: NormalEquations, x: ServoParameters) -> NormalEquations:
-        """Return the sum of the normal equations of W windows, (W, k, k) and (W, k), and of the prior at x."""
+        """Return the normal equations of the whole cost at x: Hessian (k, k) and negative gradient (k,).
+
+        windows: normal equations of W windows, (W, k, k) and (W, k), without the prior.
+        """
         precision = self.parameters.precision(x)
         descent = windows.descent.sum(dim=0) - precision * (x.flat - self.parameters.prior_mean.flat)
         return NormalEquations(windows.curvature.sum(dim=0) + torch.diag(precision), descent)

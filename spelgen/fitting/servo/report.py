@@ -45,8 +45,8 @@ ABOUT = (
 class FitSummary:
     """Summary of a fit for the user.
 
-    text: summary for a terminal. listing: table of the parameters with intervals. headline: the most important figure,
-    and the name of this figure.
+    text: summary for a terminal. listing: table of the parameters with intervals. headline: value and name of the most
+    important result, which is the delay of the commands.
     """
 
     text: str
@@ -58,8 +58,8 @@ class FitSummary:
 class ServoSolution:
     """Normal equations and covariance at the end of a fit, with the dead zones of all joints as free parameters.
 
-    blocks: normal equations of the B blocks of the logs, (B, k, k) and (B, k). precision: (k,), precision of the prior.
-    covariance: (k, k), covariance of the parameters.
+    blocks: normal equations of the B blocks of the jackknife, (B, k, k) and (B, k); a block is a log, or a segment of a
+    log. precision: (k,), precision of the prior. covariance: (k, k), covariance of the parameters.
     """
 
     blocks: NormalEquations
@@ -69,12 +69,12 @@ class ServoSolution:
     @property
     def quantile(self) -> float:
         """Half the width of a 95 % interval, in standard deviations."""
-        # the 97.5 % quantile of Student's t instead of the Gaussian, since there are few blocks
+        # The 97.5 % quantile is of Student's t distribution and not of the Gaussian, since there are few blocks.
         return float(stdtrit(max(1, len(self.blocks.curvature) - 1), 0.975))
 
 
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
-    """Return the parameters after one more step from x, and the solution at these parameters.
+    """Return the parameters after one more solver step from x, with their normal equations and covariance.
 
     x is the result of a fit with longer integration steps than the steps of ``problem``. The step from x shows the
     effect of the integration error: its outer product is added to the covariance. If the step raises the cost, the
@@ -87,14 +87,15 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     blocks = NormalEquations(*(_sums(x, numbers) for x in problem.window_equations(free, errors)))
     precision = problem.parameters.precision(free)
     step = problem.with_prior(blocks, x).step()
-    # gradients after the step: the gradients of all blocks and of the prior then add up to zero
+    # The gradients are updated to the parameters after the step, so that the gradients of all blocks and of the prior
+    # add up to zero.
     blocks = blocks._replace(descent=blocks.descent - blocks.curvature @ step)
     end = x.after(step)
     # The step may raise the cost if a joint is at its break-away torque: errors are then not linear in the parameters.
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # the step, the effect of the integration error, is included as one standard deviation
+    # The step is the effect of the integration error. It is added to the covariance as one standard deviation.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
@@ -122,7 +123,7 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
 
 
 def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
-    """Return the ratios to kp, the keys of `RATIOS` -> (n,).
+    """Return the ratios of servo and friction parameters to kp, a dict with the keys of `RATIOS` and values (n,).
 
     Args:
         model: model with position servos.
@@ -144,7 +145,11 @@ def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
 def ratios_with_deviations(
     problem: ServoProblem, solution: ServoSolution
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return the keys of `RATIOS` -> ratios to kp, and standard deviations of the ratios' logarithms, (n,) each."""
+    """Return the ratios to kp with the standard deviations of their logarithms.
+
+    The result is a dict with the keys of `RATIOS`. A value is a pair of the ratios of all joints and the standard
+    deviations, (n,) each.
+    """
     rollouts, parameters = problem.rollouts, problem.parameters
     tensors = {name: x.detach().clone().requires_grad_() for name, x in parameters.tensors.items()}
     qd, gravity = rollouts.motion.qd, rollouts.load.gravity
@@ -191,10 +196,12 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
         record: Content = {"joint": name, "kp": {"value": kp[joint], "known": not trained[joint]}}
         for ratio, (of_joints, deviations) in values.items():
             value = float(of_joints[joint])
-            if ratio == "dead_zone" and not value:  # no dead zone was selected
+            # A dead zone of zero was not selected at this joint.
+            if ratio == "dead_zone" and not value:
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
-            factor = math.exp(min(half, 50.0))  # bounded: exp must not overflow
+            # The bound 50 avoids an overflow of exp.
+            factor = math.exp(min(half, 50.0))
             # The static error, the sum of dry friction and dead zone, may be determined even if its two terms are not.
             determined = factor < TUNING.max_factor and (distinct[joint] or ratio not in ("dry", "dead_zone"))
             record[ratio] = {
@@ -218,7 +225,8 @@ def servo_summary(record: Content | None) -> FitSummary | None:
         cells = []
         for column in columns:
             interval = joint.get(column)
-            if interval is None:  # a dead zone that this joint does not have
+            # Only the interval of a dead zone can be None: no dead zone was selected at this joint.
+            if interval is None:
                 cells.append("none")
             elif interval["determined"]:
                 width = 100 * (interval["high"] / interval["value"] - 1)

@@ -19,10 +19,10 @@ from spelgen.fitting.servo.windows import BodyLoad, MidpointMotion, ServoWindows
 class ServoRollouts:
     """Rollouts of windows; each joint is integrated independently, under the load of the bodies along a fixed motion.
 
-    The load is computed once, for parameters x0: a change of the body parameters to x adds regressor (phi(x) - phi(x0))
-    to the load, with the inertial parameters phi. Since joints are independent, one rollout in which a parameter is
-    changed at all joints gives the derivatives of all joints. Each parameter that joints share (body parameters, delay)
-    needs a separate rollout. All rollouts form one batch.
+    The load is computed once, for parameters x0. For parameters x, regressor (phi(x) - phi(x0)) is added to the load,
+    where phi(x) are the inertial parameters (10 B,) of B bodies. Since joints are independent, one rollout in which a
+    parameter is changed at all joints gives the derivatives of all joints. Each parameter that joints share (body
+    parameters, delay) needs a separate rollout. All rollouts form one batch.
 
     motion: the fixed motion. load: load along this motion for x0. inertial: phi(x0), (10 B,). difference_step: step of
     the finite differences.
@@ -56,7 +56,11 @@ class ServoRollouts:
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
-        """Return measured positions with derivatives from the rollouts at x; see `ServoWindows.motion`."""
+        """Return the motion of the windows: measured positions, with velocities and accelerations from the rollouts.
+
+        Velocities and accelerations are derivatives of the positions predicted with parameters x, plus smoothed
+        derivatives of measured minus predicted positions.
+        """
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])
 
@@ -69,7 +73,8 @@ class ServoRollouts:
         """
         rows = x.active.any(dim=1).nonzero().squeeze(-1)  # parameters that are fitted at one joint or more
         p, r, step = len(rows), len(x.bodies), self.difference_step
-        # the batch: no parameter changed; then each joint parameter, each body coordinate, and the delay changed
+        # The batch has one rollout without a change, and one rollout for the change of each joint parameter, of each
+        # body coordinate, and of the delay.
         joints = x.joints.expand(p + r + 2, -1, -1).clone()
         joints[torch.arange(p) + 1, rows] += step
         bodies = x.bodies.expand(p + r + 2, -1).clone()
@@ -94,7 +99,7 @@ class ServoRollouts:
         return self._rollout(x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
 
     def _rollout(self, joints: Tensor, bodies: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
-        """Return q and qd (P, W, K, n) for P sets of parameters.
+        """Return q and qd, (P, W, K, n), for P sets of parameters and W windows of K samples.
 
         joints: (P, p, n), joint parameters. bodies: (P, r), body coordinates. commands: (P, W, K-1, S, n) [rad, m], at
         the S integration steps of each sample interval.
@@ -112,10 +117,10 @@ class ServoRollouts:
     def _integrate(
         self, drives: ServoDrives, armature: Tensor, added: Tensor, commands: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return q and qd (P, W, K, n).
+        """Integrate all joints of W windows for P sets of parameters; return q and qd, (P, W, K, n).
 
-        armature: (P, 1, n). added: (P, W, K-1, n), change of the load by changed body parameters [Nm, N]. commands: see
-        `_rollout`.
+        armature: (P, 1, n). added: (P, W, K-1, n), change of the load by changed body parameters [Nm, N]. commands: (P,
+        W, K-1, S, n) [rad, m], at the S integration steps of each sample interval.
         """
         windows, load = self.windows, self.load
         h = windows.dt.unsqueeze(-1) / commands.shape[3]
@@ -125,9 +130,9 @@ class ServoRollouts:
         positions, velocities, state = [q], [qd], None
         for k in range(windows.q.shape[1] - 1):
             current = Load(inertia[:, :, k], bias[:, :, k], load.gravity[:, k], coupled=False)
-            if (
-                state is None
-            ):  # assumed balanced, since friction is not measured; the error decays in the burn-in
+            # The initial friction state is unknown: friction is assumed to balance the other torques. The error of
+            # this assumption decays in the burn-in.
+            if state is None:
                 state = balanced(drives, q, qd, commands[:, :, k, 0], current)
             for u in commands[:, :, k].unbind(2):
                 state = advanced(drives, state, u, current, h[:, k])

@@ -24,16 +24,16 @@ class ServoTuning:
 
     # Standard deviations of the Gaussian prior, about the initial parameters (`servo.parameters`).
 
-    # [1] Logarithms of a joint's gains, armature and friction: one standard deviation is a factor of seven.
+    # [1] Prior standard deviation of the logarithms of a joint's gains, armature and friction: a factor of seven.
     logarithm: float = 2.0
-    # [1] Logarithm of the Stribeck velocity. With a wider prior, friction could decrease over the whole range of speeds
-    # and would then absorb offsets.
+    # [1] Prior standard deviation of the logarithm of the Stribeck velocity. With a wider prior, friction could
+    # decrease over the whole range of speeds and would then absorb offsets.
     stribeck_velocity: float = 1.0
-    # [rad, m] Half of a dead zone: dead zones of the gears of hobby servos are a few mrad.
+    # [rad, m] Prior standard deviation of half a dead zone: dead zones of the gears of hobby servos are a few mrad.
     dead_zone: float = 0.02
-    # [s] Delay of the commands.
+    # [s] Prior standard deviation of the delay of the commands.
     delay: float = 0.1
-    # [1] Log-Cholesky parameters of the bodies: one standard deviation is 30 % in mass.
+    # [1] Prior standard deviation of the log-Cholesky parameters of the bodies: 30 % in mass.
     bodies: float = 0.3
     # [1] Largest number of directions of the body parameters that are fitted: the directions with the largest effect on
     # gravity. Other directions remain at the prior mean.
@@ -64,10 +64,10 @@ class ServoTuning:
     # [1] Largest number of steps of the last outer iteration, on all windows: it starts near the minimum, which was
     # found on few windows.
     last_steps: int = 2
-    # [1] Decrease of the cost below which an outer iteration ends, or the fit of a joint with or without a dead zone.
+    # [1] An outer iteration, or the fit of a single joint, ends if a step decreases the cost by less than this number.
     min_decrease: float = 0.01
-    # [1] Decrease divided by the cost below which an outer iteration ends. The absolute threshold is too small for the
-    # high costs of a model whose form is wrong.
+    # [1] An outer iteration also ends if a step decreases the cost by less than this fraction of the cost.
+    # `min_decrease` is too small for the high costs of a model whose form is wrong.
     min_relative_decrease: float = 1e-4
     # [1] Damping of the first step of the second and third outer iteration; with 1e-3, kd would have an error of 0.3 %.
     later_damping: float = 1e-5
@@ -105,8 +105,8 @@ class ServoTuning:
 
     # Initial guess and baseline (`servo.least_squares`).
 
-    # [1] Smallest coefficient of gravity, in standard deviations, from which kp is computed. The threshold is large,
-    # since neighbouring windows are correlated.
+    # [1] kp is computed from the coefficient of gravity, 1 / kp, only if this coefficient is larger than this number of
+    # its standard deviations. The threshold is large, since neighbouring windows are correlated.
     kp_significance: float = 8.0
     # [1] Largest factor between the initial and the nominal kp (of the settings, or 2 efforts per radian).
     kp_range: float = 20.0

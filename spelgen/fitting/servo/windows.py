@@ -70,7 +70,7 @@ class ServoWindows:
         for number in range(len(names)):
             windows = np.flatnonzero(log_numbers == number)
             blocks[windows] += np.arange(len(windows)) * segments // len(windows)
-        # renumbered without gaps, since a log with fewer windows than segments has empty segments
+        # Blocks are renumbered without gaps, since a log with fewer windows than segments has empty segments.
         return torch.from_numpy(np.unique(blocks, return_inverse=True)[1])
 
     def motion(self, q: Tensor | None = None, qd: Tensor | None = None) -> MidpointMotion:
@@ -119,7 +119,8 @@ def servo_windows(
     for segment in segments:
         starts = range(0, len(segment) - length + 1, max(1, length - burn_in))
         rows += [(segment, slice(start, start + length)) for start in starts]
-    rows = rows[:: -(-len(rows) // count)]  # not the first ones: they may not move all joints
+    # Evenly spread windows are selected, not the first ones, in which some joints may not move.
+    rows = rows[:: -(-len(rows) // count)]
     smooth_velocities = {id(segment): velocities(segment) for segment in segments if len(segment) >= length}
     columns = (
         [log.q[samples] for log, samples in rows],

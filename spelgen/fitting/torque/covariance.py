@@ -51,7 +51,8 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
     """
     problem, x, free = estimate.problem, estimate.state.x, estimate.problem.free
     model, change = problem.jacobian.model, problem.jacobian.theta_jacobian(x)
-    # The new Jacobians below measure logged torques relative to the gains in the model, not to the initial gains.
+    # The noise is converted from the initial to the current motor gains: the Jacobians below are made from the fitted
+    # model, so that its current gains are their initial gains, and their factor `logged_scale` is 1.
     noise = problem.noise / problem.jacobian.logged_scale(x)
     blocks = contiguous_blocks(problem.jacobian.samples)
     products = torch.stack([_products(TorqueJacobian(model, block), x) for block in blocks])

@@ -102,8 +102,8 @@ def fit_torque(
     """Set the parameters of a model of rigid bodies to their MAP estimate.
 
     Args:
-        model: model whose current parameters are the prior mean; friction that exceeds the drives' torque is reduced
-            first.
+        model: model whose current parameters are the prior mean. Before a fit of all parameters, nominal friction that
+            exceeds the standard deviation of a drive's logged torque is reduced to it.
         samples: samples with torques as logged, (T, n) [Nm, N].
         prior: initial standard deviations of the prior; None: default.
         adapt: group of parameters to estimate (see `TorqueFit`); the prior mean is then their current values. Residual
@@ -201,8 +201,8 @@ def _run_stages(
         return refine(initial_fit(problem), samples), ()
     model = problem.jacobian.model
     if model.elements:
-        # The initial fit has rate-only friction: bristles delay the reversal of friction, which would be fitted to
-        # the errors of bodies that are still far off.
+        # The initial fit has rate-only friction. Bristles delay the reversal of friction, and this delay would be
+        # fitted to the torque errors of inertial parameters that are still wrong.
         model.friction.memoryless.fill_(1.0)
     estimate = initial_fit(problem)
     if model.elements:
@@ -218,6 +218,9 @@ def _run_stages(
 
 
 def _max_samples(model: ArmModel) -> int:
-    """Return the maximum number of samples of a fit, whose two regressors are kept in memory."""
+    """Return the largest number of samples of a fit.
+
+    The regressors of torque and of gravity torque, which are kept in memory, have at most `TUNING.regressor_bytes`.
+    """
     numbers = 2 * model.n * model.inertial_parameters.numel()
     return max(TUNING.initial_samples, int(TUNING.regressor_bytes / (8 * numbers)))

@@ -55,14 +55,17 @@ class ResidualSamples(NamedTuple):
 
 
 class TorqueJacobian:
-    """Torque residual of a model on samples, and its derivatives with respect to all rigid parameters x (K,).
+    """Torque residual of a model on samples, and its derivatives with respect to the parameters x (K,).
 
-    The modelled joint torque is Y(q, qd, qdd) theta + C^T (friction + armature a), plus the torque of the residual
-    terms. Here theta are the inertial parameters of B bodies, and C qd and a are the speeds and accelerations of the
-    drives. The torque residual is the measured torque, which is G (tau - offset) plus friction compensation, minus the
-    modelled torque. The residual terms of the model are evaluated once, when this object is created. `terms` are
-    additional linear terms, which are eliminated by variable projection. In Jacobians with respect to "theta (K,)",
-    theta includes all other parameters (see `joint_rows`).
+    x contains the parameters of bodies, drives and friction (`ParameterVector`). The modelled joint torque is Y(q, qd,
+    qdd) pi + C^T (friction + armature a), plus the torque of the residual terms. Here Y is the regressor, pi are the
+    inertial parameters of B bodies, and C qd and a are the speeds and accelerations of the drives. The torque residual
+    is the measured torque, which is G (tau - offset) plus friction compensation, minus the modelled torque; G maps
+    logged torques to joint torques.
+
+    The residual terms of the model are evaluated once, when this object is created. `terms` are additional linear
+    terms, which are eliminated by variable projection. theta (K,) is x with pi in place of the log-Cholesky parameters
+    of the bodies.
     """
 
     def __init__(
@@ -104,11 +107,18 @@ class TorqueJacobian:
         return squared_residual
 
     def logged_scale(self, x: torch.Tensor) -> torch.Tensor:
-        """Return initial gain / gain (n,), which scales joint torques as logged torques; 1 for fixed gains."""
+        """Return initial gain / current gain per joint, (n,) [1]; 1 for fixed gains.
+
+        Joint torques times this factor have the scale of the logged torques, converted to joint torques by the initial
+        gains.
+        """
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 
     def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
-        """Return `logged_scale`, (..., n), differentiable; parameters: one set, or a batch (...) of sets."""
+        """Return initial gain / current gain per joint, (..., n) [1], for autograd.
+
+        parameters: one set of parameters by name, or a batch (...) of sets.
+        """
         ones = torch.ones(self.model.n).double()
         for name in self.rigid.names("gains"):  # logarithms of the gains, joint torque / logged torque
             change = parameters[name] - self.rigid.initial[name]
@@ -132,8 +142,9 @@ class TorqueJacobian:
     def joint_rows(self, x: torch.Tensor) -> Iterator[JointRows]:
         """Yield the Jacobian of each joint and block of samples with respect to theta (K,), at x (K,).
 
-        theta is x with inertial parameters in place of log-Cholesky parameters. The Jacobian with respect to inertial
-        parameters is the regressor, so that no derivative need be computed. `theta_jacobian` is d theta / d x.
+        theta is x with inertial parameters in place of the bodies' log-Cholesky parameters. The Jacobian with respect
+        to inertial parameters is the regressor, so that no derivative need be computed. `theta_jacobian` is d theta / d
+        x.
         """
         parameters, scale = self.rigid.unflatten(x), self.logged_scale(x)
         body_columns = self._of_bodies.nonzero()[:, 0]
@@ -141,7 +152,8 @@ class TorqueJacobian:
         for block in self._blocks:
             residual, parameter_columns, load_columns = self._compressed_jacobian(parameters, block)
             for joint, colour in enumerate(self._colours):
-                # decompression: keep only the columns of the parameters that affect the torque of this joint
+                # Decompression: the compressed Jacobian contains the sum of the rows of all joints of one colour. The
+                # row of this joint has the columns of the parameters that affect its torque.
                 affecting, drives = self._affected[:, joint], self._affects[:, joint]
                 loads = load_columns[colour][:, drives].unsqueeze(-1) * block.load_regressor[:, drives]
                 bodies = scale[joint] * block.regressor[:, joint] + loads.sum(dim=1)
@@ -150,7 +162,10 @@ class TorqueJacobian:
                 yield JointRows(joint, columns, jacobian, residual[:, joint])
 
     def _projected(self, rows: Iterable[JointRows]) -> Iterator[JointRows]:
-        """Yield the rows of each joint, concatenated over all blocks, after variable projection of its terms."""
+        """Yield the Jacobian rows of each joint after variable projection of the joint's linear terms.
+
+        The rows of all blocks of samples are concatenated, since the linear terms depend on all samples.
+        """
         for of_joint in concatenate_blocks(rows, self.model.n):
             terms = self.terms.get(of_joint.joint)
             if terms is None:
@@ -203,11 +218,12 @@ class TorqueJacobian:
         return RigidProjection(tuple(of_joint.jacobian for of_joint in rows), tuple(gains))
 
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Return parameters (K,) after a step (K,), straight in the quantities in which the torque is linear.
+        """Return the parameters (K,) after a step (K,) from x, along a line that is curved in x.
 
-        Inertial parameters are updated along a straight line (see `step_in_inertial_parameters`). A coefficient c whose
-        logarithm is a parameter is updated to c (1 + step) for a positive step, and to c exp(step) for a negative one,
-        so that c remains positive.
+        The line is straight in the inertial parameters and the friction coefficients, in which the torque is linear.
+        Inertial parameters are updated by `step_in_inertial_parameters`. A coefficient c whose logarithm is a parameter
+        is updated to c (1 + step) for a positive step, and to c exp(step) for a negative one, so that c remains
+        positive.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
@@ -241,7 +257,10 @@ class TorqueJacobian:
             )
 
     def _affected_joints(self) -> torch.Tensor:
-        """Return a mask (K', n): whether a joint's torque depends on each of the K' parameters except the bodies'."""
+        """Return a mask (K', n): whether each of K' parameters affects the torque of each joint.
+
+        The K' parameters are the entries of x that are not parameters of bodies.
+        """
         masks = []
         for name, tensor in self.rigid.initial.items():
             if name == self.rigid.bodies:
@@ -280,17 +299,19 @@ class TorqueJacobian:
     def _compressed_jacobian(
         self, parameters: NamedTensors, block: _RegressorBlock
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-        """Return the residual of the logged torque (T, n), and minus its Jacobian, compressed over joints.
+        """Return the residual of the logged torque, and the Jacobian of the modelled torque, compressed over joints.
 
         Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive may
         have the same colour. Each parameter then affects at most one joint of a colour, so that the gradient of the sum
         of the torques of one colour contains the Jacobian rows of all its joints. One reverse pass per colour (mostly
         one) replaces n passes. Each sample has its own copy of the parameters, so that a pass computes the gradients of
-        all samples.
+        all samples. A gradient of several outputs at once (`is_grads_batched`) would import torch's symbolic shapes,
+        which takes half a second.
 
-        The second result has a matrix (T, K') per colour, for the K' parameters that are not of bodies. The third has a
-        matrix (T, n) per colour, for the load on each drive. A gradient of several outputs at once (`is_grads_batched`)
-        would import torch's symbolic shapes, which takes half a second.
+        Returns:
+            Residual, (T, n) [Nm, N]. Minus the derivatives of the residual with respect to the K' parameters that are
+                not of bodies, (T, K') per colour. Minus the derivatives with respect to the gravity torque on each
+                drive, (T, n) per colour.
         """
         copies = {}
         for name, tensor in parameters.items():

@@ -29,16 +29,18 @@ TermKey = tuple[str, int | None]
 
 ALL = slice(None)
 TORQUE, FRICTION, RIPPLE = "raw_torque_splines", "raw_friction_splines", "raw_torque_ripple"
-LOG_FACTOR_LIMIT = 0.99 * LARGEST  # limit of the log friction factor: LARGEST needs an infinite parameter
+# Largest fitted logarithm of a friction factor. The logarithm is LARGEST tanh(parameter / LARGEST) in the model, so
+# that the parameter would be infinite at LARGEST itself.
+LOG_FACTOR_LIMIT = 0.99 * LARGEST
 
 
 @dataclass(frozen=True, eq=False)
 class JointFunction:
     """A residual term of one joint, as a linear model of P = L + W weights on T samples.
 
-    The model's parameter has W entries for the joint, in units of `scale`. The first L of the P weights are
-    coefficients of trends over these entries, for example of a straight line over all splines. The other W weights are
-    the entries.
+    In the model, the term has a parameter with W entries for the joint, for example spline coefficients, in units of
+    `scale`. The linear model has L more weights: coefficients of trends, which add to all entries (for example a
+    straight line over all splines). The first L weights are of the trends, the other W of the single entries.
 
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
@@ -47,10 +49,10 @@ class JointFunction:
     trends: (W, L) entries of each trend.
     groups: (P,) index of the group of each weight; a group has one prior precision.
     friction: (T,) friction torque with the current factor, if the term is a friction factor: the weights then give the
-        logarithm of the factor, and columns @ weights is the torque linearized at the current factor. None: the term
-        is a torque.
-    visit_length: mean number of samples per visit of a position. A new visit begins when the joint has moved by the
-        spacing of the splines.
+        logarithm of the factor, and columns @ weights is the torque linearized at the current factor. None: the term is
+        a torque.
+    visit_length: mean number of successive samples in which the joint moves by the knot spacing of the splines. These
+        samples are one visit of a position.
     """
 
     parameter: str
@@ -103,7 +105,10 @@ class JointFunction:
     def fit(
         self, target: torch.Tensor, correlation_length: float, rows: slice | torch.Tensor = ALL
     ) -> BayesianRidge:
-        """Return the fit to a target (T,) at the samples `rows`; samples of one visit count as one error."""
+        """Return the Bayesian ridge fit of the weights to a target torque (T,) [Nm, N] at the samples `rows`.
+
+        The samples of one visit of a position count as one independent error.
+        """
         samples = append_target(self.features[rows], target[rows])
         # The error of a function of position is constant during a visit of a position, however long the visit lasts.
         length = max(correlation_length, self.visit_length)
@@ -113,7 +118,8 @@ class JointFunction:
 class ProjectedTerms(NamedTuple):
     """Position-dependent torques that are eliminated in a fit.
 
-    terms: linear terms per joint. candidates: the residual terms whose columns the linear terms concatenate.
+    terms: linear terms per joint. candidates: the residual terms. The columns of a joint's linear terms are the columns
+    of all its residual terms, concatenated in the order of the candidates.
     """
 
     terms: dict[int, LinearTerms]

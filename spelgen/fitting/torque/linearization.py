@@ -26,7 +26,8 @@ class JointRows(NamedTuple):
 class LinearTerms:
     """Linear terms of one joint's torque, whose weights are eliminated by variable projection.
 
-    features: F, (T, P). penalty: diagonal D of the penalty on squared weights, (P,), in squares of the torque.
+    features: F, (T, P). penalty: diagonal D of the penalty on squared weights, (P,); its unit is the square of the unit
+    of the torque.
 
     Let r be the torque residual of all other parameters. The weights are the ridge solution w(r) = (F^T F + D)^-1 F^T
     r. The cost |r - F w(r)|^2 + |D^1/2 w(r)|^2 then depends only on the other parameters. It is the square of a vector
@@ -166,9 +167,9 @@ class BayesianRidge(NamedTuple):
     """Result of `bayesian_ridge` for P weights in G groups.
 
     coef: weights, which are the ridge solution for `penalty`, (P,). penalty: penalty on the squared weights, (P,),
-    equal to lambda / alpha times the correlation length, in squares of the target. alpha: precision of the noise.
-    lambda_: precision of the weights of each group, (G,). gamma: effective number of weights of each group, (G,).
-    n_iter, converged: number of fixed-point iterations, and whether they converged.
+    equal to lambda / alpha times the correlation length; its unit is the square of the unit of the target. alpha:
+    precision of the noise. lambda_: precision of the weights of each group, (G,). gamma: effective number of weights of
+    each group, (G,). n_iter, converged: number of fixed-point iterations, and whether they converged.
     """
 
     coef: torch.Tensor
@@ -201,7 +202,8 @@ def bayesian_ridge(
     gram, moment, square = products[:-1, :-1], products[:-1, -1], float(products[-1, -1])
     member = F.one_hot(groups.long()).double()  # (P, G)
     excited = gram.diagonal() > 0
-    size, variance = member.sum(dim=0), square / count  # variance: 1 / alpha
+    # `size` is the number k of weights of each group, `variance` is 1 / alpha.
+    size, variance = member.sum(dim=0), square / count
     feature_square = (member.mT @ gram.diagonal() / count / size).clamp(min=1e-300)
     # Zero weights would be a fixed point. Initially each group therefore explains 10 % of the variance of the target.
     lambda_ = 10 * feature_square * size / max(variance, 1e-300)
@@ -216,7 +218,8 @@ def bayesian_ridge(
         lambda_ = (gamma / (member.mT @ coef.square()).clamp(min=1e-300)).clamp(max=1e14)
         residual_square = square - float(2 * coef @ moment - coef @ gram @ coef)
         previous, variance = variance, max(residual_square, 1e-12 * square) / count
-        converged = abs(variance - previous) < 1e-3 * previous  # three digits of the noise suffice
+        # Three digits of the noise variance suffice.
+        converged = abs(variance - previous) < 1e-3 * previous
     return BayesianRidge(coef, penalty, 1 / max(variance, 1e-300), lambda_, gamma, n_iter, converged)
 
 

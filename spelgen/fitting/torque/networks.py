@@ -42,13 +42,13 @@ def fit_networks(
         model: model whose weights that require a gradient are fitted.
         samples: samples with torques as logged, (T, n) [Nm, N]; errors are divided by the standard deviation of each
             joint's torque.
-        weight_decay: see `LBFGS`.
+        weight_decay: factor of half the sum of squares of all weight matrices, which is added to the loss.
         penalty: function that returns a term added to the loss, for example the distance from a URDF.
         evaluations: maximum number of evaluations of the loss.
     """
     count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
-    # joints of constant torque would have an infinite weight
+    # The errors of a joint of constant torque would have an infinite weight.
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def summands() -> Iterator[torch.Tensor]:
@@ -104,10 +104,11 @@ def select_networks(
         samples: samples with the torque residual of the model and its current terms.
         correlation_length: number of samples per independent error.
     """
-    # The time of L-BFGS is proportional to the number of samples. They are correlated, so a subset suffices.
+    # The time of L-BFGS is proportional to the number of samples, and successive samples are correlated, so that a
+    # subset suffices.
     step = -(-len(samples.q) // SELECTION.network_samples)
     subset = ResidualSamples(*(column[::step] for column in samples))
-    # The target is the torque of all residual terms together, single-joint terms included.
+    # The target is the torque that the sum of all residual terms should have, single-joint terms included.
     with torch.no_grad():
         current = residual_torque(model, *subset[:3])
     subset = subset._replace(torque_residual=subset.torque_residual + current)
@@ -127,10 +128,11 @@ def select_networks(
 def _fit_network(
     model: ArmModel, network: torch.nn.Module, samples: ResidualSamples, correlation_length: float
 ) -> float | None:
-    """Fit one network if, fitted to the first half, it lowers the error on the last half; return the error reduction.
+    """Fit a network to the first half of the samples, and to all samples if it lowers the error on the last half.
 
-    A rejected network keeps its initial weights. samples: samples whose torque residual is the target of all residual
-    terms together.
+    Return the relative reduction of the squared error on the last half; None if the network is rejected. A rejected
+    network keeps its initial weights. samples: samples whose torque residual is the target of the sum of all residual
+    terms.
     """
     initial, residual = copy.deepcopy(network.state_dict()), _remaining_residual(model, samples)
     noise = rms_per_joint(residual)

@@ -32,7 +32,7 @@ from spelgen.logs.windows import thinned
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import TorqueFit
 
-SAMPLES = 5  # number of samples per validation window
+SAMPLES = 5  # number of samples of a validation window
 FITTED = {
     "load": "only a load at the tip fitted",
     "friction": "only friction and torque offsets fitted",
@@ -47,7 +47,7 @@ class TorqueObjective(Objective):
     config: TorqueFit
 
     def prepare(self) -> PreparedLogs:
-        """Return the prepared logs, after estimates of motor couplings and torque delay; see `Objective`."""
+        """Estimate motor couplings and the torque delay from the logs, then check and prepare the logs."""
         preprocessing, self._delay = self.request.preprocessing, NO_DELAY
         self._coupling_notes: list[Diagnostic] = []
         if isinstance(self.model, RigidBodyDynamics):
@@ -90,11 +90,12 @@ class TorqueObjective(Objective):
         loss = validation.loss(substeps)
         self._make_checkpoint(loss, time.monotonic() - self.request.began, substeps)
         self._checkpoint["torque_nmse"] = torque_nmse(model, samples)
-        if solution is not None and not self.config.adapt:  # an adapted model has parameters of two fits
+        # An adapted model has parameters of two fits, so that no joint covariance of all parameters is known.
+        if solution is not None and not self.config.adapt:
             self._checkpoint["posterior"] = {
                 "covariance": solution.covariance,
                 "torque_std": solution.torque_std,
-                # half width of a 99 % interval -> standard deviation
+                # The half width of a 99 % interval is 2.576 standard deviations.
                 "delay_std": self._delay.interval / 2.576,
             }
         return notes

@@ -83,7 +83,8 @@ class ParameterVector:
         """Return a mask (K,) of the parameters that a fit estimates.
 
         Args:
-            adapt: "load": only the last body is free; "friction": only `DAY_GROUPS`; None or "unit": all groups.
+            adapt: "load": only the last body is free; "friction": only friction parameters and torque offsets, which
+                vary from day to day (`DAY_GROUPS`); None or "unit": all groups.
             compensated: (n,) joints whose friction compensation is free; it is fixed at all other joints.
         """
         if adapt == "load":
@@ -190,8 +191,9 @@ class ParameterPrior:
     wrong values, or would widen the prior of all links. The t distribution is a Gaussian whose width differs between
     bodies.
 
-    rigid: names and groups of x. widths: standard deviation of each group; for bodies, the scale of the t distribution.
-    hyperprior: the initial `widths`. mean: prior mean of x, (K,). body_widths: standard deviation of each body, (B,).
+    rigid: `ParameterVector` with the names and groups of the parameters x. widths: standard deviation of each group;
+    for bodies, the scale of the t distribution. hyperprior: the initial `widths`. mean: prior mean of x, (K,).
+    body_widths: standard deviation of each body, (B,).
     """
 
     rigid: ParameterVector
@@ -208,7 +210,11 @@ class ParameterPrior:
 
     @property
     def plausible(self) -> bool:
-        """Whether the root mean square of the bodies' widths is at most `TUNING.wrong_urdf`, as a factor of masses."""
+        """Whether the URDF is plausible: its masses agree with the fit up to a factor of `TUNING.wrong_urdf`.
+
+        The factor is exp of the root mean square of the bodies' prior widths, since the logarithm of a mass is a
+        parameter.
+        """
         return float(self.body_widths.square().mean().sqrt().exp()) <= TUNING.wrong_urdf
 
     @cached_property
@@ -233,7 +239,8 @@ def prior_covariance(
         option = width_option(groups[name])
         matrix[rows, rows] = torch.full((len(rows),), deviations[option]).double().square()
         if option in SHARED:
-            # Bristle fractions are (n, elements): each element has a separate factor common to all joints.
+            # Most groups have one parameter per joint. Bristle fractions have one per joint and bristle, (n, elements):
+            # the fractions of bristle k of all joints have a common factor.
             for of_joints in rows.view(len(x), -1).mT:
                 matrix[of_joints[:, None], of_joints] += deviations[SHARED[option]] ** 2
         if groups[name] in ("sizes", "effects"):

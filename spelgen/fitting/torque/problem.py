@@ -46,8 +46,8 @@ class NoiseEstimator:
     """Estimator of the torque noise s (n,) [Nm, N] from the squared residual of `count` samples.
 
     Errors of filtered samples are correlated, so `correlation_length` (n,) samples count as one independent error. s^2
-    is the mean squared residual times this length: the sum of squared residuals over all samples, divided by s^2, then
-    has the weight of the independent errors only. torque_std: standard deviation of the torque, (n,) [Nm, N].
+    is the mean squared residual times this length. The sum over all samples of residual^2 / s^2 is then the number of
+    independent errors, not the number of samples. torque_std: standard deviation of the torque, (n,) [Nm, N].
     """
 
     count: int
@@ -100,8 +100,9 @@ class TorqueProblem:
     """Negative log posterior of x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
     noise: standard deviations, (n,) [Nm, N], scaled such that the errors of all samples can be treated as independent
-    (see `NoiseEstimator`). adapt: see `TorqueFit`. compensated: joints whose drives compensate friction, (n,) (see
-    `stages.find_compensation`). correlation_time: correlation time of the torque errors, (n,) [s].
+    (see `NoiseEstimator`). adapt: group of parameters to estimate, "load", "friction" or "unit"; None: all parameters.
+    compensated: joints whose drives compensate friction, (n,) (see `stages.find_compensation`). correlation_time:
+    correlation time of the torque errors, (n,) [s].
     """
 
     jacobian: TorqueJacobian
@@ -154,11 +155,14 @@ class TorqueProblem:
         return replace(self, noise=noise)
 
     def residual(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the squared torque residual per joint (n,) [Nm^2, N^2]; see `LeastSquaresProblem`."""
+        """Return the sum of the squared torque residual over all samples, per joint, (n,) [Nm^2, N^2]."""
         return self.jacobian.squared_residual(x)
 
     def cost(self, x: torch.Tensor, residual: torch.Tensor) -> float:
-        """Return the negative log posterior of x (K,) up to a constant; residual: squared one, (n,) [Nm^2, N^2]."""
+        """Return the negative log posterior of x (K,) up to a constant.
+
+        residual: sum of the squared torque residual over all samples, per joint, (n,) [Nm^2, N^2].
+        """
         deviation = x - self.prior.mean
         penalty = deviation @ self.prior.precision @ deviation
         return float(((residual / self.noise.square()).sum() + penalty) / 2)
@@ -177,24 +181,33 @@ class TorqueProblem:
         step: (k,) step of the free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
-        # x + step is cheaper, and as good near the optimum. Far from the optimum the curved step may have a lower
-        # cost.
+        # The parameters x + step need less time and are as good near the optimum. Far from the optimum the curved step
+        # may have a lower cost.
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
     def minimize(self, state: State, max_steps: int) -> SolverResult[torch.Tensor]:
-        """Return the result of at most `max_steps` Levenberg-Marquardt steps from a state; its cost is recomputed."""
+        """Make at most `max_steps` Levenberg-Marquardt steps from `state`, and return the result.
+
+        The cost of `state` is recomputed first, since it may belong to another noise or prior.
+        """
         state = replace(state, cost=self.cost(state.x, state.residual))
         return levenberg_marquardt(
             self, state, max_steps=max_steps, min_relative_decrease=TUNING.min_relative_decrease
         )
 
     def covariance(self, curvature: torch.Tensor) -> torch.Tensor:
-        """Return the posterior covariance (K, K), zero for fixed parameters, from the curvature of the free ones."""
+        """Return the posterior covariance (K, K) of all K parameters, which is zero for fixed parameters.
+
+        curvature: Gauss-Newton Hessian with respect to the k free parameters, (k, k).
+        """
         return self.of_all_parameters(torch.linalg.inv(curvature))
 
     def of_all_parameters(self, free_covariance: torch.Tensor) -> torch.Tensor:
-        """Return the covariance (K, K) from the covariance of the free parameters (k, k); zero for fixed parameters."""
+        """Return the covariance (K, K) of all K parameters, which is zero for fixed parameters.
+
+        free_covariance: covariance of the k free parameters, (k, k).
+        """
         covariance = torch.zeros_like(self.prior.precision)
         covariance[self.free[:, None] & self.free] = free_covariance.flatten()
         return covariance
@@ -202,15 +215,15 @@ class TorqueProblem:
     def updated(self, state: State, covariance: torch.Tensor) -> TorqueProblem:
         """Return the problem with noise and prior widths re-estimated at a state.
 
-        The effective number of parameters is gamma = tr(1 - covariance P) (MacKay, 1992). Each joint is assigned an
-        equal share.
+        The effective number of parameters is gamma = tr(1 - covariance P), with the precision P of the prior (MacKay,
+        1992). Each joint is assigned an equal share of gamma.
         """
         free, joints = self.free, len(state.residual)
         # A parameter of a body is determined by the torques of several joints: gamma is computed for all joints
         # together.
         gamma = float(free.sum() - (covariance * self.prior.precision)[free][:, free].sum())
         noise = self.noise_estimator.estimate(state.residual, gamma / joints)
-        # The widths of a load cannot be estimated from one body.
+        # The prior width of the bodies cannot be estimated if only one body, the load, is fitted.
         prior = self.prior if self.adapt == "load" else update_widths(self.prior, state.x, covariance)
         return replace(self, noise=noise, prior=prior)
 
@@ -307,7 +320,7 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # weighted mean of the estimate and the prior mean; weights: numbers of independent errors
+    # The result is the weighted mean of the estimate and the prior mean, with numbers of independent errors as weights.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

@@ -104,7 +104,7 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
     assumed to be chi-squared with S degrees of freedom; the median of this distribution is below S.
     """
     seconds = samples.count * samples.interval / TUNING.segment
-    # the correction is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve
+    # The correction is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve seconds.
     median = 2 * float(gammaincinv(seconds / 2, 0.5))
     return np.asarray(solution.held_out_nmse * seconds / median)
 
@@ -112,7 +112,10 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
 def _few_data(
     samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray, comparison: Comparison | None
 ) -> Diagnostic:
-    """Return the warning that the samples do not support a fit of some joints; nmse: see `_likely_nmse`, (n,)."""
+    """Return the warning that the logs have too little motion for the parameters of some joints.
+
+    nmse: median-unbiased nMSE of held-out blocks, (n,).
+    """
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
     # The nMSE due to parameter errors is inversely proportional to the duration of the motion.
     enough = math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported)

@@ -57,7 +57,7 @@ class TorqueSamples:
                 [None if column is None else np.ascontiguousarray(column[::decimation]) for column in columns]
             )
             count, interval = count + len(x.q), decimation / x.rate
-            # All trajectories of one recording have the same index, since errors of its motion are common to them.
+            # All trajectories cut from one recording have the same index, since their errors are correlated.
             recordings.append(torch.full((len(x.q[::decimation]),), names.setdefault(x.name, len(names))))
         table = SampleBlock._make(map(_concatenated, zip(*decimated, strict=True)))
         return cls(table, count, interval, torch.cat(recordings))

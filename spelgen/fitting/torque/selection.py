@@ -97,8 +97,9 @@ def select_functions(
     for candidate in joint_functions(model, samples, projection):
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
-    # With two recordings each fit is to one recording, whose errors are common to several of the ten blocks: the
-    # blocks are not independent, and the stricter test is used.
+    # With two recordings, one is fitted and the other one is held out, so that several of the ten blocks have the
+    # errors of the same fit. The blocks are then not independent, and the stricter test is used, as for a single
+    # recording.
     limits = None if int(recordings.max()) > 1 else max_torques(model, samples.q, torque_std)
     best = (
         _best(of_joint, samples.torque_residual, noise, float(length), recordings, limits)
@@ -151,7 +152,8 @@ def _best(
         if reduction is None and reduction_within is None:
             continue
         weights = candidate.fit(target, correlation_length, first).coef
-        # An implausibly large torque is more likely an error that the motion repeats.
+        # An implausibly large torque is more likely a model error that repeats with the motion than a torque of the
+        # joint.
         if limits and candidate.torque(weights).std() > limits[candidate.parameter][candidate.joint]:
             continue
         before, after = target[last].square(), (target - candidate.torque(weights))[last].square()
@@ -161,8 +163,9 @@ def _best(
         if reduction_within is not None and after[within].sum() < before[within].sum():
             accepted = SelectedTerm(candidate.parameter, candidate.joint, reduction_within)
             best_within = _better(best_within, accepted)
-    # A candidate that passes outside the fitted range, too, is preferred. A spring has errors there, but other
-    # functions of position have larger ones.
+    # A candidate that passes the tests on all held-out samples, positions outside the fitted range included, is
+    # preferred: there even the torque of a spring has extrapolation errors, but other functions of position have larger
+    # errors.
     return best or best_within
 
 
@@ -205,9 +208,10 @@ def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, t
 def _cross_validate(
     candidate: JointFunction, target: torch.Tensor, correlation_length: float, recordings: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the error (T,) [Nm, N] at each sample by the fit from which it was held out, and a mask (T,).
+    """Return the cross-validation error (T,) [Nm, N] and a mask (T,).
 
-    The mask marks the samples whose positions are within the range of the fitted positions.
+    The error at a sample is the error of the fit to the other folds. The mask marks the samples whose positions are
+    within the range of the positions that were fitted.
     """
     position = candidate.position
     error, within = torch.zeros_like(target), torch.zeros_like(target, dtype=torch.bool)
@@ -229,13 +233,17 @@ def significant_reduction(
 ) -> float | None:
     """Return the relative reduction of squared errors, or None if it is not significant.
 
-    before, after: sum of squared errors of each block without and with a term, (folds,). The t test is on g = (before -
-    after) / (before + after) of each block. g is between -1 and 1, so that neither a block of large torques nor a block
-    of extrapolation dominates the variance. A negligible part of the mean square is added to the denominator, so that g
-    is zero for blocks without torque.
+    The t test is on g = (before - after) / (before + after) of each block. g is between -1 and 1, so that neither a
+    block of large torques nor a block of extrapolation dominates the variance. A negligible part of the mean square is
+    added to the denominator, so that g is zero for blocks without torque.
+
+    Args:
+        before: sum of squared errors of each block without the term, (folds,).
+        after: sum of squared errors of each block with the term, (folds,).
+        standard_errors: value of t that the mean of g over the blocks must exceed.
     """
     negligible = 2 * SELECTION.min_reduction * before.mean()
-    # g is antisymmetric: halving and doubling an error have opposite values
+    # g is antisymmetric: for halved and for doubled squared errors it has opposite values.
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:

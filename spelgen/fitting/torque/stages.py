@@ -90,9 +90,10 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
         residual, qd = _without_line(residual, samples.q), _without_line(qd, samples.q)
     products = (residual * qd).sum(dim=0)
     slope = products / qd.square().sum(dim=0).clamp(min=1e-300)
-    # coefficient of determination: fraction of the squared residual that the regression line explains
+    # `explained` is the coefficient of determination: the fraction of the squared residual that the regression line
+    # explains.
     explained = slope * products / residual.square().sum(dim=0).clamp(min=1e-300)
-    # t statistic of the slope
+    # `deviations` is the t statistic of the slope: the slope divided by its standard deviation.
     deviations = (explained * estimator.errors / (1 - explained)).sqrt()
     decreasing = (slope < 0) & (deviations > 1) & ~problem.compensated
     if not first:

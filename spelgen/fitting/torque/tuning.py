@@ -32,7 +32,7 @@ class TorqueTuning:
     reversal_correlation_time: float = 0.1
     # [1] Weight of `correlation_time` in the estimated correlation time, as a number of independent errors.
     correlation_weight: float = 30.0
-    # [s] Duration of the segments from which the correlation time is estimated, and which are held out for the nMSE.
+    # [s] Duration of the segments from which the correlation time is estimated.
     segment: float = 1.0
     # [1] Largest estimated prior width: masses and armatures are known to a factor of 20, torque offsets to three times
     # the typical friction. Logs that need a wider prior are not of the URDF's arm, or not in Nm.
@@ -84,7 +84,7 @@ class TorqueTuning:
     # [1] A warning names motor gains whose relative standard deviation exceeds this value: the 95 % interval is then
     # wider than +-20 %, which is the difference between two datasheets.
     undetermined_gain: float = 0.1
-    # [1] A warning names joints whose nMSE of held-out segments exceeds this value.
+    # [1] A warning names joints whose nMSE of held-out blocks exceeds this value.
     unsupported: float = 0.5
     # [1] A warning states that the URDF is wrong if the prior standard deviation of its masses exceeds this factor.
     wrong_urdf: float = 5.0
@@ -117,7 +117,7 @@ class ResidualTuning:
     # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
     # degrees of freedom.
     standard_errors: float = 2.82
-    # [1] The same number for one or two recordings, whose motion may repeat errors: p = 0.001.
+    # [1] `standard_errors` for one or two recordings, whose motion may repeat model errors: p = 0.001.
     standard_errors_of_one: float = 4.30
     # [1] Largest standard deviation of a position-dependent torque that is selected on one or two recordings, as a
     # fraction of the standard deviation of the joint's torque.
@@ -127,8 +127,8 @@ class ResidualTuning:
     min_load_fraction: float = 0.1
     # [1] Smallest error reduction of a residual term.
     min_reduction: float = 1e-3
-    # [1] A later term is preferred to the best one so far only if its residual is below this fraction of the residual
-    # of the best one.
+    # [1] A candidate replaces the best candidate of a joint so far only if its held-out squared residual is below this
+    # fraction of the best candidate's. Candidates are tested in the order splines, friction factor, ripple.
     preference_ratio: float = 0.9
     # [1] Largest number of samples to which networks are fitted.
     network_samples: int = 2**12
