@@ -151,6 +151,8 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
     factor, factor_change = perturbed.real, perturbed.imag / epsilon
     relative = torch.linalg.solve_triangular(factor, factor_change, upper=True)
     added = relative + relative.mT
+    if not added.isfinite().all():  # overflow: the solver rejects the step by its cost
+        return raw + step
     min_eigenvalue = torch.linalg.eigvalsh(added)[:, 0]
     fraction = (TUNING.body_step / (-min_eigenvalue).clamp(min=1e-12)).clamp(max=1.0)
     factor = factor @ upper_cholesky(torch.eye(4).double() + fraction[:, None, None] * added)

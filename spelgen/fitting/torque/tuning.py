@@ -32,7 +32,7 @@ class TorqueTuning:
     reversal_correlation_time: float = 0.1
     # [1] Weight of `correlation_time` in the estimated correlation time, as a number of independent errors.
     correlation_weight: float = 30.0
-    # [s] Duration of the segments from which the correlation time is estimated, and which are held out for the nMSE.
+    # [s] Duration of the segments from which the correlation time is estimated.
     segment: float = 1.0
     # [1] Largest estimated prior width: masses and armatures are known to a factor of 20, torque offsets to three times
     # the typical friction. Logs that need a wider prior are not of the URDF's arm, or not in Nm.
@@ -84,7 +84,7 @@ class TorqueTuning:
     # [1] A warning names motor gains whose relative standard deviation exceeds this value: the 95 % interval is then
     # wider than +-20 %, which is the difference between two datasheets.
     undetermined_gain: float = 0.1
-    # [1] A warning names joints whose nMSE of held-out segments exceeds this value.
+    # [1] A warning names joints whose nMSE of held-out blocks exceeds this value.
     unsupported: float = 0.5
     # [1] A warning states that the URDF is wrong if the prior standard deviation of its masses exceeds this factor.
     wrong_urdf: float = 5.0
