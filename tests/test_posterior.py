@@ -94,13 +94,13 @@ def logged(model, seconds, seed, correlation=0.98, noise=0.05):
 def test_intervals_hold_the_truth_if_errors_last_longer_than_the_fit_assumes(robots, monkeypatch):
     """Errors of 0.5 s: intervals of the posterior covariance, which assumes 0.2 s, are too narrow."""
     estimates, ratios, ratios_by_posterior = [], [], []  # errors divided by half intervals
-    measured = torque_fit.parameter_covariance
+    measured = torque_fit.jackknife
 
     def kept(estimate):
         estimates.append(estimate)
         return measured(estimate)
 
-    monkeypatch.setattr(torque_fit, "parameter_covariance", kept)
+    monkeypatch.setattr(torque_fit, "jackknife", kept)
     for seed in range(12):
         true, model = arm_like(robots, seed), build(robots / "rpr.urdf", "closed-form")
         solution = fit_torque(model, [logged(true, 12.0, seed)])

@@ -17,6 +17,8 @@ from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
 from spelgen.emission.specify import generate
@@ -24,6 +26,7 @@ from spelgen.errors import LogError
 from spelgen.fitting.fit import default_objective, fit
 from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
+from spelgen.fitting.torque.covariance import contiguous_blocks
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import ResidualSamples, TorqueJacobian
 from spelgen.fitting.torque.joint_functions import FRICTION
@@ -39,11 +42,14 @@ from spelgen.fitting.torque.parameters import (
     update_widths,
 )
 from spelgen.fitting.torque.problem import NoiseEstimator, TorqueProblem
+from spelgen.fitting.torque.regression import PENALTIES, best_regression
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import select_functions
 from spelgen.fitting.torque.stages import initial_fit
 from spelgen.fitting.torque.tuning import TorqueTuning
+from spelgen.identification.identification import LeastSquares
+from spelgen.identification.identify import least_squares
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -236,6 +242,83 @@ def test_bodies_that_are_placeholders_are_left_behind(emitted, robots, tmp_path,
     assert nmse(found, recorded(true, 20.0, 0.0, seed=9)) < 1e-4
 
 
+def with_unit_error(urdf, mass, center, path):
+    """Write a URDF whose masses and inertias, and whose centres of mass, are multiplied by factors."""
+    tree = etree.parse(urdf)
+    for inertial in tree.iterfind(".//link/inertial"):
+        origin = inertial.find("origin")
+        origin.set("xyz", " ".join(repr(center * float(x)) for x in origin.get("xyz").split()))
+        inertial.find("mass").set("value", repr(mass * float(inertial.find("mass").get("value"))))
+        for name, value in inertial.find("inertia").attrib.items():
+            inertial.find("inertia").set(name, repr(mass * float(value)))
+    tree.write(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("mass", "center", "replaced"),
+    [(1.0, 1.0, False), (1e-6, 1.0, True), (1.0, 1000.0, False)],
+    ids=["right", "masses in mg", "centres in mm"],
+)
+def test_a_fit_is_not_behind_least_squares_for_any_urdf(emitted, robots, tmp_path, mass, center, replaced):
+    """Inertials in other units: a fit that would be behind starts again from ridge regression, and says so."""
+    true = emitted["rpr"][0].Model()
+    urdf = with_unit_error(robots / "rpr.urdf", mass, center, tmp_path / "rpr.urdf")
+    logs, test = [recorded(true, 20.0, 0.02, seed=1)], recorded(true, 10.0, 0.0, seed=9)
+    found = build(urdf, "closed-form")
+    solution = fit_torque(found, logs)
+    reference = least_squares(load_arm(urdf).chain, logs, LeastSquares("range"))
+    error = reference.torque(test.q, test.qd, test.qdd) - test.tau
+    assert nmse(found, test) < 1.02 * (np.square(error).mean(axis=0) / test.tau.var(axis=0)).mean()
+    assert not solution.comparison.behind and (solution.comparison.replaced is not None) == replaced
+    codes = {note.code for note in torque_notes(found, TorqueSamples.of(logs), solution)}
+    assert ("fit-from-regression" in codes) == replaced and "behind-regression" not in codes
+
+
+def test_torques_that_no_bodies_have_are_named(emitted):
+    """Negative inertia at one joint: ridge regression explains it, and physically consistent bodies do not."""
+    model = emitted["rpr"][0].Model()
+    log = recorded(emitted["rpr"][0].Model(), 20.0, 0.02, seed=1)
+    tau = log.tau.copy()
+    tau[:, 2] -= 2 * tau[:, 2].std() / log.qdd[:, 2].std() * log.qdd[:, 2]
+    logs = [replace(log, tau=tau)]
+    solution = fit_torque(model, logs)
+    assert solution.comparison.behind
+    notes = {note.code: note.message for note in torque_notes(model, TorqueSamples.of(logs), solution)}
+    assert f"(nMSE {solution.comparison.regression:.2g})" in notes["behind-regression"]
+
+
+def test_held_out_errors_of_ridge_regression_are_those_of_refits(emitted, robots):
+    """Against a solution of the stacked equations for each block and penalty."""
+    model = emitted["rpr"][0].Model()
+    log = recorded(model, 4.0, 0.1, seed=1)
+    blocks = contiguous_blocks(TorqueSamples.of([log]))
+    scale = log.tau.std(axis=0)
+    found = best_regression(model, blocks, scale)
+    columns = np.concatenate(
+        [
+            regressor(load_arm(robots / "rpr.urdf").chain, log.q, log.qd, log.qdd),
+            FrictionModel().columns(log.qd, log.qdd),
+        ],
+        axis=2,
+    )
+    rows, target = columns / scale[:, None], log.tau / scale
+    length = np.sqrt(np.square(rows).sum(axis=(0, 1)))
+    rows = rows / np.where(length > 0, length, 1.0)
+    of_penalties = []
+    for penalty in PENALTIES:
+        ridge, errors = np.sqrt(penalty) * np.eye(rows.shape[2]), []
+        for block in np.array_split(np.arange(len(rows)), 10):
+            kept = np.delete(np.arange(len(rows)), block)
+            stacked = np.vstack([rows[kept].reshape(-1, rows.shape[2]), ridge])
+            known = np.append(target[kept].ravel(), np.zeros(rows.shape[2]))
+            parameters = np.linalg.lstsq(stacked, known, rcond=None)[0]
+            errors.append(np.square(rows[block] @ parameters - target[block]).sum())
+        of_penalties.append(errors)
+    expected = min(of_penalties, key=sum)
+    np.testing.assert_allclose(found.held_out, expected, rtol=1e-4)
+
+
 def test_steps_of_bodies_are_straight_in_their_parameters_and_stay_possible(emitted):
     """Twice the step adds twice to the parameters; a step that no body could follow ends short of it."""
     bodies = drawn(emitted["rpr"][0], seed=1, deviation=0.3).bodies
@@ -269,6 +352,27 @@ def test_a_drive_that_compensates_friction_unseen_is_found_out(emitted):
     assert nmse(found, recorded(true, 10.0, 0.0, seed=9)) < 5e-3
     notes = {note.code: note for note in torque_notes(found, TorqueSamples.of(logs), fit)}
     assert f"{found.joint_names[4]} {value[4].item():.3g} Nm s/rad" in notes["friction-compensated"].message
+
+
+def test_a_spring_in_a_motion_that_does_not_return_is_no_compensation(emitted):
+    """A joint that turns once in one direction against a spring: torque and velocity have opposite signs throughout."""
+    module = emitted["six_dof"][0]
+    t = np.linspace(0.0, 12.0, 1200)
+    motion = smooth_motion(6, 12.0, np.random.default_rng(1))
+    for values, of_joint in zip(
+        motion,
+        (
+            -np.cos(np.pi * t / 12),
+            np.pi / 12 * np.sin(np.pi * t / 12),
+            (np.pi / 12) ** 2 * np.cos(np.pi * t / 12),
+        ),
+        strict=True,
+    ):
+        values[:, 4] = of_joint
+    with torch.no_grad():
+        tau = module.Model().inverse_dynamics(*map(torch.from_numpy, motion)).numpy()
+    tau[:, 4] += tau[:, 4].std() * (motion[0][:, 4] - 1.0)
+    assert not fit_torque(module.Model(), [DynamicsSamples("spring", *motion, tau)]).compensated.any()
 
 
 def test_a_torque_that_falls_with_velocity_by_little_is_no_compensation(emitted):

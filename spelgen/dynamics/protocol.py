@@ -65,6 +65,8 @@ def residual_terms(model: object) -> ResidualTerms | None:
 
 def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
     """Return True if friction depends on the state z of bristles, which is then the last argument of all methods."""
+    if isinstance(dynamics, RigidBodyDynamics):  # ten times as fast as the check of a protocol
+        return dynamics.elements > 0
     return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 
 
@@ -110,7 +112,7 @@ def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = No
     [-1, 1] of dry friction without bristles, (..., n); it is required if tau was filtered, and must have passed the
     same filter.
     """
-    if z is None or not is_stateful(dynamics):
+    if z is None or not z.shape[-1] or not is_stateful(dynamics):
         return ()
     if direction is None or not isinstance(dynamics, RigidBodyDynamics):
         return (z,)
@@ -122,7 +124,7 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        # Rollouts call the methods of the friction state on this object, so they are forwarded.
+        # Rollouts call the methods of the friction state on this object: it has the methods of `dynamics`.
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements

@@ -41,7 +41,7 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     qd = logged.get("qd", np.zeros_like(q))
     if "qd" not in logged:
         for rows in _pieces(t):
-            qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # central differences
+            qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # qd is the central difference of q
     tau = logged.get("tau", np.zeros((len(t), 0)))
     return Trajectory(
         t, q, qd, tau, name, layout.file, layout.accepted, logged.get("u"), repairs, layout.remarks + wraps, mapping
@@ -158,7 +158,7 @@ def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, 
     if quantity == "tau":
         stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
         return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
-    from scipy.integrate import cumulative_trapezoid  # takes long to import
+    from scipy.integrate import cumulative_trapezoid  # imported only if needed, since the import takes long
 
     # if q or qd is frozen, the integral of qd drifts from q; a drift of more than 0.05 rad or m is evidence
     return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)

@@ -52,7 +52,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
     largest = np.array([TUNING.latest, *[TUNING.largest_value] * len(signals)])
     foreign = foreign_rows(data, len(layout.joints))
-    bad = ~(np.abs(data) < largest)  # NaN included
+    bad = ~(np.abs(data) < largest)  # NaN is bad, too: a comparison with NaN is False
     if is_split(data):
         bad[:, 1:] &= ~np.isnan(data[:, 1:])
     elif not foreign.all():

@@ -1,30 +1,35 @@
 """Fit of a model of rigid bodies to torques, stage by stage.
 
 initial fit -> choice of the friction state -> choice of friction effects -> residual terms -> final fit
+    -> comparison with ridge regression on held-out blocks of samples -> another fit if the regression is better
 
 The stages before the residual terms use a subset of the samples, residual terms are selected on a larger subset, and
 the final fit uses all samples.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import stdtrit
 
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.torque.covariance import held_out_nmse, parameter_covariance
+from spelgen.fitting.torque.covariance import Jackknife, contiguous_blocks, jackknife
 from spelgen.fitting.torque.jacobian import TorqueJacobian
-from spelgen.fitting.torque.parameters import limit_friction
+from spelgen.fitting.torque.parameters import joint_torque, limit_friction
 from spelgen.fitting.torque.problem import (
     TorqueEstimate,
     TorqueProblem,
     refine,
     with_correlation_time,
 )
+from spelgen.fitting.torque.regression import best_regression, start_at
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.selection import SelectedTerm
+from spelgen.fitting.torque.selection import SelectedTerm, significant_reduction
 from spelgen.fitting.torque.stages import (
     choose_friction_effects,
     choose_friction_state,
@@ -36,16 +41,30 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 
+class Comparison(NamedTuple):
+    """Held-out errors of a torque fit and of ridge regression, see `Regression`.
+
+    fit, regression: mean squared error of held-out blocks divided by the variance of the torque, mean over joints.
+    behind: whether the regression is better by more than chance. replaced: error of the fit from the URDF's values, in
+    place of which the solution is a fit from the regression's; None: the solution is the fit from the URDF's values.
+    """
+
+    fit: float
+    regression: float
+    behind: bool
+    replaced: float | None
+
+
 @dataclass(frozen=True, eq=False)
 class TorqueSolution:
     """Result of a torque fit.
 
     rms_residual: root mean square torque residual, (n,) [Nm, N]. steps: number of steps of the solver. cost: final
     cost. prior: prior with the estimated standard deviations. covariance: covariance of the parameters x, (K, K).
-    torque_std: root mean square torque error of held-out segments, (n,) [Nm, N]. compensated: joints whose drives
+    torque_std: root mean square torque error of held-out blocks, (n,) [Nm, N]. compensated: joints whose drives
     compensate friction, (n,). correlation_time: correlation time of the torque errors, (n,) [s]. held_out_nmse: mean
-    squared error of held-out segments divided by the variance of the torque, (n,). selected_terms: the selected
-    residual terms.
+    squared error of held-out blocks divided by the variance of the torque, (n,). selected_terms: the selected residual
+    terms. comparison: comparison with ridge regression; None for an adapted fit.
     """
 
     rms_residual: np.ndarray
@@ -58,6 +77,20 @@ class TorqueSolution:
     correlation_time: np.ndarray
     held_out_nmse: np.ndarray
     selected_terms: tuple[SelectedTerm, ...]
+    comparison: Comparison | None
+
+
+class _StagedFit(NamedTuple):
+    """Estimate after all stages, its errors and its residual terms.
+
+    held_out: like `Regression.held_out`. parameters: state_dict of the model.
+    """
+
+    estimate: TorqueEstimate
+    jackknife: Jackknife
+    selected: Sequence[SelectedTerm]
+    held_out: torch.Tensor
+    parameters: dict[str, torch.Tensor]
 
 
 def fit_torque(
@@ -69,40 +102,95 @@ def fit_torque(
     """Set the parameters of a model of rigid bodies to their MAP estimate.
 
     Args:
-        model: model whose current parameters are the prior mean. Before a fit of all parameters, nominal friction that
-            exceeds the standard deviation of a drive's logged torque is reduced to it.
+        model: model whose current parameters are the prior mean. Before a fit of all parameters, the nominal friction
+            of each drive is limited to the standard deviation of the drive's logged torque.
         samples: samples with torques as logged, (T, n) [Nm, N].
         prior: initial standard deviations of the prior; None: default.
-        adapt: group of parameters to estimate (see `TorqueFit`); the prior mean is then their current values. Residual
-            terms, and the prior widths of a load, are then fixed. None: estimate all parameters.
+        adapt: group of parameters to estimate (see `TorqueFit`). The fit of a group does not change residual terms,
+            and the fit of a load keeps the given prior widths. None: estimate all parameters.
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.of(samples, TUNING.decimation)
     samples = samples.subsampled(_max_samples(model))
-    subset = samples.subsampled(TUNING.initial_samples)
     if adapt is None:
         # The friction of an adapted model is not nominal but fitted, so it is not limited.
-        limit_friction(model, subset.columns)
+        limit_friction(model, samples.subsampled(TUNING.initial_samples).columns)
     if prior is None:
         prior = TUNING.priors[adapt] if adapt else GaussianPrior()
-    problem = TorqueProblem.of(TorqueJacobian(model, subset), prior, adapt)
-    estimate, selected = _run_stages(problem, samples)
-    state, jacobian = estimate.state, estimate.problem.jacobian
-    jacobian.rigid.write(state.x)
-    scale, nmse = jacobian.logged_scale(state.x), held_out_nmse(estimate, samples)
-    rms = (state.residual / samples.count).sqrt() / scale
+    initial = copy.deepcopy(model.state_dict())
+    fitted, comparison = _staged_fit(model, samples, prior, adapt), None
+    if adapt is None:
+        fitted, comparison = _not_behind_regression(model, samples, prior, fitted, initial)
+    estimate, state = fitted.estimate, fitted.estimate.state
+    jacobian, estimator = estimate.problem.jacobian, estimate.problem.noise_estimator
+    scale = jacobian.logged_scale(state.x)
+    error = fitted.jackknife.held_out.sum(dim=0) / samples.count  # (n,)
     return TorqueSolution(
-        rms_residual=rms.numpy(),
+        rms_residual=((state.residual / samples.count).sqrt() / scale).numpy(),
         steps=state.steps,
         cost=state.cost,
         prior=estimate.problem.prior.widths,
-        covariance=parameter_covariance(estimate),
-        torque_std=nmse.sqrt() * estimate.problem.noise_estimator.torque_std / scale,
+        covariance=fitted.jackknife.covariance,
+        torque_std=error.sqrt(),
         compensated=estimate.problem.compensated.numpy(),
         correlation_time=estimate.problem.correlation_time.numpy(),
-        held_out_nmse=nmse.numpy(),
-        selected_terms=tuple(selected),
+        held_out_nmse=(error / (estimator.torque_std / scale).square()).numpy(),
+        selected_terms=tuple(fitted.selected),
+        comparison=comparison,
     )
+
+
+def _staged_fit(
+    model: ArmModel, samples: TorqueSamples, prior: GaussianPrior, adapt: Adaptation | None
+) -> _StagedFit:
+    """Fit a model from its current parameters, which are the prior mean, and return the fit with its errors."""
+    subset = samples.subsampled(TUNING.initial_samples)
+    estimate, selected = _run_stages(TorqueProblem.of(TorqueJacobian(model, subset), prior, adapt), samples)
+    problem = estimate.problem
+    problem.jacobian.rigid.write(estimate.state.x)
+    errors = jackknife(estimate)
+    torque_std = problem.noise_estimator.torque_std / problem.jacobian.logged_scale(estimate.state.x)
+    held_out = (errors.held_out / torque_std.square()).sum(dim=1)
+    return _StagedFit(estimate, errors, selected, held_out, copy.deepcopy(model.state_dict()))
+
+
+def _not_behind_regression(
+    model: ArmModel,
+    samples: TorqueSamples,
+    prior: GaussianPrior,
+    fitted: _StagedFit,
+    initial: dict[str, torch.Tensor],
+) -> tuple[_StagedFit, Comparison]:
+    """Return the given fit, or a fit from the values of ridge regression if this predicts held-out torques better.
+
+    initial: state_dict of the model before the fit. The parameters of the returned fit are written to the model.
+    """
+    blocks = contiguous_blocks(samples)
+    regression = best_regression(model, blocks, joint_torque(model, samples.columns).std(dim=0).numpy())
+    # Errors below the lower bound of the noise are no difference.
+    negligible = TUNING.min_noise**2 * model.n * torch.tensor([block.count for block in blocks])
+    other = torch.from_numpy(regression.held_out) + negligible
+
+    def behind(fit: _StagedFit) -> bool:
+        """Return whether the regression is better than a fit by more than chance (p = 0.01 of Student's t)."""
+        if len(blocks) == 1:
+            return False
+        standard_errors = float(stdtrit(len(blocks) - 1, 0.99))
+        return significant_reduction(fit.held_out + negligible, other, standard_errors) is not None
+
+    def nmse(held_out: torch.Tensor) -> float:
+        """Return the nMSE, mean over joints, of the squared errors of blocks, (blocks,)."""
+        return float(held_out.sum()) / samples.count / model.n
+
+    best, replaced = fitted, None
+    if behind(fitted):
+        model.load_state_dict(initial)
+        start_at(model, samples.subsampled(TUNING.initial_samples), regression)
+        restarted = _staged_fit(model, samples, prior, None)
+        if restarted.held_out.sum() < fitted.held_out.sum():
+            best, replaced = restarted, nmse(fitted.held_out)
+        model.load_state_dict(best.parameters)
+    return best, Comparison(nmse(best.held_out), nmse(other), behind(best), replaced)
 
 
 def _run_stages(

@@ -13,7 +13,7 @@ from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.fitting.posterior import Posterior
-from spelgen.fitting.torque.fit import TorqueSolution
+from spelgen.fitting.torque.fit import Comparison, TorqueSolution
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.runtime.motors import MotorInputs
@@ -40,7 +40,9 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
         )
     nmse = _likely_nmse(samples, solution)
     if (nmse > TUNING.unsupported).any():
-        yield _few_data(samples, nmse, names)
+        yield _few_data(samples, nmse, names, solution.comparison)
+    if solution.comparison is not None:
+        yield from _behind_regression(solution.comparison)
     if isinstance(model.inputs, MotorInputs) and len(model.inputs.gain_rows):
         yield _trained_gains(posterior)
     if solution.compensated.any():
@@ -96,32 +98,54 @@ def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
 
 
 def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray:
-    """Return the median-unbiased nMSE of held-out segments (n,).
+    """Return the median-unbiased nMSE of held-out blocks (n,).
 
-    The mean of few squared errors is more often too small than too large. The sum of the squared errors of S segments
-    is assumed to be chi-squared with S degrees of freedom; the median of this distribution is below S.
+    The mean of few squared errors is more often too small than too large. The sum of the squared errors of S seconds is
+    assumed to be chi-squared with S degrees of freedom; the median of this distribution is below S.
     """
-    segments = samples.count * samples.interval / TUNING.segment
+    seconds = samples.count * samples.interval / TUNING.segment
     # The correction is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve seconds.
-    median = 2 * float(gammaincinv(segments / 2, 0.5))
-    return np.asarray(solution.held_out_nmse * segments / median)
+    median = 2 * float(gammaincinv(seconds / 2, 0.5))
+    return np.asarray(solution.held_out_nmse * seconds / median)
 
 
-def _few_data(samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray) -> Diagnostic:
+def _few_data(
+    samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray, comparison: Comparison | None
+) -> Diagnostic:
     """Return the warning that the logs have too little motion for the parameters of some joints.
 
-    nmse: median-unbiased nMSE of held-out segments, (n,).
+    nmse: median-unbiased nMSE of held-out blocks, (n,).
     """
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
     # The nMSE due to parameter errors is inversely proportional to the duration of the motion.
     enough = math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported)
+    ridge = "" if comparison is None else f" (nMSE {comparison.regression:.2g}, mean over joints)"
     return _warning(
         "few-data",
         "torques that were not fitted are predicted no better than by a constant at "
         f"{joints} (nMSE {np.nanmax(nmse):.2g}): "
-        f"{seconds:.2g} s of this motion do not support a fit, the values of the URDF or of a ridge regression may be "
-        f"as good; record about {enough} s in which all joints move",
+        f"{seconds:.2g} s of this motion do not support a fit, the values of the URDF or of a ridge regression{ridge} "
+        f"may be as good; record about {enough} s in which all joints move",
     )
+
+
+def _behind_regression(comparison: Comparison) -> Iterator[Diagnostic]:
+    """Yield a warning if ridge regression predicted held-out torques better than the fit from the URDF's values."""
+    regression = f"ridge regression (nMSE {comparison.regression:.2g})"
+    if comparison.replaced is not None:
+        yield _warning(
+            "fit-from-regression",
+            f"from the inertials of the URDF the fit predicts torques that were not fitted worse than {regression}: "
+            f"nMSE {comparison.replaced:.2g}. The result is a fit from the regression's values, without the URDF's "
+            f"inertials: nMSE {comparison.fit:.2g}. Check masses and centres of mass in the URDF, and their units",
+        )
+    if comparison.behind:
+        yield _warning(
+            "behind-regression",
+            f"{regression} predicts torques that were not fitted better than physically consistent bodies "
+            f"(nMSE {comparison.fit:.2g}); check the units of the torques, couplings of motors and the URDF: "
+            "`spelgen logs` tests them",
+        )
 
 
 def _trained_gains(posterior: Posterior) -> Diagnostic:

@@ -39,8 +39,8 @@ def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
     estimate = alternate(problem, state)
     if problem.adapt is not None or estimate.problem.prior.plausible or problem.compensated.all():
         return estimate
-    # So large a correction of the masses is implausible: more likely the drives compensate friction, and the masses
-    # absorbed the compensation. Refit with compensation at all joints.
+    # The fitted masses differ implausibly from the URDF (`ParameterPrior.plausible`). More likely the drives compensate
+    # friction, and the masses absorbed the compensation: refit with compensation at all joints.
     problem = replace(problem, compensated=torch.ones_like(problem.compensated))
     compensated = alternate(*_annealed_fit(problem, estimate.state.steps))
     return compensated if compensated.problem.prior.plausible else estimate
@@ -77,26 +77,36 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
 
     Friction cannot explain a torque that decreases with velocity. A drive that compensates friction after the torque
     was measured adds such a torque. The residual is regressed on velocity; the slope must be negative and significant.
-    The torque of the regression line must also be a visible part of the measured torque, since a delay of some
-    milliseconds between torque and motion causes a smaller negative slope. The drives of an arm are similar: if one of
-    them compensates friction, a negative slope of more than one standard deviation suffices for the others, whose
-    parameters may have absorbed a part of the compensation.
+    Both are first regressed on position: the torque of a spring is correlated with velocity in a motion that does not
+    return to its first position. The torque of the regression line must also be a visible part of the measured torque,
+    since a delay of some milliseconds between torque and motion causes a smaller negative slope. The drives of an arm
+    are similar: if one of them compensates friction, a negative slope of more than one standard deviation, without the
+    regression on position, suffices for the others, whose parameters may have absorbed a part of the compensation.
     """
     samples = problem.jacobian.residual_samples(x)
-    residual, estimator = samples.torque_residual, problem.noise_estimator
-    products = (residual * samples.qd).sum(dim=0)
-    slope = products / samples.qd.square().sum(dim=0).clamp(min=1e-300)
+    residual, qd, estimator = samples.torque_residual, samples.qd, problem.noise_estimator
+    first = not problem.compensated.any()
+    if first:
+        residual, qd = _without_line(residual, samples.q), _without_line(qd, samples.q)
+    products = (residual * qd).sum(dim=0)
+    slope = products / qd.square().sum(dim=0).clamp(min=1e-300)
     # `explained` is the coefficient of determination: the fraction of the squared residual that the regression line
     # explains.
     explained = slope * products / residual.square().sum(dim=0).clamp(min=1e-300)
     # `deviations` is the t statistic of the slope: the slope divided by its standard deviation.
     deviations = (explained * estimator.errors / (1 - explained)).sqrt()
     decreasing = (slope < 0) & (deviations > 1) & ~problem.compensated
-    if problem.compensated.any():
+    if not first:
         return decreasing
     amplitude = (slope * products / estimator.count).sqrt()
     visible = amplitude > TUNING.min_compensation * estimator.torque_std
     return decreasing & (deviations > TUNING.min_significance) & visible
+
+
+def _without_line(values: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+    """Return the residual of the regression of values (T, n) on a constant and the position q (T, n) of each joint."""
+    values, q = values - values.mean(dim=0), q - q.mean(dim=0)
+    return values - q * ((q * values).sum(dim=0) / q.square().sum(dim=0).clamp(min=1e-300))
 
 
 def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
@@ -131,7 +141,9 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     """
     rigid = estimate.problem.jacobian.rigid
     index = rigid.unflatten(torch.arange(len(estimate.state.x)))
-    effects = torch.stack([index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1)  # (n, effects)
+    effects = torch.stack(
+        [index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1
+    )  # (n, effects): indices in x
     plain = _without(estimate, effects.flatten())
     # penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974)
     rejected = _rejected(log_likelihood_ratio(estimate, plain) - 2)
@@ -171,7 +183,7 @@ def fraction_occam_factor(estimate: TorqueEstimate) -> torch.Tensor:
     """
     rigid = estimate.problem.jacobian.rigid
     (name,) = rigid.names("fractions")
-    fractions = rigid.unflatten(torch.arange(len(estimate.state.x)))[name]  # (n, elements)
+    fractions = rigid.unflatten(torch.arange(len(estimate.state.x)))[name]  # (n, elements): indices in x
     block = fractions.unsqueeze(-1), fractions.unsqueeze(-2)
     prior: torch.Tensor = torch.linalg.inv(estimate.problem.prior.precision)[block]
     return prior.logdet() - estimate.covariance[block].logdet()

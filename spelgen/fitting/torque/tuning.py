@@ -32,7 +32,7 @@ class TorqueTuning:
     reversal_correlation_time: float = 0.1
     # [1] Weight of `correlation_time` in the estimated correlation time, as a number of independent errors.
     correlation_weight: float = 30.0
-    # [s] Duration of the segments from which the correlation time is estimated, and which are held out for the nMSE.
+    # [s] Duration of the segments from which the correlation time is estimated.
     segment: float = 1.0
     # [1] Largest estimated prior width: masses and armatures are known to a factor of 20, torque offsets to three times
     # the typical friction. Logs that need a wider prior are not of the URDF's arm, or not in Nm.
@@ -84,7 +84,7 @@ class TorqueTuning:
     # [1] A warning names motor gains whose relative standard deviation exceeds this value: the 95 % interval is then
     # wider than +-20 %, which is the difference between two datasheets.
     undetermined_gain: float = 0.1
-    # [1] A warning names joints whose nMSE of held-out segments exceeds this value.
+    # [1] A warning names joints whose nMSE of held-out blocks exceeds this value.
     unsupported: float = 0.5
     # [1] A warning states that the URDF is wrong if the prior standard deviation of its masses exceeds this factor.
     wrong_urdf: float = 5.0
@@ -92,11 +92,11 @@ class TorqueTuning:
     # motion is then unreliable.
     weak_acceleration: float = 2.0
     # [1] Prior standard deviations of an adapted fit, for each value of the option `adapt`; the prior mean is the
-    # source fit. load: the mass is known to a factor of twenty. With a width of 10 in place of 3, a fit to half a
-    # second of motion of a UR10e has an error of 27 times the variance of the torque. friction: temperature changes
-    # the common factor of all joints by tens of per cent, the deviations of single joints by less (Bittencourt and
-    # Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: units of one arm model also differ in mass, by a
-    # few per cent.
+    # source fit. load: the mass is known to a factor of twenty. With the standard deviation 10, the mean squared torque
+    # error after a fit to half a second of motion of a UR10e is 27 times the variance of the torque. friction:
+    # temperature changes the common factor of all joints by tens of per cent, the factors of single joints by less
+    # (Bittencourt and Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: arms of one model also differ in
+    # mass, by a few per cent.
     priors: Mapping[Adaptation, GaussianPrior] = field(
         default_factory=lambda: {
             "load": GaussianPrior(bodies=3.0),
