@@ -92,7 +92,9 @@ def balance(
     with torch.no_grad():
         prepared = prepared or model.prepare()
         columns = [torch.from_numpy(x).split(_BLOCK) for x in (*samples, *bounds)]
-        blocks = [_terms(model, prepared, torch.from_numpy(point), *block) for block in zip(*columns, strict=True)]
+        blocks = [
+            _terms(model, prepared, torch.from_numpy(point), *block) for block in zip(*columns, strict=True)
+        ]
         return Balance(*(torch.cat(term).numpy() for term in zip(*blocks, strict=True)))
 
 
