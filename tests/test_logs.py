@@ -180,7 +180,7 @@ BAD = {
     ),
     "text": (
         HEADER + "0,zero,0,0\n",
-        "{}:2: row 1, column q_a: got 'zero', expected a number",
+        "{}:2: row 1, column q_a: got 'zero', expected a number; remove that row",
     ),
     "hole": (
         HEADER + "0,0,0,0\n0.1,0,,0\n0.2,0,0,nan\n",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
@@ -106,7 +107,7 @@ class Trajectory:
         """Time from the first to the last sample [s]."""
         return float(self.t[-1] - self.t[0])
 
-    @property
+    @cached_property
     def sample_rate(self) -> float:
         """Sample rate outside gaps [Hz], the inverse of the mean time step; 0 for a single sample.
 
@@ -115,7 +116,7 @@ class Trajectory:
         steps = self.regular_steps
         return float(1.0 / steps.mean()) if steps.size else 0.0
 
-    @property
+    @cached_property
     def regular_steps(self) -> np.ndarray:
         """Time steps between samples [s], gaps excluded.
 
