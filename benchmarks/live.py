@@ -24,7 +24,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from compiled_estimator import Columns, CompiledEstimator
+from compiled_estimator import Columns, CompiledEstimator, differences
 from real_logs import LOADED, OUTSIDE, TESTS, TRAINING, after, first
 from recordings import folder_of, panda_urdf
 
@@ -294,6 +294,17 @@ def changes(case: Case) -> None:
     )
 
 
+def parity(case: Case) -> None:
+    """Print the largest difference of the C estimator from the Python estimator, over all logs of an arm."""
+    estimator, largest, count = spelgen.Estimator(case.fit, levels=case.levels), 0.0, 0
+    logs = [*case.fit.logs, *case.tests, *case.others]
+    for log in logs:
+        estimator.reset()
+        found = differences(case.run(log), estimator.replay(log))
+        largest, count = max(largest, *found.values()), count + len(log)
+    print(f"\nC and Python: {largest:.1e} of the largest value, in {len(logs)} logs with {count} samples")
+
+
 def report(case: Case) -> None:
     print(f"\n== {case.name}: noise levels from {case.levels.minutes:.1f} minutes of training logs")
     if case.name == "ur10e":
@@ -305,6 +316,7 @@ def report(case: Case) -> None:
     if case.name == "ur10e":
         contacts(case, payload(2.0, np.random.default_rng(0)))
     changes(case)
+    parity(case)
 
 
 def cases(folder: Path, names: Sequence[str], runs: Path) -> list[Case]:

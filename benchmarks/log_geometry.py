@@ -1,25 +1,30 @@
 """Draw faults of the geometry of logs, and count how often `spelgen logs` names the right line.
 
     python benchmarks/log_geometry.py [--arms rpr,ur10e] [--folder ../shared/arms] [--draws 3] [--faults 12] [--first 0]
+                                      [--out runs/log_geometry.jsonl]
 
 Every draw is an arm with inertials 30 % wrong in the URDF, friction of one of five kinds, noise of 0.5 to 5 % of the
 torques, and 20 s of excitation or pick-and-place. The log is compared unchanged, and with single random faults:
 the sense of a joint's position, torque or both, an order of all columns or of the torques, a zero offset (a multiple of
-90 degrees, or any), another gravity than the settings state, and angles in revolutions or small angles in degrees.
+90 degrees, or any), another gravity than the settings state, angles in revolutions or degrees, and the motion, the
+torque or all signals of a joint logged 40 to 140 ms late or early.
 
 A fault is named if the first reading is the right one, named with others if it is among the readings that the
 message lists, and not found without a finding. It is invisible if the evidence for the right reading is below the
 threshold even with the inertials of the true arm: a vertical first axis, a wrist that is symmetric.
+
+Results are appended to a file of JSON lines; a run continues where it stopped, and the tables include all rows.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +36,11 @@ from truth import Case, Truth, record_log, wrong_urdf
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.identification.drive_hints import DriveLog
-from spelgen.identification.geometry_search import angle_scalings, compare_readings
+from spelgen.identification.geometry_search import HypothesisComparison, compare_readings, position_scalings
 from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, MotionSamples
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 OWN = ("rpr", "two_link", "scara", "six_dof", "panda", "ur10e")
@@ -44,15 +50,16 @@ OTHERS = (
 )  # fmt: skip
 KINDS = (
     "position", "torque", "position and torque", "order", "order of torques", "two torques", "zero, 90 degrees",
-    "zero, any angle", "gravity", "unit of angles",
+    "zero, any angle", "gravity", "unit of angles", "late motion", "late torque", "late joint",
 )  # fmt: skip
 SECONDS = 20.0
 NEAR = 0.2  # rad, and of the size of gravity: angles that are found within it are right
+NEAR_DELAY = 0.03  # s
 RESULTS = ("named", "with others", "invisible", "missed", "wrong")
 
 
-def draw_log(urdf: Path, number: int, folder: Path) -> tuple[Case, Arm, Arm, MotionSamples]:
-    """Return a case, the arm of its wrong URDF, the true arm, and samples of its log."""
+def draw_log(urdf: Path, number: int, folder: Path) -> tuple[Case, Arm, Arm, list[Trajectory]]:
+    """Return a case, the arm of its wrong URDF, the true arm, and its logs."""
     rng = np.random.default_rng([number, *urdf.stem.encode()])
     case = Case(
         number=number,
@@ -74,12 +81,17 @@ def draw_log(urdf: Path, number: int, folder: Path) -> tuple[Case, Arm, Arm, Mot
     if settings.exists():
         given.with_suffix(".yaml").write_bytes(settings.read_bytes())
     arm, true = load_arm(given), load_arm(urdf)
+    return case, arm, true, record_log(Truth(case, urdf, rng), case, rng)
+
+
+def samples_of(arm: Arm, logs: Sequence[Trajectory]) -> MotionSamples:
+    """Return the filtered samples of logs, as `spelgen logs` uses them."""
     collected = DriveLog(arm.chain.joint_types, arm.actuation.drives(), Preprocessing())
-    for log in record_log(Truth(case, urdf, rng), case, rng):
+    for log in logs:
         collected.add(log)
     samples = collected.samples()
     assert samples is not None
-    return case, arm, true, MotionSamples(samples.q, samples.qd, samples.qdd, samples.tau)
+    return MotionSamples(samples.around, samples.bent)
 
 
 def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
@@ -92,6 +104,9 @@ def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
     if kind == "zero, any angle":
         angle = rng.uniform(0.3, np.pi) * rng.choice([1, -1])
     offset[rng.choice(turning)] = angle
+    delay = np.zeros(n)
+    delay[rng.integers(n)] = rng.uniform(0.04, 0.14) * rng.choice([1, -1])
+    units = [x for x in position_scalings(arm, right.motion_scale) if (x.motion < 7).all()]
     pair = np.arange(n)
     first, second = rng.choice(n, 2, replace=False)
     pair[[first, second]] = second, first
@@ -109,8 +124,32 @@ def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
         "zero, 90 degrees": replace(right, offset=offset),
         "zero, any angle": replace(right, offset=offset),
         "gravity": replace(right, gravity=(x, y, z)),
-        "unit of angles": replace(right, motion_scale=angle_scalings(arm)[rng.integers(2)].motion),
+        "unit of angles": replace(right, motion_scale=units[rng.integers(2)].motion),
+        "late motion": replace(right, motion_delay=delay),
+        "late torque": replace(right, torque_delay=delay),
+        "late joint": replace(right, motion_delay=delay, torque_delay=delay),
     }[kind]
+
+
+def wrong_log(log: Trajectory, right: Hypothesis) -> Trajectory:
+    """Return the log for which a reading is right: the inverse of the reading."""
+    n = len(right.offset)
+    motion, torque = np.argsort(right.motion_source), np.argsort(right.torque_source)
+    columns = [
+        (log.q - right.offset) / right.motion_scale,
+        log.qd / right.motion_scale,
+        log.tau / right.torque_scale,
+    ]
+    delays = [right.motion_delay, right.motion_delay, right.torque_delay]
+    late = []
+    for values, delay in zip(columns, delays, strict=True):
+        late.append(np.column_stack([np.interp(log.t - delay[k], log.t, values[:, k]) for k in range(n)]))
+    return replace(log, q=late[0][:, motion], qd=late[1][:, motion], tau=late[2][:, torque])
+
+
+def compared(problem: GeometryProblem) -> HypothesisComparison:
+    """Return the readings of a log that are better than the unchanged one."""
+    return compare_readings(problem, position_scalings(problem.arm, problem.unchanged.motion_scale))
 
 
 def is_same(one: Hypothesis, other: Hypothesis) -> bool:
@@ -123,20 +162,20 @@ def is_same(one: Hypothesis, other: Hypothesis) -> bool:
         and np.allclose(one.motion_scale, other.motion_scale)
         and np.allclose(one.torque_scale, other.torque_scale)
         and np.abs(turn).max() < NEAR
+        and np.abs(one.motion_delay - other.motion_delay).max() < NEAR_DELAY
+        and np.abs(one.torque_delay - other.torque_delay).max() < NEAR_DELAY
         and np.linalg.norm(gravity) < NEAR * 9.81
     )
 
 
-def result_of(arm: Arm, true: Arm, samples: MotionSamples, kind: str, right: Hypothesis) -> str:
+def result_of(arm: Arm, true: Arm, logs: Sequence[Trajectory], kind: str, right: Hypothesis) -> str:
     """Return the result for a fault, one of `RESULTS`."""
     drives, chain, ideal = arm.actuation.drives(), arm.chain, true.chain
     if kind == "gravity":  # the log is right, and the settings state another gravity
         chain, ideal = replace(chain, gravity=right.gravity), replace(ideal, gravity=right.gravity)
         right = Hypothesis.unchanged(arm.chain)
-    wrong = right.logged(samples)
-    comparison = compare_readings(
-        GeometryProblem(chain, wrong, drives.speeds, SECONDS), angle_scalings(chain)
-    )
+    wrong = samples_of(arm, [wrong_log(log, right) for log in logs])
+    comparison = compared(GeometryProblem(chain, wrong, drives.speeds, SECONDS))
     named = [is_same(fit.hypothesis, right) for fit in comparison.better]
     if any(named):
         return "named" if named[0] else "with others"
@@ -150,48 +189,79 @@ def result_of(arm: Arm, true: Arm, samples: MotionSamples, kind: str, right: Hyp
     return "missed" if visible else "invisible"
 
 
+@dataclass(frozen=True)
+class Row:
+    """Result of one random fault, or of the clean log (kind "clean"), of one arm and log."""
+
+    arm: str
+    number: int
+    motion: str
+    noise: float
+    kind: str
+    result: str
+
+
+def rows_of(urdf: Path, number: int, faults: int) -> Iterator[Row]:
+    """Yield the results of one random log of an arm: unchanged, and with this number of single faults."""
+    with tempfile.TemporaryDirectory() as folder:
+        case, arm, true, logs = draw_log(urdf, number, Path(folder))
+    log = (urdf.stem, number, case.motion, case.noise)
+    problem = GeometryProblem(arm.chain, samples_of(arm, logs), arm.actuation.drives().speeds, SECONDS)
+    clean = compared(problem)
+    yield Row(*log, "clean", f"false: {' '.join(clean.codes)}" if clean.better else "silent")
+    rng = np.random.default_rng([number, 1])
+    for fault in range(faults):
+        kind = KINDS[(fault + number * faults) % len(KINDS)]
+        right = draw_fault(arm.chain, kind, rng)
+        if not is_same(right, Hypothesis.unchanged(arm.chain)):
+            yield Row(*log, kind, result_of(arm, true, logs, kind, right))
+
+
+def print_tables(rows: Sequence[Row]) -> None:
+    """Print the results of faults per kind and per arm, and the findings on clean logs."""
+    clean = [row for row in rows if row.kind == "clean"]
+    for row in clean:
+        if row.result != "silent":
+            print(f"clean log with a finding: {row}")
+    print(f"clean logs: {len(clean)}, with a finding: {sum(row.result != 'silent' for row in clean)}")
+    faults = [row for row in rows if row.kind != "clean"]
+    for title, group in (("fault", [x.kind for x in faults]), ("arm", [x.arm for x in faults])):
+        print(f"\n| {title} | draws | {' | '.join(RESULTS)} | named, of visible |")
+        print(f"|---|{'---|' * (2 + len(RESULTS))}")
+        for name in (*dict.fromkeys(group), "all"):
+            counts = Counter(x.result for x, of in zip(faults, group, strict=True) if name in (of, "all"))
+            visible = counts.total() - counts["invisible"]
+            named = counts["named"] + counts["with others"]
+            cells = [name, counts.total(), *map(counts.get, RESULTS), f"{named / max(visible, 1):.1%}"]
+            print(f"| {' | '.join(str(x or 0) for x in cells)} |")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Draw, compare, and print the tables by kind and by arm."""
+    """Draw, compare, append the results to the file, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--arms", default=",".join(OWN + OTHERS))
     parser.add_argument("--folder", type=Path, default=Path("../shared/arms"))
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--faults", type=int, default=12)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("runs/log_geometry.jsonl"))
     options = parser.parse_args(arguments)
-    by_kind: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
-    clean: Counter[str] = Counter()
-    for name in options.arms.split(","):
-        urdf = (ROBOTS if name in OWN else options.folder) / f"{name}.urdf"
-        if not urdf.exists():
-            print(f"left out: no {urdf}")
-            continue
-        by_arm: Counter[str] = Counter()
-        for number in range(options.first, options.first + options.draws):
-            with tempfile.TemporaryDirectory() as folder:
-                case, arm, true, samples = draw_log(urdf, number, Path(folder))
-            unchanged = compare_readings(
-                GeometryProblem(arm.chain, samples, arm.actuation.drives().speeds, SECONDS),
-                angle_scalings(arm.chain),
-            )
-            clean["false" if unchanged.better else "silent"] += 1
-            rng = np.random.default_rng([number, 1])
-            for fault in range(options.faults):
-                kind = KINDS[(fault + number) % len(KINDS)]
-                right = draw_fault(arm.chain, kind, rng)
-                if is_same(right, Hypothesis.unchanged(arm.chain)):
-                    continue
-                result = result_of(arm, true, samples, kind, right)
-                by_kind[kind][result] += 1
-                by_arm[result] += 1
-                if result in ("missed", "wrong"):
-                    print(f"  {name} {number} {case.motion} noise {case.noise}: {kind} {result}", flush=True)
-        print(f"{name}: {dict(by_arm)}", flush=True)
-    print(f"clean logs: {dict(clean)}")
-    print(f"| fault | draws | {' | '.join(RESULTS)} |")
-    print(f"|---|{'---|' * (1 + len(RESULTS))}")
-    for kind, counts in by_kind.items():
-        print(f"| {kind} | {counts.total()} | {' | '.join(str(counts[x]) for x in RESULTS)} |")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    lines = options.out.read_text().splitlines() if options.out.exists() else []
+    rows = [Row(**json.loads(line)) for line in lines]
+    present = {(row.arm, row.number) for row in rows}
+    # a log of each arm before the next log of any arm, so that an interrupted run covers all arms
+    for number in range(options.first, options.first + options.draws):
+        for name in options.arms.split(","):
+            urdf = (ROBOTS if name in OWN else options.folder) / f"{name}.urdf"
+            if (name, number) in present or not urdf.exists():
+                continue
+            new = list(rows_of(urdf, number, options.faults))
+            with options.out.open("a") as file:
+                file.writelines(f"{json.dumps(asdict(row))}\n" for row in new)
+            rows += new
+            print(name, number, dict(Counter(row.result for row in new)), flush=True)
+    print_tables(rows)
 
 
 if __name__ == "__main__":

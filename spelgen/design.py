@@ -31,10 +31,12 @@ PRESETS = Path(__file__).parent / "presets"
 class Design:
     """The form of each quantity of the equations of motion.
 
-    Values of the fields: ``derived`` is a quantity with the structure of the arm. ``dense`` is a quantity without
-    knowledge of the arm (Wang et al., Sci Rep 15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024); its suffix
-    ``3n`` means all three axes of each joint. ``closed-form`` means rigid bodies with trained inertial parameters, and
-    networks for residual terms, if any. ``constants`` is a friction model with trained constants.
+    Values of the fields: ``derived``: zeros, constants and dependences of the quantity follow from the structure of the
+    arm, and networks learn only the remaining functions. ``dense``: a network learns the whole quantity without
+    knowledge of the arm (Wang et al., Sci Rep 15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024); with the
+    suffix ``3n``, the quantity has three rows per joint, one for each axis of its frame. ``closed-form``: rigid bodies
+    with trained inertial parameters, and networks for residual terms, if any. ``constants``: a friction model with
+    trained constants.
 
     Raises SettingsError for an inconsistent combination.
     """

@@ -27,7 +27,7 @@ class SpelgenError(Exception):
     do: str | None = None
 
     def __post_init__(self) -> None:
-        # Python constructs the copy of an exception from `args`; Ray copies an error of a worker in this way.
+        # `args` gets only `got`: an exception is copied, by Ray for example, by a call of its class with `args`.
         super().__init__(self.got)
         # Callers give the file as text or as a path. `SpelgenErrors` compares the files of errors, so both become text.
         self.file = None if self.file is None else str(self.file)

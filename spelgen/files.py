@@ -128,7 +128,7 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the name of this file to an OSError without a file name, such as the error of a full disk."""
+    """Add `path` to an OSError without a file name that is raised within the context, as by a full disk."""
     try:
         yield
     except OSError as error:
@@ -171,7 +171,7 @@ def local(path: Path | str) -> Path:
     match = ADDRESS.match(str(path))
     if match is None or Path(path).exists():
         return Path(path)
-    if match[1] == "file":  # `Path` has reduced its slashes
+    if match[1] == "file":  # `Path` changes file:///x to file:/x
         return Path("/" + str(path)[match.end() :])
     address = f"{match[1]}://{str(path)[match.end() :]}".rstrip("/")
     if address not in _copies:
@@ -180,7 +180,10 @@ def local(path: Path | str) -> Path:
 
 
 def sent(path: Path) -> None:
-    """Copy a written local file to its address, or remove the file at the address if the local file was removed."""
+    """Copy a local file to the address of which it is a copy; remove the file there if the local file was removed.
+
+    A file that is no copy of an address is not sent.
+    """
     target = address_of(path)
     if target is None:
         return

@@ -29,8 +29,8 @@ UNITS = {"revolute": Units("rad", "rad/s", "Nm", "kg m²"), "prismatic": Units("
 
 INERTIAL_PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """Inertial parameters of a body: mass, first moment, and inertia tensor about the origin of the joint's frame."""
-# The first parameter of a group of regrouped parameters names the group. Iyy, hz and m come last, because those
-# parameters of a body with a revolute joint can always be regrouped into others.
+# A base parameter has the name of the first of these parameters in its sum. Iyy, hz and m are last, because for a
+# revolute joint they can always be regrouped into other parameters.
 BASE_ORDER = ("Izz", "Ixx", "Ixy", "Ixz", "Iyz", "hx", "hy", "m", "Iyy", "hz")
 
 

@@ -12,7 +12,7 @@ from typing import Literal
 WIDTH = 80
 MIN_NAME = 8
 """Smallest width of the first column [characters], to which names of rows are wrapped if a table is too wide."""
-SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s\))")  # places at which a name may be wrapped
+SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s[)\]])")  # places at which a name may be wrapped
 
 
 @dataclass(frozen=True)
@@ -124,9 +124,18 @@ def number(value: float | None) -> str:
     # Integers are counts, of samples for example: rounding would hide a lost sample.
     if isinstance(value, int):
         return f"{value:,}"
-    # Plain decimals in the range in which three digits need no exponent.
+    # Numbers from 0.001 to 1,000 are written without an exponent.
     if value == 0 or 1e-3 <= abs(value) < 1e3:
         return f"{value:.3g}"
     if 1e3 <= abs(value) < 1e6:
         return f"{value:.0f}"
     return f"{value:.2e}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time such as `40 s`, `2.5 min` or `3.5 h`."""
+    # Times are rounded to three digits, since repeated trainings differ by more.
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"

@@ -109,7 +109,7 @@ class ServoSpec:
 
 @dataclass(frozen=True)
 class OutputSpec:
-    """A learned function f(q) = mean + scale x network of ``joints``; its contribution to M is f times ``basis``."""
+    """A learned function f(q) = mean + scale * network(q of ``joints``); its contribution to M is f times ``basis``."""
 
     joints: tuple[int, ...]
     basis: Entries
@@ -119,7 +119,10 @@ class OutputSpec:
 
 @dataclass(frozen=True)
 class ConstantSpec:
-    """A trained constant in units of ``scale``; its contribution to M is the constant times ``basis``."""
+    """A trained constant with the initial value ``start``; its contribution to M is the constant times ``basis``.
+
+    The trained parameter is the constant divided by ``scale``.
+    """
 
     basis: Entries
     start: float

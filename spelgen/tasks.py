@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from importlib.util import find_spec
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from spelgen.errors import RunError
 
@@ -17,46 +17,52 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-class RunTasks(Protocol):
-    """Function that runs tasks; see `workers`."""
-
-    def __call__(
-        self, work: Callable[[Task], Result], tasks: Sequence[Task]
-    ) -> Iterator[tuple[Task, Result | Exception]]:
-        """Yield each task with its result or its exception, in the order in which the tasks end."""
-        ...
-
-
 def default_jobs() -> int:
     """Return the number of cores that this process may use if Ray is installed, else 1."""
     # The CPU affinity is counted, because a container or a scheduled job may have fewer cores than the machine.
     return 1 if find_spec("ray") is None else len(os.sched_getaffinity(0))
 
 
-def run_here(
-    work: Callable[[Task], Result], tasks: Sequence[Task]
+def run_tasks(
+    work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int = 1, address: str | None = None
 ) -> Iterator[tuple[Task, Result | Exception]]:
-    """Run one task after the other in this process; yield each task with its result or its exception."""
-    # An exception is yielded, not raised, so that a failed task does not stop the others.
-    for task in tasks:
-        try:
-            outcome: Result | Exception = work(task)
-        except Exception as error:
-            outcome = error
-        yield task, outcome
+    """Yield each task with its result or its exception, in the order in which the tasks end.
 
+    A single job at a time runs in this process, without Ray. Raises RunError if Ray is not installed, or if no cluster
+    answers.
 
-@contextmanager
-def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
-    """Yield a function that runs tasks: `jobs` at a time with Ray on this machine, or on a cluster.
-
-    A single job at a time runs in this process, without Ray. address: address of a running Ray cluster; "auto" for the
-    cluster of this machine. Raises RunError if Ray is not installed, or if no cluster answers.
+    Args:
+        work: Function of a task. With Ray, it must be able to run again, because its worker may die.
+        tasks: The tasks, of one core each.
+        jobs: Number of parallel tasks on this machine.
+        address: Address of a running Ray cluster; "auto" for the cluster of this machine.
     """
     # One job runs in this process: it needs no second interpreter, and errors keep their traceback.
     if jobs == 1 and address is None:
-        yield run_here
+        for task in tasks:
+            # An exception is yielded, not raised, so that a failed task does not stop the others.
+            try:
+                outcome: Result | Exception = work(task)
+            except Exception as error:
+                outcome = error
+            yield task, outcome
         return
+    with _ray(jobs, address) as ray:
+        remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_work_or_die)
+        waiting = {remote.remote(work, task): task for task in tasks}
+        try:
+            # Results are yielded as tasks end, so that the caller can store each one before a later task fails.
+            while waiting:
+                (reference,), _ = ray.wait(list(waiting), num_returns=1)
+                yield waiting.pop(reference), _outcome(reference)
+        finally:
+            for reference in waiting:
+                ray.cancel(reference, force=True)
+
+
+@contextmanager
+def _ray(jobs: int, address: str | None) -> Iterator[Any]:
+    """Start Ray on this machine, or connect to a cluster, within a context. Yield the module `ray`."""
     if find_spec("ray") is None:
         do = "pip install 'spelgen[parallel]', or --jobs 1"
         raise RunError("several runs at a time without Ray", expected="the extra parallel", do=do)
@@ -80,27 +86,9 @@ def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
     try:
         # Ray prints messages about dead workers to stdout, which must contain results only.
         with redirect_stdout(sys.stderr):
-            yield _run_on_ray
+            yield ray
     finally:
         ray.shutdown()
-
-
-def _run_on_ray(
-    work: Callable[[Task], Result], tasks: Sequence[Task]
-) -> Iterator[tuple[Task, Result | Exception]]:
-    """Run tasks of one core each. A task must be able to run again, because its worker may die."""
-    import ray
-
-    remote: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_work_or_die)
-    waiting = {remote.remote(work, task): task for task in tasks}
-    try:
-        # Results are yielded as tasks end, so that the caller can store each one before a later task fails.
-        while waiting:
-            (reference,), _ = ray.wait(list(waiting), num_returns=1)
-            yield waiting.pop(reference), _outcome(reference)
-    finally:
-        for reference in waiting:
-            ray.cancel(reference, force=True)
 
 
 def _work_or_die(work: Callable[[Task], Result], task: Task) -> Result:

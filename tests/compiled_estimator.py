@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import shutil
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -17,8 +19,10 @@ from spelgen.exporting.c_export import compile_library
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.describe import describe
 from spelgen.exporting.description import ENTRY_POINTS
+from spelgen.live.estimator import EstimatorState
 from spelgen.live.intake import REFUSALS
 from spelgen.live.noise import BlockNoise, NoiseLevels
+from spelgen.live.payload import Status
 
 
 def nominal_levels(
@@ -29,9 +33,9 @@ def nominal_levels(
     white = noise_ratio * effort
     noise = BlockNoise(white=white, disturbance=1.5 * white, time_constant=0.7 * ones)
     return NoiseLevels(
-        drift=noise, load=noise, observer=white, peak_start=2.5 * ones, peak_scale=0.7 * ones, load_variance=2.25,
-        load_freedom=20, resting=0.6 * coulomb, resting_speed=0.01 * speed, speed=speed, encoder=0 * ones,
-        effort=effort, minutes=2.0, point=np.array([0.0, 0.0, 0.1]),
+        drift=noise, load=noise, observer=white, peak_start=2.5 * ones, peak_scale=0.7 * ones, peak_count=40,
+        load_variance=2.25, load_freedom=20, resting=0.6 * coulomb, resting_speed=0.01 * speed, speed=speed,
+        encoder=0 * ones, effort=effort, minutes=2.0, point=np.array([0.0, 0.0, 0.1]),
     )  # fmt: skip
 
 
@@ -123,6 +127,28 @@ class Columns:
     step_seconds: np.ndarray
     report_seconds: np.ndarray
     moved: np.ndarray
+
+
+def differences(found: Columns, states: Sequence[EstimatorState]) -> dict[str, float]:
+    """Return the largest differences from the Python estimator, relative to the largest value of each quantity.
+
+    Quantities without a scale (status, refusal, change of load) differ by 1 if any sample differs.
+    """
+    result = {}
+    for name in ("external_torque", "threshold", "force", "friction_scale", "disturbance"):
+        expected = np.array([getattr(state, name, getattr(state.contact, name, None)) for state in states])
+        size = np.abs(found.external_torque if name == "disturbance" else expected).max()
+        result[name] = float(np.abs(getattr(found, name) - expected).max() / (size or 1.0))
+    for name in ("mass", "mass_interval", "center", "parameters", "log_odds"):
+        expected = np.array([getattr(state.payload, name) for state in states])
+        size = np.abs(expected).max()
+        result[name] = float(np.abs(getattr(found, name) - expected).max() / (size or 1.0))
+    statuses, refusals = get_args(Status), [REFUSALS.index(state.refusal) for state in states]
+    result["status"] = float(
+        (found.status != [statuses.index(state.payload.status) for state in states]).any()
+    )
+    result["changed"] = float((found.changed != [state.load_changed for state in states]).any())
+    return result | {"refusal": float((found.refusal != refusals).any())}
 
 
 class CompiledEstimator:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import spelgen
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import accurate_solver, roll_out_stiff
-from spelgen.baselines.registry import EvaluatedArm, UrdfValues
+from spelgen.baselines.registry import EvaluatedArm, urdf_values
 from spelgen.cli.main import app
 from spelgen.dynamics.bristles import moved_bristles
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics, regressor, urdf_parameters
@@ -131,7 +131,7 @@ def test_the_urdf_is_a_baseline_without_and_with_drives(robots):
     names = [coordinate.name for coordinate in arm.chain.coordinates]
     q = torch.zeros(1, 4, 3, dtype=torch.float64)
     probe = Windows(torch.full((1, 3), 0.05, dtype=torch.float64), q, q, q[:, :3])
-    plain, driven = UrdfValues().predictors(EvaluatedArm(names, arm.robot.path, {}, None, probe, []))
+    plain, driven = urdf_values(EvaluatedArm(names, arm.robot.path, {}, None, probe, []))
     assert (plain.name, driven.name) == (URDF, URDF_WITH_DRIVES)
     at = torch.full((1, 3), 0.3, dtype=torch.float64)
     rotors = [arm.settings.joint(name) for name in names]

@@ -461,7 +461,7 @@ def test_of_many_trajectories_an_even_part_is_filtered(monkeypatch):
         q = np.sin(t)[:, None] + 10.0 * number
         collected.add(Trajectory(t, q, np.cos(t)[:, None], q, str(number)))
     assert len(filtered) < 50
-    steps = np.diff(np.unique(collected.samples().q.round(-1)))
+    steps = np.diff(np.unique(collected.samples().motion[0].round(-1)))
     assert steps.max() <= 1.5 * steps.min()
 
 

@@ -123,6 +123,32 @@ def test_inspect_writes_a_file(spelgen, robots, tmp_path):
     assert (tmp_path / "deep" / "er.txt").read_text(encoding="utf-8") == shown
 
 
+@pytest.mark.parametrize(
+    ("command", "forms"),
+    [
+        ("inspect {urdf} -o page.pdf", ".txt, .json, .html, .tex, .py"),
+        ("report run -o page.pdf", ".json, .html"),
+        ("report run other -o page.json", ".html"),
+        ("estimate run --data logs -o page.txt", ".html"),
+    ],
+)
+def test_a_suffix_without_a_format_is_one_error_that_names_the_forms(spelgen, robots, command, forms):
+    result = spelgen(*command.format(urdf=robots / "rpr.urdf").split())
+    name = command.split()[-1]
+    expected = f"Invalid value for '--output': '{name}' has no suffix of a format of this command: {forms}"
+    assert result.exit_code == 2
+    assert expected in " ".join(result.stderr.replace("│", " ").split())
+
+
+def test_a_run_to_resume_that_does_not_exist_is_named_as_it_was_given(spelgen):
+    result = spelgen("train", "mine", "--resume", "--data", "logs")
+    assert result.exit_code == 1
+    assert result.stderr == (
+        "--resume: no run: mine is no folder, and there is no runs/mine, the default folder of this module; name the "
+        "run folder, or pass it by -o\n"
+    )
+
+
 def test_strict_fails_on_a_warning_only(spelgen, robots, tmp_path):
     assert spelgen("inspect", robots / "rpr.urdf", "--strict").exit_code == 0
     text = (robots / "rpr.urdf").read_text(encoding="utf-8")

@@ -24,8 +24,8 @@ from spelgen.baselines.registry import hold_velocity
 from spelgen.cli.main import app
 from spelgen.comparison import jobs
 from spelgen.comparison.arms import ComparedArm, Comparison, ablation_designs, arm_inputs, load_comparison
-from spelgen.comparison.figures import PredictionLoss, predict_example, spread_windows
-from spelgen.comparison.study import duration, prepare_study, run_study
+from spelgen.comparison.figures import predict_example, spread_windows
+from spelgen.comparison.study import prepare_study, run_study
 from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, comparison_sentence
 from spelgen.design import load_design
 from spelgen.emission.build import build
@@ -35,11 +35,11 @@ from spelgen.evaluation.rollout import mass_error, true_mass
 from spelgen.evaluation.tuning import EvaluationTuning
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.rollout import roll_out
+from spelgen.listing import duration
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison
 from spelgen.simulation.simulate import simulate
-from spelgen.tasks import run_here, workers
 from spelgen.urdf.read import read_urdf
 
 PRESETS = ("phnode", "hybrid")
@@ -87,7 +87,7 @@ def notes():
 def study(robot, quick, notes, tmp_path_factory):
     prepared = prepare_study(simulated(robot), tmp_path_factory.mktemp("study"))
     notes.append(prepared.announcement(1))
-    return run_study(prepared, run_here, notes.append)
+    return run_study(prepared, notes.append)
 
 
 @pytest.fixture
@@ -148,21 +148,26 @@ def test_an_estimate_uses_the_time_of_finished_runs_of_the_same_preset(study, ro
 def test_figures_of_a_run_agree_with_one_another(results):
     assert set(results) == set(PRESETS)
     for result in results.values():
-        loss = result.simulated.prediction
-        assert loss.loss == pytest.approx(loss.position + loss.velocity)
-        assert result.errors == {"prediction loss, 1 s": {"model": loss.loss}}
-        assert result.simulated.invariants.least_eigenvalue > 0
-    assert results["hybrid"].simulated.sizes.outputs == (1, 2, 0, 1)
+        losses, sizes = result.simulated.losses, result.simulated.sizes
+        loss = losses["prediction loss, 1 s"]
+        assert loss == pytest.approx(losses["position, 1 s"] + losses["velocity, 1 s"])
+        assert result.errors == {"prediction loss, 1 s": {"model": loss}}
+        assert sizes["smallest eigenvalue of M / mean"] > 0
+    labels = [f"outputs of {matrix}" for matrix in "MDGV"]
+    assert [results["hybrid"].simulated.sizes[label] for label in labels] == [1, 2, 0, 1]
     # as in the paper
-    assert results["phnode"].simulated.sizes.outputs == (21, 21, 6, 1)
-    assert results["phnode"].simulated.sizes.inputs == 4
+    sizes = results["phnode"].simulated.sizes
+    assert [sizes[label] for label in labels] == [21, 21, 6, 1]
+    assert sizes["inputs of M"] == 4
 
 
 def test_losses_are_the_mean_squared_errors_of_rollouts_from_the_logs(study, results):
     """Recomputed from the logs of each role: sums over joints, means over samples and windows."""
     job = next(job for job in study.jobs if job.preset == "hybrid")
-    model, figures = trained(job), results["hybrid"].simulated
-    for key, role, samples in (("train", "train", 5), ("test", "test", 5), ("prediction", "test", 21)):
+    model, losses = trained(job), results["hybrid"].simulated.losses
+    for key, role, samples in (
+        ("training loss", "train", 5), ("test loss", "test", 5), ("prediction loss, 1 s", "test", 21),
+    ):  # fmt: skip
         cut = [
             log[start : start + samples]
             for log in read_logs(job.inputs.data, JOINTS, role=role)
@@ -175,9 +180,10 @@ def test_losses_are_the_mean_squared_errors_of_rollouts_from_the_logs(study, res
         q, qd = (np.stack([getattr(each, name)[1:] for each in cut]) for name in ("q", "qd"))
         difference = (predicted[0] - q + np.pi) % (2 * np.pi) - np.pi
         position, velocity = (x.sum(axis=-1).mean() for x in (difference**2, (predicted[1] - qd) ** 2))
-        assert getattr(figures, key).position == pytest.approx(position, rel=1e-9), key
-        assert getattr(figures, key).velocity == pytest.approx(velocity, rel=1e-9), key
-    assert figures.train != figures.test
+        assert losses[key] == pytest.approx(position + velocity, rel=1e-9), key
+    assert losses["position, 1 s"] == pytest.approx(position, rel=1e-9)
+    assert losses["velocity, 1 s"] == pytest.approx(velocity, rel=1e-9)
+    assert losses["training loss"] != losses["test loss"]
 
 
 def test_only_the_run_without_a_result_is_run_again_and_gives_the_same_figures(study, robot):
@@ -186,11 +192,11 @@ def test_only_the_run_without_a_result_is_run_again_and_gives_the_same_figures(s
     lost.unlink()
     again = prepare_study(simulated(robot), study.folder)
     assert list(again.results) == [study.jobs[1].name]
-    run_study(again, run_here, silent)
+    run_study(again, silent)
     assert kept.stat().st_mtime_ns == before[1]
     first, second = (json.loads(x) for x in (before[0], lost.read_text()))
     for result in (first, second):
-        del result["simulated"]["step_seconds"]
+        del result["simulated"]["sizes"]["training step [ms]"]
     assert first["simulated"] == second["simulated"]
 
 
@@ -220,16 +226,16 @@ def test_tables_have_published_figures_and_ratios_to_the_baseline(study, results
     (section,) = arm_sections(study)
     rows = {row.label: list(map(row.text, table.columns)) for table in section.tables for row in table.rows}
     assert rows["outputs of M"] == ["21", "1"]
-    assert rows["parameters"] == [f"{result.simulated.sizes.parameters:,}" for result in results.values()]
+    assert rows["parameters"] == [f"{result.simulated.sizes['parameters']:,}" for result in results.values()]
     assert rows["published: prediction loss"] == ["0.194", ""]
-    base, ours = (result.simulated.prediction.loss for result in results.values())
+    base, ours = (result.simulated.losses["prediction loss, 1 s"] for result in results.values())
     assert rows["phnode's prediction loss / this"] == ["1", f"{base / ours:.3g}"]
     lines = [line for table in section.tables for line in table.text().splitlines()]
     assert all(line == line.rstrip() and len(line) <= 80 for line in lines)
 
 
 def test_the_sentence_has_the_best_model_and_the_ratios_of_the_others(study, results):
-    base, ours = (result.simulated.prediction.loss for result in results.values())
+    base, ours = (result.simulated.losses["prediction loss, 1 s"] for result in results.values())
     ratio = f"{base / ours:.3g} times smaller than with phnode" if ours < base else "than with hybrid"
     (section,) = arm_sections(study)
     assert section.sentence.startswith(
@@ -290,7 +296,8 @@ def test_the_page_shows_predictions_and_m_with_the_true_m(study, results):
 
 def test_a_run_that_is_not_finite_counts_as_infinitely_bad(results):
     result = results["hybrid"]
-    figures = replace(result.simulated, prediction=PredictionLoss(None, None, None))
+    losses = dict.fromkeys(result.simulated.losses)
+    figures = replace(result.simulated, losses=losses)
     broken = replace(result, seed=1, simulated=figures, errors={"prediction loss, 1 s": {"model": None}})
     table = arm_tables([result, broken, broken], {})[0]
     assert {row.label: row.text("hybrid") for row in table.rows}["prediction loss, 1 s"] == "-"
@@ -316,13 +323,16 @@ def test_invariants_show_a_model_that_gains_energy_or_has_an_indefinite_mass_mat
     still = spread_windows(logs, 21, 1)
     windows = replace(still, qd=0.5 + still.qd)
     low, high = (torch.full((2,), bound, dtype=torch.float64) for bound in (-math.pi, math.pi))
-    kept = rollout.invariants(model, windows, low, high)
-    assert kept.energy_rise <= 1e-12 < kept.least_eigenvalue
+    with torch.no_grad():
+        assert rollout.energy_rise(model, windows) <= 1e-12
+        assert rollout.smallest_eigenvalue(model, low, high) > 1e-12
     # drives instead of braking
     model.friction_torque = lambda pose, qd, *state: -5.0 * qd
-    assert rollout.invariants(model, windows, low, high).energy_rise > 1e-3
+    with torch.no_grad():
+        assert rollout.energy_rise(model, windows) > 1e-3
     model.mass_matrix = lambda q: torch.diag_embed(torch.cat([q.cos()[..., :1], 1 + 0 * q[..., :1]], dim=-1))
-    assert rollout.invariants(model, windows, low, high).least_eigenvalue < -1
+    with torch.no_grad():
+        assert rollout.smallest_eigenvalue(model, low, high) < -1
 
 
 @pytest.fixture(scope="module")
@@ -349,8 +359,8 @@ def listed_arms(robots, logs, tmp_path, short_epochs):
     return loaded
 
 
-def compared(comparison, folder, run_tasks=run_here):
-    return run_study(prepare_study(comparison, folder), run_tasks, silent)
+def compared(comparison, folder, jobs=1):
+    return run_study(prepare_study(comparison, folder), silent, jobs)
 
 
 def kill_two(folder: Path, killed: list[int]) -> None:
@@ -378,8 +388,7 @@ def test_runs_of_killed_workers_are_resumed_and_end_with_the_same_weights(listed
     comparison = listed_arms(training={"epochs": 12, "patience": 12, "momentum_steps": 0})
     killer = threading.Thread(target=kill_two, args=(folder, killed))
     killer.start()
-    with workers(2) as run_tasks:
-        study = compared(comparison, folder, run_tasks)
+    study = compared(comparison, folder, jobs=2)
     killer.join()
     assert len(set(killed)) == 2
     assert sorted(result.arm for result in study.results.values()) == ["a", "b"]

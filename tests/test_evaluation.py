@@ -267,9 +267,9 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
     for role, seed in (("train", 0), ("test", 1)):
         logs = motions(dynamics, count=2, samples=130, rate=100.0, seed=seed)
         write_logs(cart.parent / "logs" / f"{role}.parquet", logs, names)
-    config, unfiltered = Rollout(epochs=1, momentum_steps=0), Preprocessing(cutoff=0.0)
+    config = Rollout(epochs=1, momentum_steps=0)
     logs = [cart.parent / "logs"]
-    train(module, logs, cart.parent / "run", config, preprocessing=unfiltered)
+    train(module, logs, cart.parent / "run", config, of_logs={"cutoff": 0.0})
     result = evaluated(cart.parent / "run", logs[0])
     for horizon in result.horizons:
         assert horizon.errors["URDF"].mean_relative_rms < 1e-4

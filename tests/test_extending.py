@@ -15,7 +15,6 @@ from spelgen import design
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines import registry
 from spelgen.baselines.predictor import Predictor
-from spelgen.baselines.registry import Baseline
 from spelgen.emission import specify
 from spelgen.emission.assemble import load_module
 from spelgen.errors import RunError
@@ -89,16 +88,15 @@ def test_a_log_format(tmp_path, monkeypatch, log):
 def test_a_baseline(robots, monkeypatch, log):
     assert stands_in("a baseline", registry)
 
-    class StandsStill(Baseline):
-        def predictors(self, arm):
-            def still(windows):
-                later = windows.dt.shape[1]
-                q = windows.q[:, :1].expand(-1, later, -1)
-                return q, 0 * q
+    def still(windows):
+        later = windows.dt.shape[1]
+        q = windows.q[:, :1].expand(-1, later, -1)
+        return q, 0 * q
 
-            return [Predictor("stands still", still)]
+    def stands_still(arm):
+        return [Predictor("stands still", still)]
 
-    monkeypatch.setattr(registry, "BASELINES", (*registry.BASELINES, StandsStill()))
+    monkeypatch.setattr(registry, "BASELINES", (*registry.BASELINES, stands_still))
     results = spelgen.evaluate(spelgen.build(load_arm(robots / "two_link.urdf"), "spel", width=4), log)
     error = results.horizons[-1].errors["stands still"].mean_relative_rms
     assert error == pytest.approx(1, rel=0.2)  # 1: as if the arm had stood still

@@ -34,6 +34,12 @@ def test_columns_are_aligned_and_names_folded_at_their_separators():
     assert max(map(len, lines)) <= WIDTH
 
 
+def test_units_of_velocities_are_not_wrapped():
+    wide = Listing("", ("", *"abcdef"), (("joint2 [m/s]", *["12345.6789"] * 6), ("j [rad/s]", *["1"] * 6)))
+    words = wide.text().split()
+    assert "[m/s]" in words and "[rad/s]" in words
+
+
 def test_numbers_are_never_shortened():
     wide = Listing("", ("joint", *"abcdefghij"), (("x", *["123456789.012"] * 10),))
     assert wide.text().count("123456789.012") == 10

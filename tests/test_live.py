@@ -21,7 +21,7 @@ from spelgen.errors import RunError
 from spelgen.fitting.fitted import load_run
 from spelgen.live.estimator import Estimator
 from spelgen.live.filters import Block
-from spelgen.live.levels import block_noise
+from spelgen.live.levels import block_noise, held_out_tail
 from spelgen.live.momentum import balance, load_terms
 from spelgen.live.payload import find_payload
 from spelgen.live.tuning import TUNING
@@ -363,6 +363,33 @@ def test_noise_levels_are_those_of_the_residuals():
     assert abs(found.disturbance[0] - 0.6) < 0.12
     assert found.disturbance[1] < 0.3
     assert 0.4 <= found.time_constant[0] <= 1.6
+
+
+@pytest.mark.parametrize("minutes", [0.2, 2.0])
+def test_thresholds_keep_the_rate_of_alarms_after_short_logs(levels, minutes):
+    """Alarms of 300 arms whose peaks are exponential, for thresholds from one log each."""
+    random, windows = np.random.default_rng(0), round(60 * minutes / TUNING.window)
+    alarms = []
+    for _ in range(300):
+        third = np.array_split(random.exponential(size=(windows, 6)), 3)
+        tail = held_out_tail([1.0 + peaks for peaks in third], levels)
+        thresholds = levels.model_copy(update=tail).thresholds(1.0)
+        # probability of a peak above its threshold, times the number of peaks per minute
+        alarms.append(60 / TUNING.window * np.exp(-(thresholds - 1.0)).sum())
+    assert np.mean(alarms) < 1.0
+    # not by thresholds that nothing reaches: without errors in the estimates they would be log(720) + 1 = 7.6
+    assert np.median(thresholds) < 25.0
+
+
+def test_thresholds_hold_in_a_log_that_differs(levels):
+    """One log of three has residuals that are twice as large; a further log is like it."""
+    random = np.random.default_rng(1)
+    logs = [1.0 + random.exponential(size=(100, 6)) for _ in range(4)]
+    found = levels.model_copy(update=held_out_tail([logs[0], logs[1], 2 * logs[2]], levels))
+    # 50 s: at most one alarm
+    assert ((2 * logs[3] > found.thresholds(1.0)).any(axis=1)).sum() <= 1
+    alike = levels.model_copy(update=held_out_tail(logs[:3], levels))
+    assert ((2 * logs[3] > alike.thresholds(1.0)).any(axis=1)).sum() > 3
 
 
 def test_models_that_it_cannot_use_are_refused(arm, levels, tmp_path):

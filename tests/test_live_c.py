@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from compiled_estimator import Columns, CompiledEstimator, nominal_levels
+from compiled_estimator import Columns, CompiledEstimator, differences, nominal_levels
 from exported_runs import COUPLED, MOTORS, moved_model, saved_run
 from motions import smooth_motion
 
@@ -16,7 +16,6 @@ from spelgen.emission.build import build
 from spelgen.exporting.export import export
 from spelgen.fitting.fitted import load_run
 from spelgen.live.estimator import Estimator, EstimatorState
-from spelgen.live.intake import REFUSALS
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 
@@ -26,7 +25,6 @@ SHARED = Path(__file__).parents[1] / ".." / "shared"
 RECORDED = ("ur10e", "panda", "shanghai", "xmate3", "ar5", "airbot", "tx40")
 """Arms with measured torques: logs of position commands have no estimator."""
 SAMPLES = 2800
-STATUSES = {"not yet": 0, "no payload": 1, "payload": 2}
 
 
 def randomised(urdf, preset="hybrid"):
@@ -46,25 +44,8 @@ def levels_of(model, log, noise_ratio=2e-3):
 
 
 def require_equal(found: Columns, states: list[EstimatorState], tolerance: float) -> None:
-    pairs = {
-        "external_torque": [state.contact.external_torque for state in states],
-        "threshold": [state.contact.threshold for state in states],
-        "force": [state.contact.force for state in states],
-        "friction_scale": [state.friction_scale for state in states],
-        "disturbance": [state.disturbance for state in states],
-        "mass": [state.payload.mass for state in states],
-        "mass_interval": [state.payload.mass_interval for state in states],
-        "center": [state.payload.center for state in states],
-        "parameters": [state.payload.parameters for state in states],
-        "log_odds": [state.payload.log_odds for state in states],
-    }
-    for name, expected in pairs.items():
-        values, expected = getattr(found, name), np.array(expected)
-        size = np.abs(found.external_torque if name == "disturbance" else expected).max()
-        assert np.abs(values - expected).max() <= tolerance * size, name
-    np.testing.assert_array_equal(found.status, [STATUSES[state.payload.status] for state in states])
-    np.testing.assert_array_equal(found.changed, [state.load_changed for state in states])
-    np.testing.assert_array_equal(found.refusal, [REFUSALS.index(state.refusal) for state in states])
+    for name, difference in differences(found, states).items():
+        assert difference <= tolerance, name
 
 
 def segments(files: list[Path], arm: Arm) -> Trajectory:

@@ -1,6 +1,7 @@
 """Each log format and each naming of columns gives the same trajectories, or one clear error."""
 
 import csv
+import datetime as dt
 import os
 import re
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv
 import pyarrow.parquet
 import pytest
 import yaml
@@ -276,7 +278,8 @@ NPZ = {
     ),
     "short": (
         {"t": T, "q": Q[:3], "qd": QD, "tau": TAU},
-        "{}: array q: got an array of shape (3, 2), expected a value for each of the 4 times",
+        "{}: array q: got an array of shape (3, 2), expected a value for each of the 4 times; "
+        "resample it to these times",
     ),
     "wide": (
         {"t": T, "q": np.ones((4, 3)), "qd": QD, "tau": TAU},
@@ -479,7 +482,7 @@ def test_of_several_topics_one_is_named(bag):
         read_logs([folder], JOINTS)
     assert str(caught.value) == (
         f"{folder}: got joint states on the topics /joint_states, /other, expected one of them; "
-        "name it by 'topic' under 'logs'"
+        "write 'topic: /joint_states' under 'logs' in the robot's YAML, or the other topic"
     )
     check(read_logs([folder], JOINTS, mapping=LogMapping(topic="/joint_states"))[0], "bag", rtol=1e-12)
     with pytest.raises(
@@ -507,8 +510,8 @@ def test_a_pipe_in_a_bag_is_not_waited_for(bag):
 BAD_BAGS = {
     "part": (
         [("/a", JOINTS[:1], [0.0], [0.0], [0.0])],
-        "{}: message 1: got a message with the joints shoulder, expected elbow in it too; "
-        "record one message with the states of all joints of the arm, as joint_state_broadcaster publishes",
+        "{}: got joint states without elbow, expected states of all joints of the arm; write "
+        "'moving_joints: [shoulder]' into the robot's YAML if the others do not move, or map their names",
     ),
     "lengths": (
         [STATES[0], ("/joint_states", JOINTS, [0.0], [0.0, 0.0], [0.0, 0.0])],
@@ -625,7 +628,8 @@ def test_a_cell_that_is_no_number_is_reported_with_its_row(tmp_path):
     with pytest.raises(LogError) as caught:
         read_logs(tmp_path / "x.csv", JOINTS)
     assert (
-        str(caught.value) == f"{tmp_path / 'x.csv'}:4: row 3, column q_elbow: got 'o.23', expected a number"
+        str(caught.value) == f"{tmp_path / 'x.csv'}:4: row 3, column q_elbow: got 'o.23', expected a number; "
+        "remove that row"
     )
 
 
@@ -785,7 +789,7 @@ def test_dropouts_are_removed_on_request(tmp_path):
         pa.table({"t": t, "q_a": q, "qd_a": 0.3 * np.cos(t), "tau_a": q}), tmp_path / "log.parquet"
     )
     (log,) = read_logs([tmp_path / "log.parquet"], ("a",))
-    with pytest.raises(LogError, match=r"falls to 0 for a moment, in 3 samples, at t = 0\.4, 0\.41, 1\.2 s"):
+    with pytest.raises(LogError, match=r"falls to 0, in 3 samples, at t = 0\.4, 0\.41, 1\.2 s"):
         checks.check([log], ("a",), ("revolute",))
     (mended,) = read_logs([tmp_path / "log.parquet"], ("a",), {"dropouts": "dropped"})
     assert len(mended) == 197
@@ -796,3 +800,60 @@ def test_a_joint_that_is_not_logged_is_named_with_what_to_write(tmp_path):
     (tmp_path / "log.csv").write_text("t,q_a,qd_a,tau_a\n0,0,0,0\n0.1,0,0,0\n")
     with pytest.raises(LogError, match="moving_joints"):
         read_logs([tmp_path / "log.csv"], ("a", "gripper"))
+
+
+def clock_texts(kind, seconds):
+    hours = 10 if kind != "midnight" else 23.9995
+    texts = []
+    for x in seconds.tolist():
+        time = dt.datetime(2026, 2, 28) + dt.timedelta(hours=hours, seconds=round(x, 3))
+        fraction = f"{time.microsecond // 1000:03d}"
+        texts.append(
+            {
+                "clock": f"{time:%H:%M:%S}.{fraction}",
+                "midnight": f"{time:%H:%M:%S}.{fraction}",
+                "date": f"{time:%Y-%m-%d %H:%M:%S}.{fraction}",
+                "minutes": f"{time:%M:%S}.{fraction}",
+                "ms": f"{1000 * x:.0f} ms",
+                "us": f"{1e6 * x:.0f}µs",
+                "s": f"{x:.2f} s",
+            }[kind]
+        )
+    return texts
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+@pytest.mark.parametrize("kind", ["clock", "midnight", "date", "minutes", "ms", "us", "s"])
+def test_times_as_texts_of_a_clock_or_with_a_unit_are_read(tmp_path, kind, form):
+    seconds = 0.01 * np.arange(400)
+    values = {f"{name}_a": np.sin(seconds + k) for k, name in enumerate(("q", "qd", "tau"))}
+    path = tmp_path / f"log.{form}"
+    table = pa.table({"t": clock_texts(kind, seconds), **values})
+    (pa.csv.write_csv if form == "csv" else pa.parquet.write_table)(table, path)
+    (log,) = read_logs(path, ["a"])
+    np.testing.assert_allclose(log.t - log.t[0], seconds, atol=1e-6)
+    np.testing.assert_allclose(log.q[:, 0], np.sin(seconds), rtol=1e-12)
+
+
+def test_cells_with_units_and_a_second_header_are_errors_with_what_to_do(tmp_path):
+    rows = ["t,q_a,qd_a,tau_a", "0,0.1,0,1", "0.1,0.2 rad,0,1"]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    with pytest.raises(
+        LogError, match=r"row 2, column q_a: got '0.2 rad', .*; write numbers only, and the unit as"
+    ):
+        read_logs(tmp_path / "log.csv", ["a"])
+    (tmp_path / "log.csv").write_text("\n".join([*rows[:2], rows[0], rows[1]]) + "\n")
+    with pytest.raises(LogError, match=r"got 't', .*remove that row, the header of a second file"):
+        read_logs(tmp_path / "log.csv", ["a"])
+
+
+def test_the_encoding_of_a_long_file_is_found_in_its_head(tmp_path):
+    rows = [f"{0.01 * k:.2f},0.1,0.2,1.0" for k in range(8000)]
+    (tmp_path / "log.csv").write_bytes("\n".join(["t,q °,qd,tau", *rows, ""]).encode("latin-1"))
+    mapping = LogMapping.model_validate({"columns": {"q": "q °", "qd": "qd", "tau": "tau"}})
+    assert len(read_logs(tmp_path / "log.csv", ["a"], mapping)[0]) == 8000
+
+
+def test_columns_separated_by_spaces_are_read(tmp_path):
+    (tmp_path / "log.csv").write_text("t q_a qd_a tau_a\n0 0.1 0 1\n0.1 0.2 0 1\n")
+    np.testing.assert_array_equal(read_logs(tmp_path / "log.csv", ["a"])[0].q[:, 0], [0.1, 0.2])

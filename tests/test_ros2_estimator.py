@@ -44,9 +44,9 @@ def levels(arm):
     noise = BlockNoise(white=2e-3 * effort, disturbance=2e-3 * effort, time_constant=np.ones(N))
     ones = np.ones(N)
     return NoiseLevels(
-        drift=noise, load=noise, observer=2e-3 * effort, peak_start=3 * ones, peak_scale=0.3 * ones, load_variance=1.0,
-        load_freedom=20, resting=0.01 * effort, resting_speed=0.02 * ones, speed=2 * ones, encoder=1e-5 * ones,
-        effort=effort, minutes=10.0, point=np.zeros(3),
+        drift=noise, load=noise, observer=2e-3 * effort, peak_start=3 * ones, peak_scale=0.3 * ones, peak_count=40,
+        load_variance=1.0, load_freedom=20, resting=0.01 * effort, resting_speed=0.02 * ones, speed=2 * ones,
+        encoder=1e-5 * ones, effort=effort, minutes=10.0, point=np.zeros(3),
     )  # fmt: skip
 
 

@@ -170,3 +170,23 @@ def test_commands_in_radians_beside_positions_in_degrees_are_an_error_with_the_l
     assert len(errors) == 2
     for error, joint in zip(errors, arm.chain.joint_names, strict=True):
         assert f"write 'joints: {{{joint}: {{units: {{q: deg, u: rad}}}}}}'" in error
+
+
+@pytest.mark.parametrize("counts", [None, 1024, 4096])
+@pytest.mark.parametrize(("stated", "logged"), [("deg", "rad"), ("rad", "deg")])
+def test_a_unit_of_servos_that_is_stated_wrongly_is_named_with_the_line(arm, logs, stated, logged, counts):
+    factor = np.pi / 180 if stated == "deg" else 180 / np.pi
+    step = 0.0 if counts is None else 2 * np.pi / counts
+
+    def wrong(values):
+        return factor * (np.round(values / step) * step if step else values)
+
+    mapping = LogMapping.model_validate({"input": "position", "units": {"q": stated}})
+    small = changed(logs, q=lambda x: wrong(x.q), u=lambda x: wrong(x.u), mapping=lambda x: mapping)
+    errors = [str(error) for error in spelgen.check_logs(small, arm).errors]
+    if (
+        stated == "rad" and counts is None
+    ):  # without steps of an encoder, positions of many turns show the unit
+        assert all("jump" in error or f"units: {{q: {logged}" in error for error in errors)
+        return
+    assert any(f"write 'units: {{q: {logged}}}' under 'logs'" in error for error in errors), errors

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import SettingsError, SpelgenErrors
+from spelgen.excitation.bounds import read_surroundings
 from spelgen.settings.settings import OF_A_STEP, JointSettings, Settings, load_mapping, load_settings
 from spelgen.simulation.protocol import make_friction
 
@@ -248,6 +249,26 @@ def test_reading_settings_imports_nothing_heavy():
     )
     shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert shown.stdout == "set()\n"
+
+
+def test_settings_in_place_of_a_mapping_are_named(tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text("gravity: [0, 0, 0]\nlogs:\n  velocity: logged\n")
+    with pytest.raises(SettingsError) as error:
+        load_mapping(path, ["a"])
+    assert str(error.value) == (
+        f"{path}:2: got settings of a robot, expected the keys of a mapping, as in the group logs of these settings; "
+        "write these keys into a file of their own; without --mapping, the settings beside the URDF are used"
+    )
+
+
+def test_a_list_of_boxes_is_refused_with_an_example(tmp_path):
+    path = tmp_path / "cell.yaml"
+    path.write_text("boxes:\n  - {size: [1, 1, 1]}\n")
+    with pytest.raises(
+        SettingsError, match=r"cell.yaml:1: boxes: got .*, expected boxes by name, as in \{table: "
+    ):
+        read_surroundings(path)
 
 
 @pytest.mark.parametrize("name", ["rpr", "scara", "panda", "ur10e"])

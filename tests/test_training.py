@@ -397,14 +397,21 @@ def test_a_run_is_not_overwritten_unasked(module, logs, tmp_path):
         f"{tmp_path}/run: there is a run in this folder; --resume it, --force to replace it, or -o another"
     )
     assert (tmp_path / "run" / "model.pt").read_bytes() == before
-    train(module, [logs], tmp_path / "run", config, seed=5, options=RunOptions(force=True))
+    train(module, [logs], tmp_path / "run", config, of_logs={"seed": 5}, options=RunOptions(force=True))
     assert json.loads((tmp_path / "run" / "config.json").read_text())["seed"] == 5
 
 
 def test_a_run_is_resumed_only_as_it_was_started(module, logs, tmp_path):
     train(module, [logs], tmp_path / "run", quick(epochs=1))
     with pytest.raises(RunError) as caught:
-        train(module, [logs], tmp_path / "run", quick(batch=16), seed=1, options=RunOptions(resume=True))
+        train(
+            module,
+            [logs],
+            tmp_path / "run",
+            quick(batch=16),
+            of_logs={"seed": 1},
+            options=RunOptions(resume=True),
+        )
     assert str(caught.value) == (
         f"{tmp_path}/run: got batch 16 instead of 32, seed 1 instead of 0, "
         "expected the settings the run was started with; or start a new run"

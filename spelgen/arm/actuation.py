@@ -45,7 +45,7 @@ class Drives(NamedTuple):
 
 @dataclass(frozen=True)
 class Actuation:
-    """The nonzero entries of G for ``joints`` joints, and diagnostics.
+    """The nonzero entries of the input matrix G, (n, n), and diagnostics; ``joints`` is the number n of joints.
 
     couplings: entries (joint torque per motor torque) of coupled motors if the logs contain joint torques. G does not
     contain these entries; they determine the motor speeds.

@@ -19,7 +19,7 @@ from spelgen.urdf.robot import JointType, Robot, UrdfJoint, UrdfLink
 
 
 class Coordinate(NamedTuple):
-    """A degree of freedom: a joint with its limits, damping and friction in the URDF, None for an absent limit.
+    """A degree of freedom: a joint with its limits, damping and friction in the URDF. An absent limit is None.
 
     ``lower``, ``upper`` [rad, m]; ``effort`` [Nm, N]; ``velocity`` [rad/s, m/s]; ``damping`` [Nm s/rad, N s/m];
     ``friction`` [Nm, N]. ``passive``: whether the joint has no actuator.
@@ -38,8 +38,8 @@ class Coordinate(NamedTuple):
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """Lower and upper limit [rad, m]; None for a continuous joint, or if one of the two limits is absent."""
-        if self.continuous or self.lower is None or self.upper is None:
+        """Lower and upper limit [rad, m]; None if one of the two is absent, as for continuous joints."""
+        if self.lower is None or self.upper is None:
             return None
         return self.lower, self.upper
 
@@ -196,7 +196,8 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
     """
     rounding = AngleRounding(angle_tolerance)
     placement = Placement(robot.root, rounding)
-    # A mimic joint may follow a mimic joint: `leaders` returns the joint at the end, and the total multiplier.
+    # A mimic joint may mimic another mimic joint: `leaders` returns the joint without <mimic> at the end of such a
+    # sequence, and the product of all multipliers.
     following = leaders(robot)
     poses = []
     locked: list[UrdfJoint] = []

@@ -82,3 +82,10 @@ def load_arm(
         tip=tip,
         angle_tolerance=angle_tolerance,
     )
+
+
+def urdf_path(arm: Arm | Path | str | None) -> Path | None:
+    """Return the path of the URDF of a loaded arm, or the given path; None without an arm."""
+    if arm is None:
+        return None
+    return Path(arm) if isinstance(arm, str | Path) else arm.robot.path

@@ -153,9 +153,9 @@ class Placement:
     def __init__(self, root: str, rounding: AngleRounding) -> None:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
-        # The segment of the root, and of each body: the rotations of all bodies from the last body with a revolute
-        # joint to this body, relative to the last body with a revolute joint. The segment of a body with a revolute
-        # joint contains only the body itself.
+        # A segment starts at the root, or at a body with a revolute joint; bodies with prismatic joints continue it.
+        # For the root and for each body, the list has the rotations of all bodies from the start of the segment to
+        # this body, relative to the start, in float64 and exact.
         self._segments: list[tuple[_Rotation, ...]] = [((np.eye(3), IDENTITY),)]
 
     def lock(self, joint: UrdfJoint, value: float) -> None:
@@ -226,10 +226,10 @@ class Placement:
     def _seen_from_both(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
         """Return the position (3,) [m] of a joint in the frame of the parent body, without rounding errors.
 
-        position: in the frame of the parent body, where rounding errors have been removed. rotation: rotation (3, 3) of
-        the joint's frame. Components that are rounding errors in the joint's frame are set to 0 too, unless rounding in
-        the parent's frame would undo this. Reason: an offset of (0.1, 0.1, 0) is parallel to an axis at 45 degrees, but
-        not exactly to the rational approximation of this axis.
+        position: in the frame of the parent body, without components that are rounding errors. rotation: rotation
+        (3, 3) of the joint's frame. Components that are rounding errors in the joint's frame are set to 0, too: an
+        offset of (0.1, 0.1, 0) is not exactly parallel to the rational approximation of an axis at 45 degrees. The
+        result is ``position`` if components cannot be zero in both frames.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
         # Exact zeros matter: with a rounding error in place of 0, a zero entry of M would become nonzero.
@@ -239,10 +239,10 @@ class Placement:
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
         """Return an exact rotation (3, 3) in the frame of a body.
 
-        composed: float64 rotation (3, 3) in the frame of the last body with a revolute joint, where the segment of the
-        body begins. The rotation is approximated relative to one body of the segment: the body for which the
-        approximation preserves the most zero elements of the rotations relative to all bodies of the segment. Reason:
-        an axis at 45 degrees, which is not rational, may be normal to several other axes.
+        composed: float64 rotation (3, 3) relative to the start of the segment of the body (see ``_segments``). Zero
+        elements matter: an axis at 45 degrees, which is not rational, may be normal to axes of several bodies. The
+        rotation is therefore approximated relative to each body of the segment; the approximation that preserves the
+        most zero elements relative to all these bodies is used.
         """
         segment = self._segments[body + 1]
         candidates: list[tuple[int, int, np.ndarray]] = []

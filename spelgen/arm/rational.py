@@ -112,11 +112,10 @@ def alignment(axis: np.ndarray) -> np.ndarray:
 def exact_rotation(rotation: np.ndarray, error: float = TUNING.rotation_error) -> np.ndarray:
     """Return a rational approximation (3, 3), exactly orthogonal, of a float64 rotation (3, 3).
 
-    Elements differ by less than ``error``; a zero element remains zero. The components of the quaternion are divided by
-    the largest one and replaced by close fractions; the rotation matrix of an unnormalised rational quaternion is
-    rational (Euler-Rodrigues). A zero element that depends on several components may thereby become nonzero. The
-    rotation is then approximated by a product that preserves one zero: a rotation about a coordinate axis, a signed
-    permutation, and a rotation about a coordinate axis.
+    Elements differ by less than ``error``. The components of the quaternion, divided by the largest one, are replaced
+    by close fractions: the rotation matrix of any rational quaternion is rational (Euler-Rodrigues). If a zero element
+    becomes nonzero in this way, another approximation is used, which preserves one zero: the product of a rotation
+    about a coordinate axis, a signed permutation, and a rotation about a coordinate axis.
     """
     ratios = _quaternion_ratios(rotation)
     candidate = IDENTITY
@@ -176,9 +175,9 @@ def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     cosine, sine: cosine and sine of the angle in float64, both multiplied by the same positive factor, which need not
     be 1. error: largest error of an element.
     """
-    # The angle is split into quarter turns, which are exact, and a remainder, which is approximated; 45 and 135 degrees
-    # then have approximations that differ by exactly a right angle. The remainder is in -0.7 .. 0.87 rad and not in
-    # +-45 degrees: rounding of the common angles +-45 degrees would otherwise change the number of quarter turns.
+    # The angle is the sum of exact quarter turns and a remainder, which is approximated. Approximations of 45 and 135
+    # degrees then differ by exactly a right angle. The remainder is between -0.7 and 0.87 rad: with the limits +-45
+    # degrees, rounding errors of the common angles +-45 degrees would change the number of quarter turns.
     eighth = 0.7  # [rad] somewhat less than pi/4
     quarter, angle = divmod(atan2(sine, cosine) + eighth, pi / 2)
     tangent = tan((angle - eighth) / 2)

@@ -17,7 +17,7 @@ class DelayedCommand:
     about = "the commands themselves, after the delay by which they are nearest to the positions of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the predicted positions of each part, (K, n) [rad, m]: the delayed commands."""
+        """Return the delayed commands at the end of the K sample intervals of each part of a log, (K, n) [rad, m]."""
         return [delayed_commands(log, rows, self.delay, 1)[:, 0] for log, rows in parts]
 
 
@@ -37,7 +37,7 @@ class LinearServos:
     about = "a linear second-order servo at each joint, fitted to windows of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the predicted positions of each part, (K, n) [rad, m]: second-order responses to the commands."""
+        """Return second-order responses to the commands at the end of the K sample intervals of each part, (K, n)."""
         frequency, damping, result = np.array(self.frequency), np.array(self.damping), []
         for start, speed, (log, rows) in zip(q, qd, parts, strict=True):
             # The mean interval is used for all steps, so that the exact response is computed only once.

@@ -80,18 +80,19 @@ def _stepper(
         pose = pose_at(q)
         damping, stiffness = _friction_slopes(dynamics, pose, qd, z, width)
         h = GAMMA * step
-        # Without the eliminated position, the matrix of both stages is M + h D + h^2 K: one factorisation of size n.
+        # The position is eliminated from the equations of both stages. The remaining matrix, M + h D + h^2 K (n, n), is
+        # factorised once.
         factors, pivots, _ = torch.linalg.lu_factor_ex(
             pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
         )
 
         def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force)."""
+            """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force), with h = GAMMA * step."""
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
-        # ROS2 for a state u: the next state is u + step (3 k1 + k2) / 2, where (1 - h A) k1 = F(u) and
+        # ROS2 for u' = F(u): the next state is u + step (3 k1 + k2) / 2, where (1 - h A) k1 = F(u) and
         # (1 - h A) k2 = F(u + step k1) - 2 k1.
         v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
@@ -110,7 +111,10 @@ def _stepper(
 def _friction_slopes(
     dynamics: object, pose: MotionEquations, qd: Tensor, z: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the diagonals of D and K, (W, n), see `_stepper`: friction depends on the motion of its own joint only."""
+    """Return the derivatives of friction with respect to velocity (D) and, through the bristles, to position (K).
+
+    Both are diagonals, (W, n): friction depends on the motion of its own joint only.
+    """
     # Central differences, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
     # Negative damping (friction that decreases with velocity) is omitted from D, and so integrated explicitly.
@@ -134,7 +138,7 @@ class PredictorTuning:
     # [1] Allowed change of a prediction if the number of steps is doubled, divided by the error of the dynamics. With
     # this value reported figures change by a thousandth.
     tolerance: float = 5e-2
-    # [1] Lower bound of the error of the dynamics in this comparison, divided by the motion.
+    # [1] Lower bound of the relative error of a prediction (RMS error / RMS motion) that `tolerance` is applied to.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16
@@ -160,7 +164,10 @@ class Solver:
     substeps: int
 
     def __call__(self, windows: Windows, disturbance: Tensor | None = None) -> States:
-        """Return predicted q and qd, (W, K-1, n); NaN if they diverged. disturbance: see `roll_out_stiff`."""
+        """Return predicted q and qd of W windows at samples 1..K-1, (W, K-1, n); NaN after a divergence.
+
+        disturbance: constant disturbance (W, n) from `observe`.
+        """
         with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
             return roll_out_stiff(self.dynamics, windows, self.substeps, disturbance)
 

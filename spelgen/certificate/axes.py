@@ -73,10 +73,10 @@ class Axes:
         return True
 
     def keep_offset(self, slider: int, hinge: int) -> bool:
-        """Whether the load of a prismatic joint ``slider`` keeps its distance from a plane.
+        """Whether all bodies that the prismatic joint ``slider`` moves keep their distance from a plane.
 
         The plane contains the axis of the revolute joint ``hinge``, which is nearer the root, and is parallel to the
-        axis of ``slider``. The test includes the motion of all joints between ``hinge`` and the tip.
+        axis of ``slider``. All joints between ``hinge`` and the tip may move.
         """
         if not all(self.prismatic[hinge + 1 : slider]):
             return False  # A revolute joint between the two joints may rotate the plane.

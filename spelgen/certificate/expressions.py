@@ -152,8 +152,8 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
         groups.setdefault(unit, {})[symbol] = leading
     total = []
     for unit, parameters in groups.items():
-        # The function of a parameter that no other parameter has is not normalised, because its coefficients are
-        # lengths of the arm.
+        # If only one parameter has a function, the coefficients of the function are not normalised: they are lengths
+        # of the arm, which users recognise.
         factor = abs(next(iter(parameters.values()))) if len(parameters) == 1 else fmpq(1)
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))

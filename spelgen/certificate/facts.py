@@ -2,9 +2,9 @@
 
 A reason is given only if the exact geometry of the arm proves it. The entry of M of joints a and b is the integral of
 v_a . v_b over the mass that both joints move, where v_a is the velocity field for a unit velocity of joint a; the
-reasons are properties of this integral. A function that returns a reason returns None if it finds none. The text of a
-reason is valid for several entries, each of two joints: it names one of the joints of an entry, and has the placeholder
-``{joints}`` for the other joints of all entries, or ``{axes}`` for the axes of these joints.
+reasons are properties of this integral. A function that returns a reason returns None if it finds none. One
+reason may be valid for several entries of M. Its text names the joint that these entries have in common; the
+placeholder ``{joints}`` represents the other joints of the entries, ``{axes}`` the axes of the other joints.
 """
 
 from collections.abc import Callable, Iterator, Sequence

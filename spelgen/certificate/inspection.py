@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -223,7 +223,7 @@ class Inspection:
 
 
 def _rows(entries: Iterable[InputEntry]) -> str:
-    """Return the joints, which are the rows, of these entries of G as text."""
+    """Return the joints of the rows in G of these entries as text."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
 
 
@@ -253,27 +253,16 @@ def cell_text(entry: MassEntry) -> str:
     return {"zero": "0", "constant": "C"}.get(entry.kind, joint_ranges(entry.joints))
 
 
-def inspect(
-    arm: Arm | str | Path,
-    joints: Sequence[str] | None = None,
-    tip: str | None = None,
-    assume: Assume = "kinematics",
-    *,
-    angle_tolerance: float = 2e-3,
-) -> Inspection:
+def inspect(arm: Arm | str | Path, assume: Assume = "kinematics") -> Inspection:
     """Return the derived structure of an arm.
 
     Args:
         arm: The result of ``load_arm``, or the path of a URDF.
-        joints: See ``load_arm``; used only with a path.
-        tip: See ``load_arm``; used only with a path.
         assume: ``kinematics``: structure for any inertial parameters; ``inertials``: for the parameters of the URDF.
-        angle_tolerance: See ``load_arm``; used only with a path [rad].
 
     Raises the errors of ``load_arm``, and ArmError for ``inertials`` if a body has no inertial.
     """
-    # An arm that was loaded before has its own joints, tip and tolerance.
     if not isinstance(arm, Arm):
-        arm = load_arm(arm, joints, tip, angle_tolerance)
+        arm = load_arm(arm)
     structure = derive(arm.chain, assume)
     return Inspection(arm.chain, structure, arm.actuation, arm.diagnostics, arm.settings.input)

@@ -23,7 +23,7 @@ from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import Settings
 from spelgen.structure.nominal import parameters_of
-from spelgen.urdf.document import urdf_bytes
+from spelgen.urdf.document import read_document
 from spelgen.urdf.robot import Robot
 
 ENGINE = f"Pinocchio {pin.__version__}"
@@ -61,10 +61,10 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
     gravity = np.zeros((count, n))
     for sample in range(count):
         dynamics = arm_dynamics(with_random_inertias(arm, rng) if random_inertials else arm, Settings())
-        # Each further row of q differs from the first in one coordinate, so that a difference of M is an effect of
-        # this coordinate.
+        # Row 0 of q, (1 + n, n), has random positions. Row 1 + k differs from row 0 in coordinate k only, so that a
+        # difference of M is an effect of this coordinate.
         base, moved = _positions(arm, rng), _positions(arm, rng)
-        q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)  # (1 + n, n)
+        q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)
         mass[:, sample] = dynamics.mass_matrix(q)
         gravity[sample] = dynamics.gravity(base)
     # Entries have different units (kg, kg m, kg m2), and are therefore divided by scales with the same units.
@@ -153,10 +153,10 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
 
 def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
     """Return the dynamics of the URDF as read by Pinocchio. Raises ValueError if the file has changed."""
-    data = urdf_bytes(robot.path)
-    if hashlib.sha256(data).hexdigest() != robot.digest:
+    document = read_document(robot.path)
+    if hashlib.sha256(document.data).hexdigest() != robot.digest:
         raise ValueError("the file has changed since it was read")
-    root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True))
+    root = document.root
     # Limits and friction are replaced, because they are not compared, and Pinocchio rejects some of their values.
     for element in [*root.iter("limit"), *root.iter("dynamics")]:
         element.getparent().remove(element)

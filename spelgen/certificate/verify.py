@@ -104,9 +104,10 @@ Magnitude = tuple[str, float, bool]
 
 @dataclass(frozen=True)
 class _DerivedFact:
-    """A derived fact, with the sampled numbers that must be zero, and the numbers that must not, if it is true.
+    """A derived fact, with the sampled numbers that confirm or refute it.
 
-    fact: name of the fact. derived: result of the derivation, as text.
+    fact: name of the fact. derived: result of the derivation, as text. magnitudes: tuples (name, number, is_nonzero).
+    If the fact is true, the number is nonzero for is_nonzero = True, and zero for False.
     """
 
     fact: str
@@ -189,7 +190,8 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
 def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
     """Yield two facts: which entries of M are zero, and on which joints each entry depends."""
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
-    largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()  # (entries, n)
+    # Largest change of each entry of M with each joint, (entries, n).
+    largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()
     zeros: list[Magnitude] = []
     pairs: list[Magnitude] = []
     dependent = 0
@@ -231,9 +233,10 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFac
 
 
 def _ranks(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield facts about the number of outputs, of outputs and constants, and of outputs of the joints nearer the tip.
+    """Yield facts about numbers of terms of M, each of which is equal to a rank of samples.
 
-    An output is a varying term of M.
+    The facts are the number of outputs (varying terms), the number of outputs and constants, and the numbers of outputs
+    that do not depend on the first 0, 1, ... joints.
     """
     changes, outputs = samples.changes, len(structure.outputs)
     width = changes.shape[-1]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, deliver, note, refuse_warnings
 from spelgen.cli.options import flag, option
+from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
     from spelgen.certificate.formulas import Formulas
@@ -27,28 +28,21 @@ FRICTION_HELP = (
 
 
 def inspect(
-    robot: options.Robot,
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    assume: options.Assumption = "kinematics",
-    angle_tolerance: options.AngleTolerance = 2e-3,
-    formulas: Annotated[
-        bool, flag("--formulas", "Write M and V as expressions in q and base parameters.")
-    ] = False,
-    entry: options.Entry = None,
-    format: Annotated[InspectionFormat | None, options.result_format()] = None,
-    output: options.Output = None,
-    strict: options.Strict = False,
-    verify: Annotated[
-        bool, flag("--verify", "Verify the structure by Pinocchio, SymPy and numeric samples.")
-    ] = False,
+    chosen_arm: options.ArmOptions,
+    assume: Assume = options.ASSUMPTION,
+    formulas: bool = flag("--formulas", "Write M and V as expressions in q and base parameters."),
+    entry: str | None = options.ENTRY,
+    format: InspectionFormat | None = options.result_format(),
+    output: Path | None = options.OUTPUT,
+    strict: bool = options.STRICT,
+    verify: bool = flag("--verify", "Verify the structure by Pinocchio, SymPy and numeric samples."),
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
     chosen_entry = options.entry(entry)
     chosen = options.choose_format(format, output, get_args(InspectionFormat))
     from spelgen.certificate.inspection import inspect as inspect_arm
 
-    arm = options.load(robot, joints, tip, angle_tolerance)
+    arm = chosen_arm.load()
     inspection = inspect_arm(arm, assume=assume)
     proof = None
     if verify:
@@ -60,15 +54,17 @@ def inspect(
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE
 
-        # Formulas for programs may have any length; formulas for people are limited.
+        # JSON and SymPy files are read by programs, so their formulas have no length limit as in text and LaTeX.
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
     # The result is printed in any case; --strict and a failed proof only affect the exit code.
     deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
     if strict:
-        refuse_warnings(f"{robot}: ", [x.severity for x in inspection.diagnostics].count("warning"))
+        refuse_warnings(
+            f"{chosen_arm.robot}: ", [x.severity for x in inspection.diagnostics].count("warning")
+        )
     if proof and not proof.agrees:
-        note(f"{robot}: the proof contradicts the derivation; please report this file")
+        note(f"{chosen_arm.robot}: the proof contradicts the derivation; please report this file")
         raise typer.Exit(FAILED)
 
 
@@ -76,8 +72,8 @@ def _text(
     format: str, inspection: Inspection, closed: Formulas | None, proof: Verification | None, urdf: Path
 ) -> str:
     """Return the text of the inspection in a format, with a line end. closed: closed-form formulas of M and V."""
-    if closed and format in ("latex", "sympy"):
-        return _formula_file(format, closed, proof)
+    if closed:  # SymPy is slow to import and needed for formulas only
+        from spelgen.certificate import formula_files
     if format == "html":
         from spelgen.render.arm_pages import inspection_page
 
@@ -85,49 +81,36 @@ def _text(
     if format == "json":
         data = inspection.to_dict()
         if closed:
-            from spelgen.certificate.formula_files import to_dict
-
-            data["formulas"] = to_dict(closed)
+            data["formulas"] = formula_files.to_dict(closed)
         if proof:
             data["verification"] = proof.to_dict()
         return json.dumps(data, indent=2) + "\n"
-    paragraphs = [] if proof is None else [proof.text()]
-    if closed is None:
-        return "\n\n".join([inspection.text(), *paragraphs]) + "\n"
-    from spelgen.certificate import formula_files
-
-    return "\n\n".join([formula_files.text(closed), *paragraphs]) + "\n"
-
-
-def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> str:
-    """Return the text of a file of formulas; print the proof and the names of omitted formulas to stderr."""
-    from spelgen.certificate import formula_files
-
-    names = [formula.name for formula in closed.unwritten]
-    if names:
-        note(f"too long to be written: {', '.join(names)}")
-    if proof:
-        note(proof.text())
-    return formula_files.latex(closed) if format == "latex" else formula_files.sympy_source(closed)
+    if closed and format in ("latex", "sympy"):
+        # The file contains formulas only: the proof and the names of omitted formulas are printed to stderr.
+        names = [formula.name for formula in closed.unwritten]
+        if names:
+            note(f"too long to be written: {', '.join(names)}")
+        if proof:
+            note(proof.text())
+        return formula_files.latex(closed) if format == "latex" else formula_files.sympy_source(closed)
+    paragraphs = [formula_files.text(closed) if closed else inspection.text()]
+    paragraphs += [proof.text()] if proof else []
+    return "\n\n".join(paragraphs) + "\n"
 
 
 def identify(
-    robot: options.Robot,
-    extra_logs: options.MoreData = None,
-    data: options.Data = None,
-    mapping: options.MappingFile = None,
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    angle_tolerance: options.AngleTolerance = 2e-3,
-    filter: options.Filter = None,
-    weights: Annotated[
-        Literal["equal", "range", "noise"],
-        option("", "Weights of the joints: equal, by torque range, or by torque noise."),
-    ] = "noise",
-    friction: Annotated[str | None, option(",".join(EFFECTS), FRICTION_HELP)] = None,
-    accept: options.Accept = None,
-    format: Annotated[IdentificationFormat | None, options.result_format()] = None,
-    output: options.Output = None,
+    chosen_arm: options.ArmOptions,
+    extra_logs: list[Path] | None = options.MORE_DATA,
+    data: list[Path] | None = options.DATA,
+    mapping: Path | None = options.MAPPING_FILE,
+    filter: float | None = options.FILTER,
+    weights: Literal["equal", "range", "noise"] = option(
+        "", "Weights of the joints: equal, by torque range, or by torque noise.", default="noise"
+    ),
+    friction: str | None = option(",".join(EFFECTS), FRICTION_HELP),
+    accept: list[str] | None = options.ACCEPT,
+    format: IdentificationFormat | None = options.result_format(),
+    output: Path | None = options.OUTPUT,
 ) -> None:
     """Identify base parameters and friction by least squares."""
     paths = options.logs(data, extra_logs)
@@ -144,7 +127,7 @@ def identify(
         if name not in EFFECTS:
             raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
     method = LeastSquares(weights, FrictionModel(**dict.fromkeys(effects, True)))
-    arm = options.load(robot, joints, tip, angle_tolerance)
+    arm = chosen_arm.load()
     # Error codes on the command line are accepted in addition to the codes in the settings.
     log_mapping = options.log_mapping(arm, mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")

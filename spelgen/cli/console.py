@@ -8,9 +8,10 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, NoReturn, get_args
+from typing import NoReturn, get_args
 
 import typer
 from typer.models import OptionInfo
@@ -28,47 +29,60 @@ BROKEN_PIPE = 141  # exit code of shells: 128 + SIGPIPE
 EXTRAS = {"pinocchio": "simulate", "ray": "parallel"}
 EXTRAS |= dict.fromkeys(("casadi", "mujoco", "onnxruntime", "onnxscript", "safetensors"), "deploy")
 
-Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+DEBUG = typer.Option(False, "--debug", help="Show the traceback of an error.")
 
 
 def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
     """Return the command with an additional option --debug; exceptions of the command are reported by `fail`.
 
-    Usage errors (exit code 2) are unchanged, because typer raises them before the command runs.
+    An argument of the command that is a dataclass is replaced by one option per field. Usage errors (exit code 2) are
+    unchanged, because typer raises them before the command runs.
     """
+    groups: dict[str, type] = {}
+    options: list[inspect.Parameter] = []
+    # eval_str: annotations are strings, because of `from __future__ import annotations`.
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        if isinstance(parameter.annotation, type) and is_dataclass(parameter.annotation):
+            groups[name] = parameter.annotation
+            options += inspect.signature(parameter.annotation, eval_str=True).parameters.values()
+        else:
+            options.append(parameter)
+    options.append(inspect.Parameter("debug", parameter.KEYWORD_ONLY, default=DEBUG, annotation=bool))
 
     @functools.wraps(command)
-    def run(*arguments: object, debug: bool = False, **options: object) -> None:
+    def run(*, debug: bool = False, **values: object) -> None:
         try:
-            command(*arguments, **{name: _local(value) for name, value in options.items()})
+            values = {name: _local(value) for name, value in values.items()}
+            for name, group in groups.items():
+                values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
+            command(**values)
             sys.stdout.flush()  # a closed pipe raises its error here and not at the exit of the interpreter
         except (typer.Exit, typer.Abort, typer.BadParameter):
             raise
         except BaseException as error:
             fail(error, debug=debug)
 
-    # eval_str: annotations are strings, because of `from __future__ import annotations`.
-    signature = inspect.signature(command, eval_str=True)
-    for parameter in signature.parameters.values():
-        _name_values(*get_args(parameter.annotation))
-    option = inspect.Parameter("debug", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Debug)
-    parameters = [*signature.parameters.values(), option]
+    for option in options:
+        _name_values(option.annotation, option.default)
     # Typer reads the options from the signature and the annotations.
-    vars(run)["__signature__"] = signature.replace(parameters=parameters)
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    parameters = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    vars(run)["__signature__"] = inspect.Signature(parameters)
+    run.__annotations__ = {option.name: option.annotation for option in options}
     return run
 
 
-def _name_values(annotation: object, *metadata: object) -> None:
-    """Set the placeholder that the help shows for the value of an option: N, X, FILE, or the choices."""
+def _name_values(annotation: object, info: object) -> None:
+    """Set the placeholder of an option's value in the help.
+
+    It is N for an integer, X for a float, TEXT, FILE for a path, or the list of the choices.
+    """
     value_type = get_args(annotation)[0] if NoneType in get_args(annotation) else annotation
-    for info in metadata:
-        if isinstance(info, OptionInfo) and info.metavar is None and value_type is not bool:
-            info.metavar = METAVARS.get(value_type) or "|".join(map(str, get_args(value_type)))
+    if isinstance(info, OptionInfo) and info.metavar is None and value_type is not bool:
+        info.metavar = METAVARS.get(value_type) or "|".join(map(str, get_args(value_type)))
 
 
 def _local(value: object) -> object:
-    """Return the value of an option, in which paths that are addresses are replaced by their local copies."""
+    """Return the value of an option, in which URLs (such as s3://bucket/log) are replaced by paths of local copies."""
     if isinstance(value, list):
         return [_local(element) for element in value]
     return local(value) if isinstance(value, Path) else value
@@ -133,7 +147,7 @@ def note(text: object) -> None:
 
 
 def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
-    """Print the result of a command: its lines as text, or its record as one line of JSON."""
+    """Print the result of a command. form: "text" prints `lines`, "json" prints `record` as one line of JSON."""
     # JSON has one line, as log files of pipelines have one record per line.
     if form == "json":
         print(json.dumps(record, default=str))

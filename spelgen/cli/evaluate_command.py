@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -26,22 +26,21 @@ LIMIT_HELP = f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMI
 
 
 def evaluate(
-    run: options.Run,
-    extra_logs: options.MoreData = None,
-    data: options.Data = None,
-    mapping: options.MappingFile = None,
-    filter: options.Filter = None,
-    format: Annotated[Format | None, options.result_format()] = None,
-    output: options.Output = None,
-    limit: Annotated[list[str] | None, option("FIGURE=MAX", LIMIT_HELP)] = None,
-    truth: Annotated[
-        Path | None, option("URDF", "The true arm of simulated logs: state the error of M(q).")
-    ] = None,
-    quick: Annotated[bool, flag("--quick", "Torque errors only, without rollouts.")] = False,
+    run: Path = options.RUN,
+    extra_logs: list[Path] | None = options.MORE_DATA,
+    data: list[Path] | None = options.DATA,
+    mapping: Path | None = options.MAPPING_FILE,
+    filter: float | None = options.FILTER,
+    format: Format | None = options.result_format(),
+    output: Path | None = options.OUTPUT,
+    limit: list[str] | None = option("FIGURE=MAX", LIMIT_HELP),
+    truth: Path | None = option("URDF", "The true arm of simulated logs: state the error of M(q)."),
+    quick: bool = flag("--quick", "Torque errors only, without rollouts."),
 ) -> None:
     """Evaluate a trained run and its baselines on test logs.
 
-    The assessment comes first. The result is also written to evaluation.json in the run folder; nothing else is.
+    The result begins with an assessment of the model. The result is also written to evaluation.json in the run folder,
+    and no other file is changed.
     """
     # Limits are checked first, so that a misspelt name is reported before minutes of rollouts.
     paths = options.logs(data, extra_logs)
@@ -101,18 +100,14 @@ def _limit(text: str) -> tuple[str, float]:
 
 
 def estimate(
-    run: options.Run,
-    extra_logs: options.MoreData = None,
-    data: options.Data = None,
-    mapping: options.MappingFile = None,
-    accept: options.Accept = None,
-    alarms: Annotated[
-        float | None, option("RATE", "False alarms of contact per minute; default: 1.", min=1e-6)
-    ] = None,
-    output: Annotated[
-        Path | None, output_option("FILE", "HTML page; default: estimate.html in the run folder.")
-    ] = None,
-    format: options.TextOrJson = "text",
+    run: Path = options.RUN,
+    extra_logs: list[Path] | None = options.MORE_DATA,
+    data: list[Path] | None = options.DATA,
+    mapping: Path | None = options.MAPPING_FILE,
+    accept: list[str] | None = options.ACCEPT,
+    alarms: float | None = option("RATE", "False alarms of contact per minute; default: 1.", min=1e-6),
+    output: Path | None = output_option("FILE", "HTML page; default: estimate.html in the run folder."),
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Run the estimator along logs: payload, contacts, friction drift.
 
@@ -128,14 +123,16 @@ def estimate(
     from spelgen.logs.read import read_logs
     from spelgen.render.estimate_page import write_estimate
 
+    path = output or Path(run) / "estimate.html"
+    options.choose_format(None, path, ["html"])
     fit = load_run(run)
-    # A model without torques is an error, which is raised here before logs are read.
+    # Models of position servos predict no torques, which the estimator needs: the error is raised before logs are read.
     torque_model(fit)
     levels = noise_levels(fit)
     joints = list(fit.model.joint_names)
     log_mapping = options.log_mapping(joints, mapping or fit.record.mapping, accept)
     results = replay(fit, read_logs(paths, joints, mapping=log_mapping), alarms)
-    page = write_estimate(fit, levels, results, output or Path(run) / "estimate.html")
+    page = write_estimate(fit, levels, results, path)
     record: dict[str, object] = {"run": str(run), "page": str(page)}
     record["supported_alarms_per_minute"] = rate = levels.supported_alarms
     record["logs"] = [result.to_dict() for result in results]
@@ -147,21 +144,18 @@ def estimate(
 
 
 def report(
-    runs: Annotated[list[Path], argument("RUN", "Run folders; several are compared on one page.")],
-    output: Annotated[
-        Path | None,
-        output_option(
-            "FILE",
-            "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
-        ),
-    ] = None,
-    robot: Annotated[
-        Path | None, option("ROBOT.urdf", "URDF with its meshes, for the picture of the arm.")
-    ] = None,
+    runs: list[Path] = argument("RUN", "Run folders; several are compared on one page."),
+    output: Path | None = output_option(
+        "FILE",
+        "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
+    ),
+    robot: Path | None = option("ROBOT.urdf", "URDF with its meshes, for the picture of the arm."),
 ) -> None:
     """Write an HTML page about one run or several."""
     if robot is not None and len(runs) > 1:
         raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
+    if output is not None:
+        options.choose_format(None, output, ["html", "json"] if len(runs) == 1 else ["html"])
     from spelgen.evaluation.results import Results
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.render.report_page import write_report, write_runs
@@ -178,41 +172,25 @@ def report(
     say(f"wrote {path}: the report, for any browser" if path.suffix == ".html" else f"wrote {path}")
 
 
-Jobs = Annotated[
-    int | None,
-    option(
+def compare(
+    target: Path = argument("TARGET", "URDF of an arm, or YAML file that lists arms and their logs."),
+    extra_logs: list[Path] | None = options.MORE_DATA,
+    data: list[Path] | None = options.DATA,
+    mapping: Path | None = options.MAPPING_FILE,
+    output: Path | None = output_option("FOLDER", "Output folder; default: comparisons/TARGET."),
+    presets: str | None = option(
+        "A,B,C", "Presets or YAML files of designs; default: closed-form,hybrid on logs, else all presets."
+    ),
+    seeds: int | None = option("", "Number of runs of each preset.", min=1),
+    splits: int | None = option("", "Folds of a cross-validation over trajectories; default: 1.", min=1),
+    steps: int | None = option("", "Training steps of each run on a simulated arm.", min=1),
+    ablation: bool = flag(
+        "--ablation", "Compare designs from phnode to hybrid that differ by one change each."
+    ),
+    jobs: int | None = option(
         "", "Number of parallel runs, one core each, by Ray; default: all cores if Ray is installed.", min=1
     ),
-]
-
-
-def compare(
-    target: Annotated[
-        Path, argument("TARGET", "URDF of an arm, or YAML file that lists arms and their logs.")
-    ],
-    extra_logs: options.MoreData = None,
-    data: options.Data = None,
-    mapping: options.MappingFile = None,
-    output: Annotated[
-        Path | None, output_option("FOLDER", "Output folder; default: comparisons/TARGET.")
-    ] = None,
-    presets: Annotated[
-        str | None,
-        option(
-            "A,B,C",
-            "Presets or YAML files of designs; default: closed-form,hybrid on logs, else all presets.",
-        ),
-    ] = None,
-    seeds: Annotated[int | None, option("", "Number of runs of each preset.", min=1)] = None,
-    splits: Annotated[
-        int | None, option("", "Folds of a cross-validation over trajectories; default: 1.", min=1)
-    ] = None,
-    steps: Annotated[int | None, option("", "Training steps of each run on a simulated arm.", min=1)] = None,
-    ablation: Annotated[
-        bool, flag("--ablation", "Compare designs from phnode to hybrid that differ by one change each.")
-    ] = False,
-    jobs: Jobs = None,
-    address: options.Address = None,
+    address: str | None = options.ADDRESS,
 ) -> None:
     """Train presets on the same logs and rank them.
 
@@ -224,7 +202,7 @@ def compare(
     from spelgen.comparison.tables import arm_sections
     from spelgen.fitting.process import locked, termination_as_interrupt
     from spelgen.render.comparison_page import write_comparison
-    from spelgen.tasks import default_jobs, workers
+    from spelgen.tasks import default_jobs
 
     if ablation and presets is not None:
         raise UsageError("--ablation: names the presets itself, omit --presets")
@@ -248,8 +226,7 @@ def compare(
             study = prepare_study(comparison, folder, progress)
         note(study.announcement(parallel))
         # Inputs are written before the workers start, so that all workers read the same files.
-        with workers(parallel, address) as run_tasks:
-            study = run_study(study, run_tasks, note)
+        study = run_study(study, note, parallel, address)
         sections = arm_sections(study)
         # Tables are printed in addition to the page, which cannot be shown in a terminal.
         for section in sections:

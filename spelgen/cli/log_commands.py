@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -24,29 +24,24 @@ if TYPE_CHECKING:
 class MotionOptions:
     """Arguments of the function `spelgen.excite`, as options of a command."""
 
-    duration: Annotated[float, option("", "Duration [s].", min=2.0, max=600.0)] = 30.0
-    sample_rate: Annotated[float, option("", "Sample rate [Hz].", min=1.0, max=10000.0)] = 100.0
-    harmonics: Annotated[
-        int | None, option("", "Number of harmonics; default: 0.4 per second, at least 5.", min=2, max=100)
-    ] = None
-    reach: Annotated[float, option("", "Fraction of the position range to use.", min=0.05, max=1.0)] = 0.9
-    speed: Annotated[float, option("", "Fraction of the velocity limits to use.", min=0.05, max=1.0)] = 0.7
-    acceleration: Annotated[
-        str | None, option("X|X,X,X", "Largest acceleration, of all joints or per joint [rad/s^2, m/s^2].")
-    ] = None
-    start: Annotated[
-        str | None,
-        option(
-            "X,X,X",
-            "Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
-            "--from",
-        ),
-    ] = None
-    surroundings: Annotated[
-        Path | None, option("FILE.yaml", "Floor, boxes and clearance, which the motion respects.")
-    ] = None
-    trials: Annotated[int, option("", "Candidates of the search, after random ones.", min=1)] = 100
-    seed: Annotated[int, option("", "Seed of the search.", min=0)] = 0
+    duration: float = option("", "Duration [s].", min=2.0, max=600.0, default=30.0)
+    sample_rate: float = option("", "Sample rate [Hz].", min=1.0, max=10000.0, default=100.0)
+    harmonics: int | None = option(
+        "", "Number of harmonics; default: 0.4 per second, at least 5.", min=2, max=100
+    )
+    reach: float = option("", "Fraction of the position range to use.", min=0.05, max=1.0, default=0.9)
+    speed: float = option("", "Fraction of the velocity limits to use.", min=0.05, max=1.0, default=0.7)
+    acceleration: str | None = option(
+        "X|X,X,X", "Largest acceleration, of all joints or per joint [rad/s^2, m/s^2]."
+    )
+    start: str | None = option(
+        "X,X,X",
+        "Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
+        "--from",
+    )
+    surroundings: Path | None = option("FILE.yaml", "Floor, boxes and clearance, which the motion respects.")
+    trials: int = option("", "Candidates of the search, after random ones.", min=1, default=100)
+    seed: int = option("", "Seed of the search.", min=0, default=0)
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of `spelgen.excite`; lists of numbers are converted from text."""
@@ -54,21 +49,17 @@ class MotionOptions:
         return vars(self) | {"acceleration": acceleration, "start": options.numbers(self.start, "--from")}
 
 
-@options.grouped
 def excite(
-    robot: options.Robot,
-    output: Annotated[Path, output_option("FILE.csv", "Output file of the motion.")],
+    output: Path = output_option("FILE.csv", "Output file of the motion.", default=...),
+    *,
     design: MotionOptions,
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    angle_tolerance: options.AngleTolerance = 2e-3,
-    trajectory: Annotated[
-        Path | None,
-        option("FILE", "Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML."),
-    ] = None,
-    html: Annotated[Path | None, option("FILE", "Also write a page that shows the motion.")] = None,
-    force: options.Force = False,
-    format: options.TextOrJson = "text",
+    chosen_arm: options.ArmOptions,
+    trajectory: Path | None = option(
+        "FILE", "Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML."
+    ),
+    html: Path | None = option("FILE", "Also write a page that shows the motion."),
+    force: bool = options.FORCE,
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Propose an excitation trajectory for identification.
 
@@ -79,7 +70,7 @@ def excite(
     for path in (output, trajectory, html):
         if path is not None:
             options.require_free(path, force=force)  # checked before the search, which takes minutes
-    arm = options.load(robot, joints, tip, angle_tolerance)
+    arm = chosen_arm.load()
     with progress_bar("searching") as progress:
         motion = design_motion(arm, progress=progress, **design.arguments())
     written = [str(write_text(output, motion.csv()))]
@@ -96,24 +87,17 @@ def excite(
 
 
 def simulate(
-    robot: options.Robot,
-    output: Annotated[Path, output_option("LOGS", "Folder for train and test logs.")],
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    angle_tolerance: options.AngleTolerance = 2e-3,
-    seed: Annotated[
-        int | None, option("", "Random seed; default: the seed in the robot's settings.", min=0)
-    ] = None,
-    as_built: Annotated[
-        int | None, option("SEED", "Simulate an arm that differs from its URDF, drawn from this seed.", min=0)
-    ] = None,
-    motion: Annotated[
-        list[Path] | None,
-        option(
-            "FILE.csv", "A motion of `spelgen excite` to perform; repeatable. The last half is for testing."
-        ),
-    ] = None,
-    force: options.Force = False,
+    output: Path = output_option("LOGS", "Folder for train and test logs.", default=...),
+    *,
+    chosen_arm: options.ArmOptions,
+    seed: int | None = option("", "Random seed; default: the seed in the robot's settings.", min=0),
+    as_built: int | None = option(
+        "SEED", "Simulate an arm that differs from its URDF, drawn from this seed.", min=0
+    ),
+    motion: list[Path] | None = option(
+        "FILE.csv", "A motion of `spelgen excite` to perform; repeatable. The last half is for testing."
+    ),
+    force: bool = options.FORCE,
 ) -> None:
     """Simulate training and test logs with Pinocchio.
 
@@ -125,7 +109,7 @@ def simulate(
     from spelgen.simulation.prescribed import read_motion
     from spelgen.simulation.simulate import simulate as simulate_arm
 
-    arm = options.load(robot, joints, tip, angle_tolerance)
+    arm = chosen_arm.load()
     # Columns have the joint names of the URDF, so that the logs need no mapping.
     names = arm.chain.joint_names
     motions = [read_motion(file, names) for file in motion or ()]
@@ -147,20 +131,18 @@ def simulate(
 
 
 def logs(
-    paths: Annotated[list[Path], argument("LOGS", "Log files or folders.")],
-    robot: Annotated[Path, option("ROBOT.urdf", "URDF of the logged arm.")],
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    angle_tolerance: options.AngleTolerance = 2e-3,
-    mapping: options.MappingFile = None,
-    format: options.TextOrJson = "text",
-    html: Annotated[Path | None, option("FILE", "Also write an HTML page with plots.")] = None,
-    suggest: Annotated[
-        Path | None, option("", "Write a mapping drafted from the column names of the first log.")
-    ] = None,
-    force: options.Force = False,
-    accept: options.Accept = None,
-    strict: options.Strict = False,
+    paths: list[Path] = argument("LOGS", "Log files or folders."),
+    robot: Path = option("ROBOT.urdf", "URDF of the logged arm.", default=...),
+    joints: str | None = options.JOINTS,
+    tip: str | None = options.TIP,
+    angle_tolerance: float = options.ANGLE_TOLERANCE,
+    mapping: Path | None = options.MAPPING_FILE,
+    format: options.TextOrJson = options.TEXT_OR_JSON,
+    html: Path | None = option("FILE", "Also write an HTML page with plots."),
+    suggest: Path | None = option("", "Write a mapping drafted from the column names of the first log."),
+    force: bool = options.FORCE,
+    accept: list[str] | None = options.ACCEPT,
+    strict: bool = options.STRICT,
 ) -> None:
     """Check logs against the robot, and report their contents.
 
@@ -170,8 +152,8 @@ def logs(
     from spelgen.logs.read import read_bounded_logs
 
     # The mapping is loaded after the arm, because its names are checked against the joints of the URDF.
-    arm = options.load(robot, joints, tip, angle_tolerance)
-    # A mapping is suggested before the logs are read: without it they may be unreadable.
+    arm = options.ArmOptions(robot, joints, tip, angle_tolerance).load()
+    # The mapping is suggested before the logs are read: logs with other column names cannot be read without a mapping.
     if suggest is not None:
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
@@ -191,7 +173,7 @@ def logs(
         note(f"wrote {write_text(html, text)}")
     if result.errors:
         note(SpelgenErrors(result.errors))
-    # Errors decide the exit code before warnings do.
+    # With --strict, warnings give the same exit code as the errors below, and a line on stderr.
     if strict:
         refuse_warnings("", len(result.warnings))
     if result.errors:

@@ -1,8 +1,8 @@
 """Commands about models: `init`, `build`, `check`, `export`."""
 
+import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -12,20 +12,20 @@ from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.design import PRESET_NAMES
 from spelgen.exporting.exported import Format
 from spelgen.files import write_text
+from spelgen.labels import UNITS
+from spelgen.urdf.robot import Assume
 
 
 def init(
-    robot: options.Robot,
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    output: Annotated[
-        Path | None, output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF.")
-    ] = None,
-    force: options.Force = False,
+    robot: Path = options.ROBOT,
+    joints: str | None = options.JOINTS,
+    tip: str | None = options.TIP,
+    output: Path | None = output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF."),
+    force: bool = options.FORCE,
 ) -> None:
     """Write a commented file of settings for an arm."""
     from spelgen.arm.arm import make_arm
-    from spelgen.settings.starter import StarterJoint, starter
+    from spelgen.templates import render
     from spelgen.urdf.read import read_urdf
 
     path = output or robot.with_suffix(".yaml")
@@ -33,29 +33,30 @@ def init(
     # The arm is made without a settings file, because this command writes it.
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
     # Damping and friction of the URDF are the initial values in the file, which the user edits.
-    drives = [StarterJoint(x.name, x.joint_type, x.damping, x.friction) for x in arm.coordinates]
-    say(f"wrote {write_text(path, starter(robot.name, drives, arm.bodies[-1].link))}")
+    text = render(
+        "settings.yaml.jinja",
+        urdf=robot.name,
+        joints=arm.coordinates,
+        names=arm.joint_names,
+        tip=arm.bodies[-1].link,
+        units=UNITS,
+        json=json.dumps,
+    )
+    say(f"wrote {write_text(path, text)}")
 
 
 def build(
-    robot: options.Robot,
-    joints: options.Joints = None,
-    tip: options.Tip = None,
-    assume: options.Assumption = "kinematics",
-    angle_tolerance: options.AngleTolerance = 2e-3,
-    preset: Annotated[
-        str, option("NAME|FILE.yaml", f"Preset of the model: {', '.join(PRESET_NAMES)}, or a YAML file.")
-    ] = "hybrid",
-    width: Annotated[int, option("", "Hidden units per layer.", min=1, max=4096)] = 64,
-    depth: Annotated[int, option("", "Number of hidden layers.", min=1, max=16)] = 2,
-    standalone: Annotated[
-        bool, flag("--standalone", "Include the runtime: the module then needs PyTorch only.")
-    ] = False,
-    output: Annotated[
-        Path | None, output_option("MODULE.py", "Output file; default: <robot>_spel.py in this folder.")
-    ] = None,
-    force: options.Force = False,
-    format: options.TextOrJson = "text",
+    chosen_arm: options.ArmOptions,
+    assume: Assume = options.ASSUMPTION,
+    preset: str = option(
+        "NAME|FILE.yaml", f"Preset of the model: {', '.join(PRESET_NAMES)}, or a YAML file.", default="hybrid"
+    ),
+    width: int = option("", "Hidden units per layer.", min=1, max=4096, default=64),
+    depth: int = option("", "Number of hidden layers.", min=1, max=16, default=2),
+    standalone: bool = flag("--standalone", "Include the runtime: the module then needs PyTorch only."),
+    output: Path | None = output_option("MODULE.py", "Output file; default: <robot>_spel.py in this folder."),
+    force: bool = options.FORCE,
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
     # The preset is checked before the URDF is read, which takes time.
@@ -65,8 +66,8 @@ def build(
     from spelgen.emission.specify import make_spec
     from spelgen.emission.text import module_text
 
-    arm = options.load(robot, joints, tip, angle_tolerance)
-    path = output or Path(f"{robot.stem}_spel.py")
+    arm = chosen_arm.load()
+    path = output or Path(f"{chosen_arm.robot.stem}_spel.py")
     spec = make_spec(arm, preset, width=width, depth=depth, assume=assume, module=path)
     source = module_text(spec, standalone=standalone)
     # An unchanged file is not written, so that its modification time is kept.
@@ -81,7 +82,7 @@ def build(
     answer(format, record, line)
 
 
-def check(module: options.Module, robot: options.RobotOption = None) -> None:
+def check(module: Path = options.MODULE, robot: Path | None = options.ROBOT_OPTION) -> None:
     """Check whether a module is up to date with its URDF."""
     from spelgen.certificate.module_check import check as check_module
 
@@ -96,29 +97,22 @@ def check(module: options.Module, robot: options.RobotOption = None) -> None:
 
 
 def export(
-    run: Annotated[Path, argument("RUN", "A folder that `spelgen train` wrote.")],
-    output: Annotated[Path, output_option("FILE|FOLDER", "Output file or folder.")],
-    to: Annotated[
-        Format | None, option("", "Export format. Default: by the extension of the output.")
-    ] = None,
-    entry: Annotated[
-        list[str] | None,
-        option(
-            "NAME",
-            "A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
-        ),
-    ] = None,
-    float32: Annotated[
-        bool, flag("--float32", "Numbers of onnx and torch programs; otherwise float64.")
-    ] = False,
-    force: options.Force = False,
-    format: options.TextOrJson = "text",
+    run: Path = argument("RUN", "A folder that `spelgen train` wrote."),
+    output: Path = output_option("FILE|FOLDER", "Output file or folder.", default=...),
+    to: Format | None = option("", "Export format. Default: by the extension of the output."),
+    entry: list[str] | None = option(
+        "NAME",
+        "A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
+    ),
+    float32: bool = flag("--float32", "Numbers of onnx and torch programs; otherwise float64."),
+    force: bool = options.FORCE,
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Export a trained model to other tools. Each export is compared with the model before it is written.
 
-    urdf: the rigid bodies; for models with networks in M, the nearest rigid bodies. mjcf: rigid bodies, drives and
-    friction for MuJoCo. c: a C99 header and source without dependencies. ros2: a colcon package around these. casadi,
-    onnx, torch: a file for each function.
+    urdf: the rigid bodies; for models with networks in M, the rigid bodies with the nearest dynamics. mjcf: rigid
+    bodies, drives and friction for MuJoCo. c: a C99 header and source without dependencies. ros2: a colcon package of
+    the C header and source. casadi, onnx, torch: a file for each function.
     """
     from spelgen.exporting.export import export as export_run
     from spelgen.exporting.exported import format_by_extension, require_fitting

@@ -1,23 +1,22 @@
-"""Arguments and options that several commands share, and the conversion of their values."""
+"""Arguments and options that several commands share, and the conversion of their values.
+
+An option is the default value of a parameter of a command; typer replaces it by the value from the command line.
+"""
 
 from __future__ import annotations
 
 import csv
-import inspect
 import re
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import fields, is_dataclass
-from functools import wraps
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import typer
-from typer.models import ArgumentInfo, OptionInfo
 
 from spelgen.cli.console import deliver
 from spelgen.errors import SpelgenError, suggestion
 from spelgen.settings.log_mapping import Accepted
-from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
@@ -25,120 +24,98 @@ if TYPE_CHECKING:
     from spelgen.settings.log_mapping import LogMapping
 
 
+Declared: TypeAlias = Any
+"""Declaration of an option or argument, as the default value of a parameter of any type."""
+
+
 def option(
-    metavar: str, text: str, *names: str, min: float | None = None, max: float | None = None
-) -> OptionInfo:
-    """Return an option of a command.
+    metavar: str,
+    text: str,
+    *names: str,
+    default: object = None,
+    min: float | None = None,
+    max: float | None = None,
+) -> Declared:
+    """Return an option of a command, in place of the default value of a parameter.
 
     metavar: placeholder of the value in the help; "" for a placeholder by type. text: help. names: names of the option;
-    by default the name of the parameter. min, max: bounds of the value.
+    by default the name of the parameter. default: value without the option; ... for an option that is required. min,
+    max: bounds of the value.
     """
-    info: OptionInfo = typer.Option(*names, metavar=metavar or None, help=text, min=min, max=max)
-    return info
+    return typer.Option(default, *names, metavar=metavar or None, help=text, min=min, max=max)
 
 
-def flag(name: str, text: str) -> OptionInfo:
+def flag(name: str, text: str) -> Declared:
     """Return an option without a value, and without the negation `--no-...` that typer would add."""
-    return option("", text, name)
+    return option("", text, name, default=False)
 
 
-def argument(metavar: str, text: str) -> ArgumentInfo:
-    """Return a positional argument."""
-    info: ArgumentInfo = typer.Argument(metavar=metavar, help=text)
-    return info
+def argument(metavar: str, text: str, default: object = ...) -> Declared:
+    """Return a positional argument; without a default it is required."""
+    return typer.Argument(default, metavar=metavar, help=text)
 
 
-def output_option(metavar: str, text: str) -> OptionInfo:
+def output_option(metavar: str, text: str, default: object = None) -> Declared:
     """Return the option `-o` of a command, which names the output file or folder."""
-    return option(metavar, text, "-o", "--output")
+    return option(metavar, text, "-o", "--output", default=default)
 
 
-SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
+SUFFIXES = {"": "text", ".txt": "text", ".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex"}
+SUFFIXES |= {".py": "sympy"}
+"""Suffix of an output file -> format of its content; a name without a suffix means text."""
 
-Robot = Annotated[
-    Path, argument("ROBOT.urdf", "URDF of the arm; settings are read from ROBOT.yaml beside it.")
-]
-RobotOption = Annotated[Path | None, option("ROBOT.urdf", "URDF of the module, if it is not found by name.")]
-Module = Annotated[Path, argument("MODULE.py", "A module written by `spelgen build`.")]
-Run = Annotated[Path, argument("RUN", "A run folder of `spelgen train`.")]
-Joints = Annotated[str | None, option("A,B,C", "Moving joints; all others are locked at zero.")]
-Tip = Annotated[str | None, option("LINK", "Last link of the chain, which starts at the root.")]
-Assumption = Annotated[
-    Assume,
-    option("", "URDF values the structure may use: kinematics, or also zeros and symmetries of inertials."),
-]
-AngleTolerance = Annotated[
-    float, option("RAD", "Tolerance for rounding angles to special values such as pi/2.", min=0.0, max=0.1)
-]
-Entry = Annotated[str | None, option("ROW,COLUMN|V", "Write this entry of M, or V, as an expression.")]
-Data = Annotated[list[Path] | None, option("LOGS...", "Log files or folders.")]
-MoreData = Annotated[
-    list[Path] | None, argument("LOGS", "More log files or folders; several may follow --data.")
-]
-MappingFile = Annotated[
-    Path | None, option("FILE", "YAML file with column names and units of the logs; see docs/logs.md.")
-]
-Accept = Annotated[
-    list[str] | None, option("CODE", "Use logs with this error, which names its code; once for each.")
-]
-TextOrJson = Annotated[Literal["text", "json"], option("", "Format of the result on stdout.")]
-Filter = Annotated[
-    float | None, option("HZ", "Cutoff frequency of the zero-phase low-pass filter; 0: no filter.", min=0.0)
-]
-Address = Annotated[
-    str | None, option("HOST:PORT", "Address of a running Ray cluster; default: a new one on this machine.")
-]
-Strict = Annotated[bool, flag("--strict", "Exit with 1 if there is any warning.")]
-Force = Annotated[bool, flag("--force", "Overwrite existing output.")]
+TextOrJson = Literal["text", "json"]
+
+ROBOT = argument("ROBOT.urdf", "URDF of the arm; settings are read from ROBOT.yaml beside it.")
+ROBOT_OPTION = option("ROBOT.urdf", "URDF of the module, if it is not found by name.")
+MODULE = argument("MODULE.py", "A module written by `spelgen build`.")
+RUN = argument("RUN", "A run folder of `spelgen train`.")
+JOINTS = option("A,B,C", "Moving joints; all others are locked at zero.")
+TIP = option("LINK", "Last link of the chain, which starts at the root.")
+ASSUMPTION = option(
+    "",
+    "URDF values the structure may use: kinematics, or also zeros and symmetries of inertials.",
+    default="kinematics",
+)
+ANGLE_TOLERANCE = option(
+    "RAD", "Tolerance for rounding angles to special values such as pi/2.", min=0.0, max=0.1, default=2e-3
+)
+ENTRY = option("ROW,COLUMN|V", "Write this entry of M, or V, as an expression.")
+DATA = option("LOGS...", "Log files or folders.")
+MORE_DATA = argument("LOGS", "More log files or folders; several may follow --data.", default=None)
+MAPPING_FILE = option("FILE", "YAML file with column names and units of the logs; see docs/logs.md.")
+ACCEPT = option("CODE", "Use logs with this error, which names its code; once for each.")
+TEXT_OR_JSON = option("", "Format of the result on stdout.", default="text")
+FILTER = option("HZ", "Cutoff frequency of the zero-phase low-pass filter; 0: no filter.", min=0.0)
+ADDRESS = option("HOST:PORT", "Address of a running Ray cluster; default: a new one on this machine.")
+STRICT = flag("--strict", "Exit with 1 if there is any warning.")
+FORCE = flag("--force", "Overwrite existing output.")
+OUTPUT = output_option("FILE", "Write the result to a file.")
 
 
-Output = Annotated[Path | None, output_option("FILE", "Write the result to a file.")]
-
-
-def result_format() -> OptionInfo:
-    """Return the option `--format` of a command; each command has its own formats."""
+def result_format() -> Declared:
+    """Return the option `--format` of a command; each command has its own formats, which its help lists."""
     return option("", "Format of the result; default: that of the suffix of -o, else text.")
 
 
 def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
-    """Return the format of a result: `format`, else the format for the suffix of the output file, else text."""
-    # A suffix without a format of this command is no error: users may choose any file name.
-    by_suffix = SUFFIXES.get(output.suffix.lower(), "text") if output else "text"
-    return format or (by_suffix if by_suffix in formats else "text")
+    """Return the format of a result: `format`, else the format for the suffix of the output file, else text.
+
+    formats: formats of the command. Raises a usage error for a suffix of another format.
+    """
+    if format or output is None:
+        return format or "text"
+    suffixes = {suffix: name for suffix, name in SUFFIXES.items() if name in formats}
+    if output.suffix.lower() not in suffixes:
+        forms = ", ".join(filter(None, suffixes))
+        message = f"{output.name!r} has no suffix of a format of this command: {forms}"
+        raise typer.BadParameter(message, param_hint="'--output'")
+    return suffixes[output.suffix.lower()]
 
 
 def write_result(format: str | None, output: Path | None, forms: Mapping[str, Callable[[], str]]) -> None:
     """Print a result, or write it to a file. forms: format -> function that returns the text of the result."""
     deliver(forms[choose_format(format, output, forms)]() + "\n", output)
-
-
-def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command in which an argument that is a dataclass is replaced by one option per field."""
-    parameters: list[inspect.Parameter] = []
-    groups: dict[str, type] = {}
-    declared = get_type_hints(command, include_extras=True)
-    for name, parameter in inspect.signature(command).parameters.items():
-        group = declared[name]
-        if not (isinstance(group, type) and is_dataclass(group)):
-            parameters.append(parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=group))
-            continue
-        groups[name], options = group, get_type_hints(group, include_extras=True)
-        for field in fields(group):
-            annotation, default = options[field.name], field.default
-            parameters.append(
-                inspect.Parameter(field.name, parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-            )
-
-    @wraps(command)
-    def run(**values: object) -> None:
-        for name, group in groups.items():
-            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
-        command(**values)
-
-    # Typer reads the options from the signature and the annotations.
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    vars(run)["__signature__"] = inspect.Signature(parameters)
-    return run
 
 
 def names(text: str | None) -> list[str] | None:
@@ -198,11 +175,20 @@ def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequen
     return chosen.model_copy(update={"accept": tuple(accepted)})
 
 
-def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> Arm:
-    """Return the arm of a URDF. joints, tip, angle_tolerance: values of the options of a command, as text or number."""
-    from spelgen.arm.configured_arm import load_arm
+@dataclass(frozen=True)
+class ArmOptions:
+    """Arguments and options of commands that read an arm from a URDF."""
 
-    return load_arm(robot, names(joints), tip, angle_tolerance)
+    robot: Path = ROBOT
+    joints: str | None = JOINTS
+    tip: str | None = TIP
+    angle_tolerance: float = ANGLE_TOLERANCE
+
+    def load(self) -> Arm:
+        """Return the arm."""
+        from spelgen.arm.configured_arm import load_arm
+
+        return load_arm(self.robot, names(self.joints), self.tip, self.angle_tolerance)
 
 
 def require_free(path: Path, *, force: bool) -> None:

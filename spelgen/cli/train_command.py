@@ -7,54 +7,46 @@ import math
 import textwrap
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import argument, flag, option, output_option
-from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, new_run, read_assignments, resumed_run
-from spelgen.errors import LogError, ModuleError, OptionError
+from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, fit_options, read_assignments
+from spelgen.errors import LogError, ModuleError, OptionError, RunError
 from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, TorqueFit, WindowConfig
+from spelgen.settings.training import OF_LOGS, TrainingSettings
 
 if TYPE_CHECKING:
     from spelgen.fitting.fitted import Fit
     from spelgen.live.payload import Payload
+    from spelgen.settings.log_mapping import LogMapping
     from spelgen.spec import ModelSpec
 
 
-TrainModule = Annotated[
-    Path | None, argument("MODULE.py", "Module of `spelgen build`; with --resume, a run folder.")
-]
-NewRun = Annotated[Path | None, output_option("RUN", "Run folder; default: runs/<module>.")]
-Resume = Annotated[bool, flag("--resume", "Resume the run in the run folder.")]
-Source = Annotated[Path | None, option("RUN", "Adapt the model of this run; replaces MODULE.", "--from")]
-ObjectiveName = Annotated[
-    Objective | None,
-    option("", "Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."),
-]
-Assignments = Annotated[
-    list[str] | None,
-    option("KEY=VALUE", "Set an option of the fit, e.g. epochs=50; repeat it for more options.", "--set"),
-]
-
-
 def train(
-    module: TrainModule = None,
-    extra_logs: options.MoreData = None,
-    data: options.Data = None,
-    output: NewRun = None,
-    robot: options.RobotOption = None,
-    mapping: options.MappingFile = None,
-    resume: Resume = False,
-    force: options.Force = False,
-    source: Source = None,
-    objective: ObjectiveName = None,
-    assignments: Assignments = None,
-    accept: options.Accept = None,
-    format: options.TextOrJson = "text",
+    module: Path | None = argument(
+        "MODULE.py", "Module of `spelgen build`; with --resume, a run folder.", default=None
+    ),
+    extra_logs: list[Path] | None = options.MORE_DATA,
+    data: list[Path] | None = options.DATA,
+    output: Path | None = output_option("RUN", "Run folder; default: runs/<module>."),
+    robot: Path | None = options.ROBOT_OPTION,
+    mapping: Path | None = options.MAPPING_FILE,
+    resume: bool = flag("--resume", "Resume the run in the run folder."),
+    force: bool = options.FORCE,
+    source: Path | None = option("RUN", "Adapt the model of this run; replaces MODULE.", "--from"),
+    objective: Objective | None = option(
+        "", "Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."
+    ),
+    assignments: list[str] | None = option(
+        "KEY=VALUE", "Set an option of the fit, e.g. epochs=50; repeat it for more options.", "--set"
+    ),
+    accept: list[str] | None = options.ACCEPT,
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Fit a module to logs.
 
@@ -63,15 +55,12 @@ def train(
     """
     start_time = time.monotonic()  # max_minutes includes the time to read the logs
     # Keys are checked before any file is read, so that a misspelt key costs no time.
-    request, recorded = Request(objective, read_assignments(assignments or [])), None
+    request = Request(objective, read_assignments(assignments or []))
     if source is not None:
-        from spelgen.fitting.run_folder import RunFolder
-
         if module is not None:
-            extra_logs = [module, *(extra_logs or [])]  # with --from, all arguments are logs
-        run = RunFolder(source)
-        recorded = run.read_record().mapping  # raises an error if the folder is not a run
-        robot = robot or (run.urdf if run.urdf.exists() else None)
+            # With --from there is no argument MODULE, so the first argument is a log, too.
+            extra_logs = [module, *(extra_logs or [])]
+        robot = robot or _urdf_of_run(source)
         request = _warm_start(request)
     elif "adapt" in request.values:
         raise UsageError("--set adapt: belongs to --from")
@@ -80,35 +69,34 @@ def train(
     paths = options.logs(data, extra_logs)
     # With --resume the first argument may be the run folder instead of a module.
     folder = output or _default_folder(module, source, resume=resume)
-    spec = _specification(module, source, folder if resume else None)
+    spec, recorded = _specification(module, folder if resume else source)
     # A resumed run uses the settings in its record, since the settings file of the robot may have changed.
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
-    start = resumed_run(folder, request) if resume else new_run(urdf, request)
     from spelgen.emission.specify import arm_of_spec
     from spelgen.log_checks.check_logs import require_sound_logs
 
-    # The arm is needed to check logs, and for a mapping that contains all joints of the URDF.
+    # The arm is needed to check the logs, and the names in a mapping, which may have every joint of the URDF.
     arm = None if urdf is None else arm_of_spec(spec, urdf)
-    log_mapping = options.log_mapping(arm or spec.joint_names, mapping or start.mapping or recorded, accept)
+    settings = TrainingSettings() if arm is None else arm.settings.training
+    log_mapping = options.log_mapping(arm or spec.joint_names, mapping or recorded, accept)
     # Torch is imported after the checks above, so that their errors are reported without delay.
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
-    from spelgen.logs.preprocessing import Preprocessing
 
     # Device and threads are not recorded, because they describe the machine and not the result.
     machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
+    config = fit_options(request, None if resume else settings)
+    of_logs = settings.model_dump(include=OF_LOGS, exclude_unset=True)
     try:
         fit = train_files(
             module,
             paths,
             folder,
-            start.options,
+            config,
             urdf=urdf,
             source=source,
-            preprocessing=Preprocessing(**start.settings.preprocessing),
-            validation=start.settings.validation_fraction,
-            seed=start.settings.seed,
+            of_logs=of_logs | request.values_of(OF_LOGS),
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
@@ -120,17 +108,20 @@ def train(
 
 
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
-    """Return the payload in the logs of a model that was adapted to a load; None for any other fit.
+    """Write the noise levels of the estimator; return the payload in the logs of a fit with `adapt=load`, else None.
 
-    The estimator of the source run computes it, with noise levels of that run; None if that run has no noise levels.
-    A new fit gets noise levels of its own, an adapted run keeps the noise levels of its source run.
+    source: the run that was adapted. Its model and its noise levels estimate the payload, and the adapted run gets a
+    copy of these noise levels; without noise levels in the source run there is no payload. A fit without a source run
+    gets noise levels from its own logs.
     """
-    from spelgen.live.levels import keep_levels, stored_levels
+    from spelgen.live.levels import cross_validated_levels, keep_levels, stored_levels
     from spelgen.live.replay import carried_payload
+    from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
     if source is None:
         try:
-            keep_levels(fit)
+            if isinstance(fit.config, TorqueFit) and isinstance(fit.model, RigidBodyDynamics):
+                keep_levels(fit, cross_validated_levels(fit))
         except LogError as error:
             note(f"info: no estimator: {error}")
         return None
@@ -197,7 +188,7 @@ def _outcome(fit: Fit) -> tuple[str, str]:
 
 
 def _warm_start(request: Request) -> Request:
-    """Return the request to adapt a fitted model; by default the load is adapted, with the torque objective."""
+    """Return the request of a warm start; by default the objective is "torque", for which `adapt` is "load"."""
     objective, values = request.objective or "torque", dict(request.values)
     if objective == "torque":
         values.setdefault("adapt", "load")
@@ -211,18 +202,35 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
     if resume and module is not None and module.is_dir():
         return module
     name = f"{(source or Path()).resolve().name}_adapted" if module is None else module.stem
-    return Path("runs") / name
+    folder = Path("runs") / name
+    if resume and module is not None and not folder.is_dir():
+        got = f"no run: {module} is no folder, and there is no {folder}, the default folder of this module"
+        raise RunError(got, element="--resume", do="name the run folder, or pass it by -o")
+    return folder
 
 
-def _specification(module: Path | None, source: Path | None, resumed: Path | None) -> ModelSpec:
-    """Return the specification of the model, from the module or from the run that is resumed or adapted."""
+def _specification(module: Path | None, run: Path | None) -> tuple[ModelSpec, LogMapping | None]:
+    """Return the specification of the model, and the recorded mapping of the logs.
+
+    Both are read from the run that is resumed or adapted. For a new fit, the specification is read from the module, and
+    there is no mapping.
+    """
     from spelgen.emission.text import read_spec
     from spelgen.fitting.run_folder import RunFolder
 
-    folder = resumed or source
-    if folder is None and module is not None:
-        return read_spec(module)
-    return RunFolder(folder or Path()).read_spec()
+    if run is None and module is not None:
+        return read_spec(module), None
+    folder = RunFolder(run or Path())
+    return folder.read_spec(), folder.read_record().mapping
+
+
+def _urdf_of_run(folder: Path) -> Path | None:
+    """Return the URDF in a run folder, if there is one. Raises RunError if the folder is not a run."""
+    from spelgen.fitting.run_folder import RunFolder
+
+    run = RunFolder(folder)
+    run.read_record()
+    return run.urdf if run.urdf.exists() else None
 
 
 def _unchanged_urdf(module: Path, spec: ModelSpec) -> Path | None:

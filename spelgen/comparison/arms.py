@@ -50,7 +50,7 @@ class ComparedArm(Group):
     tip: str | None = None
 
     def files(self) -> Iterator[tuple[str, Path]]:
-        """Yield each path of the arm, after the key of the YAML file that contains it."""
+        """Yield (key, path) for each path of the arm, with the key of the path in the YAML file of the comparison."""
         yield "urdf", self.urdf
         yield from (("data", path) for path in self.data)
         if self.mapping is not None:
@@ -68,9 +68,10 @@ class Comparison(Group):
 
     presets: names or YAML files of designs; by default closed-form and hybrid on logs, and all presets on a simulated
     arm. seeds: number of seeds 0, 1, ...; by default 1 on logs, and `comparison.seeds` of the settings of a simulated
-    arm. splits: 1 for training on train.* and testing on test.* of the logs, or on a quarter of the trajectories; k for
-    k-fold cross-validation over whole trajectories. width, depth: size of the hidden layers. training: training
-    settings for all arms, with the keys of a robot's settings. steps: number of training steps on simulated arms.
+    arm. splits: 1: train on the logs train.* and test on the logs test.*; without such files, test on a quarter of the
+    trajectories. k > 1: k-fold cross-validation over whole trajectories. width, depth: size of the hidden layers.
+    training: training settings for all arms, with the keys of a robot's settings. steps: number of training steps on
+    simulated arms.
     """
 
     arms: Annotated[dict[Name, ComparedArm], Field(min_length=1)]
@@ -210,9 +211,10 @@ def arm_inputs(
 
 
 def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress | None) -> None:
-    """Simulate logs by the protocol of the arm's settings, unless they are in the folder.
+    """Simulate logs by the protocol of the arm's settings, unless the folder already contains them.
 
-    Models know only a copy of the URDF without inertials, drives and friction, so that no model starts from the truth.
+    Models are built from a copy of the URDF without inertials, drives and friction, so that no model starts from the
+    true parameters.
     """
     # Imported here, because Pinocchio is an extra that logs of the user do not need.
     from spelgen.simulation.simulate import simulate

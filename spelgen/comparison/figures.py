@@ -19,7 +19,7 @@ from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
 from spelgen.evaluation.plain import Curve, finite
-from spelgen.evaluation.rollout import Invariants, invariants, mass_error, true_mass
+from spelgen.evaluation.rollout import energy_rise, mass_error, smallest_eigenvalue, true_mass
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
@@ -54,49 +54,24 @@ class ComparisonTuning:
 TUNING = ComparisonTuning()
 
 
-@dataclass(frozen=True)
-class PredictionLoss:
-    """Squared errors of predicted windows, summed over joints, mean over windows and samples; units rad, m, s.
+Figures = dict[str, int | float | None]
+"""Row of a table -> figure; None for a figure that is not finite."""
 
-    position: squared position error, for revolute joints the squared geodesic distance. velocity: squared velocity
-    error. loss: sum of both (eq. 8 of the paper). None: the error is not finite.
-    """
-
-    loss: float | None
-    position: float | None
-    velocity: float | None
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """Sizes of a model.
-
-    outputs: number of outputs of the networks of M, D, G and V. inputs: number of inputs of the network of M.
-    parameters: number of trained parameters of the model.
-    """
-
-    outputs: tuple[int, ...]
-    inputs: int
-    parameters: int
+NETWORKS = {"mass": "M", "friction": "D", "input_network": "G", "potential": "V"}
+"""Part of the name of a network -> the matrix or the potential energy that the network computes."""
 
 
 @dataclass(frozen=True)
 class SimulatedFigures:
     """Figures of a model of a simulated arm.
 
-    train, test: losses on training and test logs, for windows as long as in training. prediction: loss of predictions
-    over 1 s of the test motions. mass_error: relative error of M, see `mass_error`. step_seconds: time of a training
-    step [s], see `step_seconds`. example: a test motion and its prediction; None if no test motion lasts 1 s. mass:
-    (T, n, n) learned M at the measured positions of the example.
+    losses: squared errors of predictions, and the relative error of M (see `mass_error`). sizes: sizes of the networks,
+    time of a training step, and invariants. example: a test motion and its prediction; None if no test motion lasts
+    1 s. mass: (T, n, n) learned M at the measured positions of the example.
     """
 
-    sizes: Sizes
-    train: PredictionLoss
-    test: PredictionLoss
-    prediction: PredictionLoss
-    invariants: Invariants
-    mass_error: float
-    step_seconds: float
+    losses: Figures
+    sizes: Figures
     mass: Curve | None
     example: PredictedMotion | None
 
@@ -117,17 +92,19 @@ def simulated_figures(
     visited = far.q[:, 0]
     example = predict_example(of_dynamics("", model, far), testing, steps, decimation)
     mass = None if example is None else model.mass_matrix(torch.from_numpy(example.q)).numpy()
-    return SimulatedFigures(
-        sizes=sizes(model),
-        train=prediction_loss(model, spread_windows(training, config.window, decimation), substeps),
-        test=prediction_loss(model, spread_windows(testing, config.window, decimation), substeps),
-        prediction=prediction_loss(model, far, substeps),
-        invariants=invariants(model, far, low, high),
-        mass_error=mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints)),
-        step_seconds=step_seconds(model, training, config, decimation),
-        mass=mass,
-        example=example,
-    )
+    loss, position, velocity = prediction_loss(model, far, substeps)
+    losses: Figures = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
+    losses["M, relative error"] = mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints))
+    # These two losses are of windows as long as in training.
+    for label, logs in (("training loss", training), ("test loss", testing)):
+        windows = spread_windows(logs, config.window, decimation)
+        losses[label] = prediction_loss(model, windows, substeps)[0]
+    rows = sizes(model)
+    rows["training step [ms]"] = 1e3 * step_seconds(model, training, config, decimation)
+    with torch.no_grad():
+        rows["smallest eigenvalue of M / mean"] = smallest_eigenvalue(model, low, high)
+        rows["rise of energy, no input"] = energy_rise(model, far)
+    return SimulatedFigures(losses, rows, mass, example)
 
 
 def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
@@ -147,38 +124,45 @@ def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, d
 
 def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
     """Return at most about `TUNING.windows` windows, evenly spread over the logs."""
-    # The stride is a multiple of the decimation, because the controller changes its torque at these samples only.
+    # Windows start at multiples of the decimation: the simulated controller changes its torque at such samples only.
     starts = sum(max(0, len(log) - (samples - 1) * decimation) for log in logs)
     stride = -(-max(1, -(-starts // TUNING.windows)) // decimation) * decimation
     return cut_windows(logs, samples, stride, decimation, measured=False)
 
 
-def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> PredictionLoss:
-    """Return the loss of predictions from the first sample of the windows. substeps: integrator steps per sample."""
+def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> tuple[float | None, ...]:
+    """Return three squared errors of predictions from the first sample of the windows.
+
+    They are sums over joints and means over windows and samples, in units of rad, m and s: the sum of both other errors
+    (eq. 8 of the paper), the position error (for revolute joints the geodesic distance), and the velocity error. None:
+    the error is not finite. substeps: integrator steps per sample.
+    """
     with torch.no_grad():
         q, qd = roll_out(model, windows, substeps)
         difference = position_difference(q, windows.q[:, 1:], model.joint_types)
         position = difference.square().sum(dim=-1).mean()
         velocity = (qd - windows.qd[:, 1:]).square().sum(dim=-1).mean()
-    return PredictionLoss(*finite(torch.stack([position + velocity, position, velocity])))
+    return finite(torch.stack([position + velocity, position, velocity]))
 
 
-def sizes(model: ArmModel) -> Sizes:
-    """Return the numbers of outputs and inputs of the networks of M, D, G and V, residual networks included."""
-    outputs, inputs = [], 0
-    for quantity in ("mass", "friction", "input_network", "potential"):
-        count = 0
-        for name, module in model.named_modules():
-            masks = [x for key, x in module.named_buffers(recurse=False) if key.startswith("mask")]
-            if masks and quantity in name.split("."):
-                # Outputs without inputs are not counted: V of an arm without gravity has one such output.
-                count = int(masks[-1].flatten(1).any(dim=1).sum())
-                if quantity == "mass":
-                    inputs = int(masks[0].flatten(1).any(dim=0).sum())
-        outputs.append(count)
+def sizes(model: ArmModel) -> Figures:
+    """Return the numbers of outputs of the networks of M, D, G and V, residual networks included.
+
+    Also return the number of inputs of the network of M, and the number of trained parameters of the model.
+    """
+    figures: Figures = {f"outputs of {matrix}": 0 for matrix in NETWORKS.values()}
     # Friction without a network counts as one output per joint.
-    outputs[1] = outputs[1] or model.n
-    return Sizes(tuple(outputs), inputs, parameter_count(model))
+    figures |= {"outputs of D": model.n, "inputs of M": 0}
+    for name, module in model.named_modules():
+        masks = [x for key, x in module.named_buffers(recurse=False) if key.startswith("mask")]
+        for quantity in NETWORKS.keys() & name.split("."):
+            if masks:
+                # Outputs without inputs are not counted: V of an arm without gravity has one such output.
+                outputs = int(masks[-1].flatten(1).any(dim=1).sum())
+                figures[f"outputs of {NETWORKS[quantity]}"] = outputs
+            if masks and quantity == "mass":
+                figures["inputs of M"] = int(masks[0].flatten(1).any(dim=0).sum())
+    return figures | {"parameters": parameter_count(model)}
 
 
 def predict_example(

@@ -108,7 +108,7 @@ class Job(Group):
 
     @property
     def named_design(self) -> str | Design:
-        """Return the design in the form that `build` accepts."""
+        """Return the design as `build` accepts it: the name of a preset, the path of a YAML file, or a `Design`."""
         return ablation_designs().get(self.design, self.design)
 
     def build(self) -> ArmModel:
@@ -182,7 +182,8 @@ def run_job(job: Job) -> RunResult:
         errors = _errors(results)
     else:
         simulated = simulated_figures(trained, training, testing, job.inputs.truth)
-        errors = {"prediction loss, 1 s": {MODEL: simulated.prediction.loss}}
+        # The first loss ranks the models.
+        errors = {label: {MODEL: loss} for label, loss in list(simulated.losses.items())[:1]}
     result = RunResult(
         key=job.key, arm=job.arm, preset=job.preset, seed=job.seed, split=job.split, seconds=seconds,
         parameters=trained.parameters, errors=errors, simulated=simulated,
@@ -196,7 +197,7 @@ def _own_checkpoint(job: Job, run: RunFolder) -> bool:
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()
-    run.config.unlink(missing_ok=True)  # without config.json the folder is not a run
+    run.config.unlink(missing_ok=True)  # without config.json the folder is no run, and a new fit starts
     write_json(owner, {"key": job.key})
     return False
 

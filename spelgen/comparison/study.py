@@ -17,9 +17,9 @@ from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.evaluation.plain import record
 from spelgen.files import write_json
 from spelgen.labels import MODEL, counted
-from spelgen.listing import number
+from spelgen.listing import duration, number
 from spelgen.settings.settings import load_settings
-from spelgen.tasks import RunTasks
+from spelgen.tasks import run_tasks
 
 PRESETS_ON_LOGS: tuple[str, ...] = ("closed-form", "hybrid")
 # The models of the paper (Wang et al., Sci Rep 15:33179, 2025) are first.
@@ -67,8 +67,8 @@ class Study:
 def prepare_study(comparison: Comparison, folder: Path, progress: Progress | None = None) -> Study:
     """Prepare the inputs of all arms, find finished runs, and estimate the time of the others.
 
-    An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist,
-    RunError if no arm can be used, and the error of a single arm.
+    An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist, and
+    RunError if no arm can be used; if there is only one arm, the error of this arm is raised instead.
     """
     # Presets are checked first, so that a misspelt name is an error before logs are simulated.
     for preset in set(comparison.presets or ()) - ablation_designs().keys():
@@ -97,16 +97,16 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     return Study(folder, tuple(jobs), results, failures, estimates)
 
 
-def run_study(study: Study, run_tasks: RunTasks, note: Callable[[str], None]) -> Study:
+def run_study(study: Study, note: Callable[[str], None], jobs: int = 1, address: str | None = None) -> Study:
     """Run the unfinished jobs, write comparison.json and return the study with all results.
 
     A run with an error becomes a failure of the study; the same command runs it again. note: function called with a
-    line of text after each run.
+    line of text after each run. jobs, address: see `run_tasks`.
     """
     waiting = [job for job in study.jobs if job.name in study.estimates]
     results, failures = dict(study.results), dict(study.failures)
     start, done, total = time.monotonic(), 0.0, sum(study.estimates.values())
-    for count, (job, outcome) in enumerate(run_tasks(run_job, waiting), start=1):
+    for count, (job, outcome) in enumerate(run_tasks(run_job, waiting, jobs, address), start=1):
         # Progress is measured in estimated seconds and not in runs, because presets differ in cost.
         done += study.estimates[job.name]
         if isinstance(outcome, Exception):
@@ -124,13 +124,6 @@ def run_study(study: Study, run_tasks: RunTasks, note: Callable[[str], None]) ->
     figures = [record(replace(result, simulated=None)) for result in results.values()]
     write_json(study.folder / "comparison.json", {"schema": 1, "failures": failures, "results": figures})
     return finished
-
-
-def duration(seconds: float) -> str:
-    """Return a time in words, such as `40 s`, `12 min` or `3.5 h`."""
-    if seconds < 90:
-        return f"{max(seconds, 1):.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) -> list[Job]:
@@ -157,7 +150,10 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
 
 
 def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
-    """Return the expected time of a run [s]: of finished runs of this arm and preset, else from the training steps."""
+    """Return the expected time of a run [s]: the median time of finished runs of the same arm and preset.
+
+    Without such runs it is, on simulated arms, the number of training steps times the measured time of a step.
+    """
     finished = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
     if finished:
         return statistics.median(finished) + TUNING.measuring

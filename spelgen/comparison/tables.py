@@ -5,7 +5,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from spelgen.comparison.figures import SimulatedFigures
+from spelgen.comparison.figures import Figures
 from spelgen.comparison.jobs import RunResult
 from spelgen.comparison.study import Study
 from spelgen.evaluation.tables import Row, Table, table
@@ -17,26 +17,6 @@ BASELINE = "phnode"
 Runs = Mapping[str, Sequence[RunResult]]
 """Preset -> results of the runs of an arm with all seeds and splits."""
 Numbers = dict[str, float | None]
-Figure = Callable[[SimulatedFigures], float | None]
-
-LOSSES: dict[str, Figure] = {
-    "prediction loss, 1 s": lambda run: run.prediction.loss,
-    "velocity, 1 s": lambda run: run.prediction.velocity,
-    "position, 1 s": lambda run: run.prediction.position,
-    "M, relative error": lambda run: run.mass_error,
-    "training loss": lambda run: run.train.loss,
-    "test loss": lambda run: run.test.loss,
-}
-SIZES: dict[str, Figure] = {
-    "outputs of M": lambda run: run.sizes.outputs[0],
-    "outputs of D": lambda run: run.sizes.outputs[1],
-    "outputs of G": lambda run: run.sizes.outputs[2],
-    "outputs of V": lambda run: run.sizes.outputs[3],
-    "inputs of M": lambda run: run.sizes.inputs,
-    "parameters": lambda run: run.sizes.parameters,
-    "training step [ms]": lambda run: 1e3 * run.step_seconds,
-    "smallest eigenvalue of M / mean": lambda run: run.invariants.least_eigenvalue,
-}
 RATIO = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
 """Label of a row -> name in the label of the next row, which shows the baseline's figure divided by each model's."""
 
@@ -68,22 +48,22 @@ def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFi
     # Logs of the user have no known true parameters: models are ranked by their errors on test logs only.
     if not all(figures.values()):
         return [_ranking(runs)]
-    losses: dict[str, Numbers] = {}
+    of_seeds: dict[str, Numbers] = {}
     for result in sorted(results, key=lambda result: (result.seed, result.split)):
         split = f", split {result.split}" if any(x.split for x in results) else ""
         loss = next(iter(result.errors.values()))[MODEL]
-        losses.setdefault(f"seed {result.seed}{split}", {})[result.preset] = loss
+        of_seeds.setdefault(f"seed {result.seed}{split}", {})[result.preset] = loss
     rows = []
-    for label, figure in SIZES.items():
-        is_ranked = label in ("parameters", "training step [ms]")
-        rows.append(Row(label, _summary(figures, figure, min), is_ranked))
-    rise = _summary(figures, lambda run: run.invariants.energy_rise, max)
-    rows.append(Row("rise of energy, no input", rise, ranked=False))
+    sizes = {name: [run.sizes for run in x] for name, x in figures.items()}
+    for label in next(iter(sizes.values()))[0]:
+        worst = max if label == "rise of energy, no input" else min
+        rows.append(Row(label, _summary(sizes, label, worst), label in ("parameters", "training step [ms]")))
+    losses = {name: [run.losses for run in x] for name, x in figures.items()}
     title = (
         "Sizes, time of a training step, and invariants, the worst over seeds; a negative rise is a decrease"
     )
-    of_runs = table("Prediction loss over 1 s of every run", losses)
-    return [_losses(figures, published), Table(title, tuple(rows)), of_runs]
+    of_runs = table("Prediction loss over 1 s of every run", of_seeds)
+    return [_losses(losses, published), Table(title, tuple(rows)), of_runs]
 
 
 def arm_sentence(results: Sequence[RunResult]) -> str:
@@ -160,15 +140,13 @@ def _medians(runs: Runs, measure: str) -> Numbers:
     return dict(sorted(medians.items(), key=lambda item: math.inf if item[1] is None else item[1]))
 
 
-def _losses(
-    figures: Mapping[str, Sequence[SimulatedFigures]], published: Mapping[str, PublishedFigures]
-) -> Table:
+def _losses(figures: Mapping[str, Sequence[Figures]], published: Mapping[str, PublishedFigures]) -> Table:
     rows = []
-    for label, figure in LOSSES.items():
-        medians = _summary(figures, figure, statistics.median)
+    for label in next(iter(figures.values()))[0]:
+        medians = _summary(figures, label, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        # Ratios are added, because absolute losses of the paper depend on its units and sampling.
+        # The baseline's loss divided by each loss is added: absolute losses depend on the units and the sample rate.
         if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))
@@ -186,10 +164,10 @@ def _losses(
 
 
 def _summary(
-    figures: Mapping[str, Sequence[SimulatedFigures]], figure: Figure, combine: Callable[[list[float]], float]
+    figures: Mapping[str, Sequence[Figures]], label: str, combine: Callable[[list[float]], float]
 ) -> Numbers:
-    """Return preset -> one figure, combined over the runs of the preset. combine: median, for example."""
-    return {name: _combined(list(map(figure, of_preset)), combine) for name, of_preset in figures.items()}
+    """Return preset -> the figure of a row, combined over the runs of the preset. combine: median, for example."""
+    return {name: _combined([run[label] for run in runs], combine) for name, runs in figures.items()}
 
 
 def _combined(values: Sequence[float | None], combine: Callable[[list[float]], float]) -> float | None:

@@ -1,7 +1,7 @@
 """Conversions of inertial parameters, the regressor of the joint torques, and base parameters.
 
-The base parameters are equal to the ones of `identification.base_parameters`, which uses exact arithmetic. Here they
-are computed numerically from the kinematics.
+The base parameters of `base_combinations` are computed numerically. Their inertial parts are equal to the exact base
+parameters of `structure.base_parameters`.
 """
 
 import numpy as np
@@ -54,8 +54,9 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
         q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     count = len(chain.parents)
-    # With the homogeneous transform T (4 x 4), its time derivative T', and the pseudo-inertia J of a body, the kinetic
-    # energy is 1/2 tr(T' J T'^T), which is linear in J. The identity in place of point masses gives the columns of T.
+    # T (4 x 4) is the homogeneous transform of a body, T' its time derivative, and J the pseudo-inertia. The kinetic
+    # energy, 1/2 tr(T' J T'^T), is linear in J. `forward` transforms points: with the columns of the identity as
+    # points, the result is T.
     pose = chain.forward(q, torch.eye(4 * count).to(q))
     rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
     rises = torch.unflatten(rises, -1, (3, count, 4))
@@ -95,7 +96,8 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     columns is regrouped into their parameters (Gautier and Khalil, IEEE T-RA 6:368, 1990).
     """
     n, inertial = len(motors), 10 * len(chain.parents)
-    # Parameters that can always be regrouped come last, so that the conventional base parameters are found.
+    # In BASE_ORDER, the parameters of a body that other parameters usually absorb come last: the result then has the
+    # conventional base parameters.
     order = [
         10 * body + INERTIAL_PARAMETERS.index(name) for body in range(inertial // 10) for name in BASE_ORDER
     ]

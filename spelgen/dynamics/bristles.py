@@ -70,46 +70,22 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     path = encoded(q)
     if bristles.motors is not None:
         path = path @ bristles.motors.T
-    corners, latest = turning_points(path)
-    drives, reach = np.arange(path.shape[1]), torch.from_numpy(bristles.values)
-    turned_at = np.take_along_axis(path, corners, axis=0)
-    at_corners = [torch.zeros_like(reach)]
-    # Only reversals are sequential, and they are few: given z at the latest reversal, all samples after it are
-    # independent of each other.
-    for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
-        at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
-    turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
-    # Number of samples that are computed together; it limits the memory of temporary arrays.
-    size = 2**14
-    for start in range(0, len(q), size):
-        block = slice(start, start + size)
-        corner = latest[block], drives
-        moved = torch.from_numpy(path[block] - turned_at[corner])
-        z[block] = moved_bristles(turned_with[corner], moved[..., None], reach).numpy()
+    z = np.empty((*q.shape, bristles.elements))
+    for drive, (positions, reach) in enumerate(zip(path.T, bristles.values, strict=True)):
+        steps = np.diff(positions)
+        # A drive at rest keeps the direction of its last motion.
+        moving = np.flatnonzero(steps)
+        signs = np.sign(steps[moving])
+        reversals = moving[1:][signs[1:] * signs[:-1] < 0]
+        corners = np.concatenate([[0], reversals])
+        at_corners = [np.zeros_like(reach)]
+        for displacement in np.diff(positions[corners]):
+            at_corners.append(np.clip(at_corners[-1] + displacement, -reach, reach))
+        # The latest reversal before each sample, or at the sample.
+        latest = np.searchsorted(corners, np.arange(len(q)), side="right") - 1
+        moved = positions - positions[corners[latest]]
+        z[:, drive] = np.clip(np.stack(at_corners)[latest] + moved[:, None], -reach, reach)
     return z
-
-
-def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the samples at which each column of a path (T, n) starts or reverses.
-
-    Returns:
-        Indices of these samples, (R, n): first the start, then the reversals, where R - 1 is the largest number of
-        reversals of a column. Columns with fewer reversals are padded with zeros.
-        For each sample, the row of this array with the latest start or reversal, (T, n).
-    """
-    steps = np.diff(path, axis=0, prepend=path[:1])
-    # A drive at rest keeps the direction of its last motion.
-    moving = np.where(steps != 0, np.arange(len(path))[:, None], 0)
-    # The running maximum of the indices of moving samples is the latest moving sample.
-    direction = np.sign(np.take_along_axis(steps, np.maximum.accumulate(moving, axis=0), axis=0))
-    turns = np.zeros(path.shape, dtype=bool)
-    turns[1:] = direction[1:] * direction[:-1] < 0
-    latest = turns.cumsum(axis=0)
-    # Drives with fewer reversals than others have zeros at the end, to which no sample refers.
-    corners = np.zeros((latest.max(initial=0) + 1, path.shape[1]), dtype=int)
-    samples, drives = np.nonzero(turns)
-    corners[latest[samples, drives], drives] = samples - 1
-    return corners, latest
 
 
 def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:

@@ -13,7 +13,6 @@ from spelgen.dynamics.equations import runge_kutta
 from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.protocol import known_past, memory_after, sliding_memory
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
-from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
     from spelgen.dynamics.tip import TipKinematics
@@ -44,7 +43,7 @@ class PreparedModel:
         self._model = reduced
         self._weights, self._tip, self.dtype = reduced.prepare(), tip, dtype
         self.n: int = reduced.n
-        self.elements: int = reduced.elements if isinstance(reduced, RigidBodyDynamics) else 0
+        self.elements: int = reduced.elements
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """Return the mass matrix M(q), (..., n, n) [kg m^2, kg m, kg]."""

@@ -122,7 +122,7 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        # Rollouts call the methods of the friction state on this object, so they are forwarded.
+        # Rollouts call the methods of the friction state on this object: it has the methods of `dynamics`.
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements

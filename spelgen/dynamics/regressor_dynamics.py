@@ -104,8 +104,8 @@ class RegressorDynamics:
         The momentum of a body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and
         its pseudo-inertia J.
         """
-        # The kinetic energy of a body is 1/2 tr(T' J T'^T), linear in J, so that J may be physically inconsistent. The
-        # identity in place of point masses gives the columns of T.
+        # The kinetic energy of a body, 1/2 tr(T' J T'^T), is linear in J, so that J may be physically inconsistent.
+        # `forward` transforms points: with the columns of the identity as points, the result is T.
         chain = self.chain.forward(q, torch.eye(len(self.inertia)).to(q))
         jacobian = torch.unflatten(self.chain.ratios.mT @ chain.jacobian, -1, (3, -1))
         return chain, (jacobian @ self.inertia).flatten(-2)

@@ -61,17 +61,18 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
-    batch = steepness.shape[1:-1] or (1,)  # batch dimensions of the constants
+    # Batch dimensions of the constants. Constants without batch dimensions get one of length 1.
+    batch = steepness.shape[1:-1] or (1,)
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
     return ServoDrives(model.servo.prepare(), constants, model.torque_offset, reach.view(shape), steepness)
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return the state in which dry friction balances all other torques, or is at its limit if it cannot.
+    """Return the state at q and qd in which the bristles balance all other torques, as at rest or in steady motion.
 
-    It is the state at rest, or of steady motion. q, u: positions and commands, (..., n) [rad, m]. qd: velocities, (...,
-    n) [rad/s, m/s].
+    Dry friction is at its limit if it cannot balance the other torques. q, u: positions and commands, (..., n)
+    [rad, m]. qd: velocities, (..., n) [rad/s, m/s].
     """
     servo = drives.servo
     torque = servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd

@@ -33,7 +33,8 @@ class TipKinematics:
         }
         constraint = mimic_constraint(robot, joints)
         rows = [constraint.names.index(joint.name) for joint in path if joint.moves]
-        self._jacobian = torch.from_numpy(constraint.jacobian[rows])  # (joints on the path to the link, n)
+        # Derivative of the moving joints on the path to the link with respect to the coordinates, (joints, n).
+        self._jacobian = torch.from_numpy(constraint.jacobian[rows])
         self._offset = torch.from_numpy(constraint.offset[rows])
         # A joint that does not move the link is probably a mistake of the caller: raise instead of a zero column.
         missing = [name for name, column in zip(joints, self._jacobian.T, strict=True) if not column.any()]

@@ -1,1 +1,1 @@
-"""Specification of a model from an arm's structure; model in memory, or source of a module, from a specification."""
+"""Derive the specification of a model from the structure of an arm; make a model or the source of a module from it."""

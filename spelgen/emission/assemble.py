@@ -56,8 +56,8 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
     """
     assembly = model_parts(spec)
     names: dict[str, object] = {"generator": torch.Generator().manual_seed(seed)}
-    # A module defines the function `mass_entries`. This replacement has the same operations in the same
-    # order.
+    # The source of a module defines the function `mass_entries`. In memory, `_mass_entries` takes its place, with the
+    # same operations in the same order, so that rounding errors are equal.
     names["mass_entries"] = partial(_mass_entries, entry_sums(spec))
     try:
         # The rows are evaluated first, because calls refer to them by name.
@@ -92,9 +92,10 @@ def spec_of(model: object) -> ModelSpec | None:
 
 
 def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
-    """Return M, (..., n, n), a linear function of terms (...,): the function ``mass_entries`` of a module.
+    """Return M, (..., n, n), as linear combinations of terms, (...,); equal to ``mass_entries`` of a module.
 
-    rows: linear combinations per row of the lower triangle. terms: values of the functions of q, then the constants.
+    rows: a list of linear combinations for each row of the lower triangle of M. terms: values of the functions of q,
+    then the constants.
     """
     return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in rows))
 
@@ -114,9 +115,8 @@ def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
 
 @cache
 def _model_class(base: str) -> Callable[..., ArmModel]:
-    """Return a class ``Model`` that derives from ``ArmModel`` and from this class of the runtime."""
-    # The cache makes one class per class of the runtime, so that models with equal dynamics have the same
-    # type.
+    """Return a class ``Model`` that derives from ``ArmModel`` and from ``base``, a class of ``spelgen.runtime``."""
+    # With the cache, models that derive from the same class of the runtime have the same type.
     return cast("Callable[..., ArmModel]", type("Model", (ArmModel, vars(runtime)[base]), {}))
 
 

@@ -1,4 +1,4 @@
-"""The parts of a model, from a ``ModelSpec``: the common source of models in memory and of the text of modules."""
+"""The parts of a model, from a ``ModelSpec``; models in memory and the text of modules are made from these parts."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -17,19 +17,18 @@ FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code(
 
 @dataclass(frozen=True)
 class ModelParts:
-    """The rows of an arm (``JOINTS``, ``LINKS``, ...), and the call that makes the model from the rows.
+    """The tables of an arm, and the constructor call that makes the model from the tables.
+
+    rows: the tables ``JOINTS``, ``LINKS``, ``FUNCTIONS`` and ``CONSTANTS``; a table is a tuple of rows, which are calls
+    of ``Joint``, ``Link``, ``Function`` or ``Constant``. model: the constructor call.
 
     All calls are calls of classes of ``spelgen.runtime``. An argument is a number, a text, a tuple, a call or a name.
-    Names refer to the rows, to the function ``mass_entries``, and to ``generator``, the random generator of initial
+    Names refer to the tables, to the function ``mass_entries``, and to ``generator``, the random generator of initial
     weights, which is used in the order of the calls.
     """
 
     rows: dict[str, tuple[Call, ...]]
     model: Call
-
-    def uses(self, name: Code) -> bool:
-        """Return True if the call refers to this name; for example, models with networks refer to ``generator``."""
-        return _names(self.model, name)
 
 
 def model_parts(spec: ModelSpec) -> ModelParts:
@@ -38,7 +37,7 @@ def model_parts(spec: ModelSpec) -> ModelParts:
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
     if spec.outputs and spec.links and spec.design.net != "none":
-        # Residual functions of M start at zero, so the rows have neither mean nor scale.
+        # The functions of a residual of M are zero initially, so their rows have neither mean nor scale.
         rows["FUNCTIONS"] = tuple(call("Function", _joint_names(spec, x.joints)) for x in spec.outputs)
     elif spec.design.mass == "derived":
         functions = [
@@ -69,17 +68,11 @@ def base_class(spec: ModelSpec) -> str:
     return "DenseInputDynamics" if spec.design.input == "dense-3n" else "NetworkDynamics"
 
 
-def _names(value: object, name: Code) -> bool:
-    """Return True if a value is this name, or contains it as an argument or item."""
-    if isinstance(value, Call):
-        return any(_names(item, name) for _, item in value.arguments)
-    if isinstance(value, tuple):
-        return any(_names(item, name) for item in value)
-    return value == name
-
-
 def _unless(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
-    """Return the fields without those at their default value, so that the rows of a module are short."""
+    """Return the keyword arguments without the arguments at their default, so that the rows of a module are short.
+
+    fields: values by the name of the argument. is_default: whether an argument has its default value.
+    """
     return {name: value for name, value in fields.items() if not is_default.get(name)}
 
 
@@ -146,7 +139,7 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
 def _friction_laws(spec: ModelSpec) -> Call:
     if spec.design.memory == "none":
         return call("SlidingFriction", JOINTS)
-    # The rows of the arm's joint types, always in the order of BREAKAWAY, so that the text is deterministic.
+    # `breakaway` has a row for each joint type of the arm, in the order of BREAKAWAY: the text is deterministic.
     breakaway = {name: row for name, row in BREAKAWAY.items() if name in spec.joint_types}
     rounding = {"stribeck_rounding": SERVO_STRIBECK_ROUNDING} if spec.servos else {}
     return call("FrictionLaws", JOINTS, breakaway=breakaway, **rounding)
@@ -190,7 +183,10 @@ def _mass_network(spec: ModelSpec) -> Call:
 
 
 def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
-    """Return two rows of input scales per joint: of cos q (or the scaled q of a prismatic joint), and of sin q."""
+    """Return the scales of the inputs of the network of M, in two rows (n,).
+
+    The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q.
+    """
     return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
 
 
@@ -212,7 +208,7 @@ def _friction(spec: ModelSpec) -> Call:
         width = TUNING.friction_units * n
         network = _network(spec, outputs, (scale, scale, speeds, ones), width=width, depth=1)
         return call("JointFriction", JOINTS, network=network)
-    # The published model has three axes per joint, of which only one moves.
+    # In the published model (Duong et al., IEEE T-RO 40:3695, 2024) a joint has three axes, of which one moves.
     axes = 3 if spec.design.dissipation == "dense-3n" else 1
     rows = axes * n
     network = _network(spec, (spec.joint_names,) * (rows * (rows + 1) // 2), (scale, scale, ones))
@@ -260,7 +256,10 @@ Sums = list[tuple[float, int]]
 
 
 def entry_sums(spec: ModelSpec) -> list[list[Sums]]:
-    """Return the linear combination of terms for each entry of the lower triangle of M, as a list per row."""
+    """Return each entry of the lower triangle of M as a linear combination of functions and constants.
+
+    The result has a list per row of M, with a list of pairs (factor, index of the function or constant) per entry.
+    """
     cells: defaultdict[tuple[int, int], Sums] = defaultdict(list)
     terms: Sequence[OutputSpec | ConstantSpec] = (*spec.outputs, *spec.constants)
     for index, term in enumerate(terms):

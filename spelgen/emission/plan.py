@@ -1,9 +1,7 @@
 """The function ``derive_spec``: the ``ModelSpec`` of an arm, from the arm's structure and nominal values."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from fractions import Fraction
-from math import isfinite
 
 import numpy as np
 
@@ -53,18 +51,20 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
             expected="a preset with bristle friction, which position servos need", do="--preset closed-form",
         )  # fmt: skip
     structure = derive(arm.chain, options.assume)
-    # Magnitudes of M, V and torques are the scales of networks and friction. They are computed with the
-    # URDF's inertials, or with nominal inertials.
+    # Magnitudes of M, V and torques are the scales of networks and friction. The magnitudes are computed with the
+    # inertials of the URDF or, if they are absent or inconsistent, with default inertials.
     sizes = nominal(arm.chain, structure)
     coordinates = arm.chain.coordinates
     drives = [arm.settings.joint(x.name) for x in coordinates]
-    joints = [_joint(x, sizes, index, drives[index]) for index, x in enumerate(coordinates)]
-    links: tuple[LinkSpec, ...] = ()
     outputs, constants = _outputs(structure, sizes, design), _constants(structure, sizes)
+    links: tuple[LinkSpec, ...] = ()
+    min_armatures = np.zeros(len(drives))
     if design.mass == "closed-form":
         # A URDF may have inertials that are not physically consistent; `_links` corrects them.
         links = _links(arm.chain, exact_inertias(arm.chain, sizes.from_urdf))
-        joints = _with_armature(joints, np.diagonal(mean_mass(len(joints), outputs, constants)))
+        min_armatures = TUNING.min_armature * np.diagonal(mean_mass(len(drives), outputs, constants))
+    rows = enumerate(zip(coordinates, drives, min_armatures.tolist(), strict=True))
+    joints = [_joint(x, sizes, index, drive, min_armature) for index, (x, drive, min_armature) in rows]
     x, y, z = map(float, arm.chain.gravity)
     return ModelSpec(
         robot=arm.chain.name,
@@ -79,7 +79,8 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
         constants=constants,
         potential=tuple(range(len(joints))) if design.potential == "dense" else structure.potential,
         potential_scale=sizes.potential_scale,
-        # The bound is rounded to one digit, so that rounding errors of nominal values do not change the text.
+        # The lower bound of the eigenvalues of M is rounded to one digit, so that rounding errors of nominal values
+        # do not change the text of the module.
         margin=float(f"{max(TUNING.margin * sizes.min_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
         links=links,
@@ -90,7 +91,10 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
 
 
 def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
-    """Return the nonzero entries of G; empty if each input is the torque of its own joint, or if a network gives G."""
+    """Return the nonzero entries of the input matrix G.
+
+    The result is empty if each input is the torque of its own joint, or if a network gives G.
+    """
     entries = actuation.entries
     if design.input != "derived" or (actuation.direct and len(entries) == actuation.joints):
         return ()
@@ -102,7 +106,7 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
         joints = output.joints
-        # With the encoding of the Lie group paper, every function depends on all joints.
+        # With the encoding of Duong et al. (IEEE T-RO 40:3695, 2024), every function depends on all joints.
         if design.encoding == "lie-group":
             joints = tuple(range(len(sizes.mass_sensitivities)))
         outputs.append(OutputSpec(joints, _entries(output.basis), mean, scale))
@@ -126,11 +130,13 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, speeds.tolist()))
 
 
-def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings) -> JointSpec:
+def _joint(
+    coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings, min_armature: float
+) -> JointSpec:
+    """Return the joint of a coordinate; min_armature: armature if the rotor inertia is unknown [kg m^2, kg]."""
     # The inputs of networks are scaled with a working range, which exists even if the URDF has no limits.
     low, high = working_range(coordinate)
-    limits = (None, None) if coordinate.continuous else (coordinate.lower, coordinate.upper)
-    lower, upper = (None if x is None or not isfinite(x) else rounded(x) for x in limits)
+    lower, upper = (None if x is None else rounded(x) for x in (coordinate.lower, coordinate.upper))
     effort = _plausible(coordinate.effort, TUNING.largest_effort)
     speed = _plausible(coordinate.velocity, TUNING.largest_speed)
     # Without a given rotor inertia, the armature is such that full effort accelerates it to full speed in
@@ -150,7 +156,7 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
         half_range=rounded((high - low) / 2),
         speed=speed or default_speed,
         friction=rounded(friction, 3),
-        armature=rounded(drive.armature or armature, 3),
+        armature=rounded(drive.armature or armature, 3) or rounded(min_armature, 3),
         gear=drive.gear,
         mass_sensitivity=sizes.mass_sensitivities[index],
         potential_sensitivity=sizes.potential_sensitivities[index],
@@ -170,12 +176,6 @@ def _plausible(limit: float | None, largest: float) -> float | None:
     return limit if limit and limit <= largest else None
 
 
-def _with_armature(joints: Sequence[JointSpec], mass: np.ndarray) -> list[JointSpec]:
-    """Return the joints, with a small armature if it was unknown; mass: nominal diagonal of M, (n,) [kg m^2, kg]."""
-    initial = [rounded(TUNING.min_armature * value, 3) for value in mass]
-    return [replace(x, armature=x.armature or value) for x, value in zip(joints, initial, strict=True)]
-
-
 def _entries(weights: Weights) -> Entries:
     return tuple((row, column, float(value)) for row, column, value in weights)
 
@@ -187,16 +187,12 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
         arm: the arm.
         inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (10,).
     """
-    # A link without mass gets a small fraction of the heaviest link's mass, which does not dominate M.
-    heaviest = max(float(ten[0]) for ten in inertias)
-    names = [body.link for body in arm.bodies]
     specs = []
-    for index, (body, ten) in enumerate(zip(arm.bodies, inertias, strict=True)):
-        mass, center, inertia = _about_center(_consistent(arm, index, ten, heaviest))
+    for body, ten in zip(arm.bodies, inertias, strict=True):
+        mass, center, inertia = _about_center(_consistent(ten))
         first, second, third = map(_triple, body.rotation)
         spec = LinkSpec(
-            # A link name that occurs again gets the body's index, so that names are unique.
-            name=body.link if body.link not in names[:index] else f"{body.link} ({index})",
+            name=body.link,
             parent=body.parent,
             joint=body.coordinate,
             joint_type=body.joint_type,
@@ -212,22 +208,14 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
     return tuple(specs)
 
 
-def _consistent(
-    arm: Chain, index: int, ten: Sequence[Fraction | float], heaviest: float
-) -> Sequence[Fraction | float]:
-    """Return inertial parameters, (10,), changed if they are not physically consistent."""
-    # Log-Cholesky parameters contain the logarithm of the mass, so a link without mass gets one, as a ball
-    # that extends to the next joint.
-    if ten[0] <= 0:
-        distances = [float(np.linalg.norm(_triple(x.translation))) for x in arm.bodies if x.parent == index]
-        mass = TUNING.default_mass * heaviest
-        moment = 0.4 * mass * max([0.1, *distances]) ** 2
-        ten = [mass, 0, 0, 0, moment, 0, 0, moment, 0, moment]
+def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
+    """Return inertial parameters, (10,), of a body with mass, changed if they are not physically consistent."""
     factor, is_consistent = reference_factor(np.array(ten, dtype=float))
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
-    # Below this bound, rounding to `inertia_digits` could make the body inconsistent.
+    # If a second moment is less than `min_second_moment` times the largest, rounding to `inertia_digits` digits could
+    # make the body physically inconsistent.
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten
@@ -245,7 +233,8 @@ def _about_center(
     x, y, z = hx / m, hy / m, hz / m
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
     inertia = [value - m * square for value, square in zip(tensor, steiner, strict=True)]
-    # `_consistent` computes in floating point: entries as small as its rounding errors become zero.
+    # The given parameters have rounding errors, since `_consistent` computes in floating point. Entries of the size of
+    # these errors become zero.
     noise = max(map(abs, inertia)) / 10 ** (TUNING.inertia_digits + 3)
     inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]
     mass, cx, cy, cz, xx, xy, xz, yy, yz, zz = _significant([m, x, y, z, *inertia])
@@ -254,7 +243,8 @@ def _about_center(
 
 def _significant(values: Iterable[Fraction | float]) -> list[float]:
     """Return values rounded to the significant digits of inertial parameters."""
-    return [rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values]  # no -0.0
+    # The sum with 0.0 is 0.0 for -0.0.
+    return [rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values]
 
 
 def _triple(values: Vector) -> Triple:

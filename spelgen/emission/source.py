@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 WIDTH = 110
 _STEP = 4  # blanks per level of indentation
-SKIP = "  # fmt: skip"  # ruff keeps the rows of numbers
+SKIP = "  # fmt: skip"  # the comment with which ruff does not reformat the rows of numbers
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,10 @@ def call(callee: str, *positional: object, **named: object) -> Call:
 
 
 def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
-    """Return ``start`` and ``value``, in one line if ``reserved`` more characters fit there, else in several lines."""
+    """Return the text ``start`` followed by ``value``.
+
+    The result is one line if the line with ``reserved`` more characters is not too long, otherwise several lines.
+    """
     text = start + flat(value)
     if indent + len(text) + reserved < WIDTH or not _items(value) or _alike(value):
         return text
@@ -74,7 +77,10 @@ def flat(value: object) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return a string literal with 32-bit escapes: JSON has none, and splits larger code points in two."""
+    """Return a string literal of ASCII characters, with Python's 32-bit escapes for all others.
+
+    JSON has only 16-bit escapes, and needs two of them for a larger code point.
+    """
     return '"' + "".join(rf"\U{ord(x):08x}" if not x.isascii() else json.dumps(x)[1:-1] for x in text) + '"'
 
 

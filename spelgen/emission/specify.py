@@ -1,4 +1,4 @@
-"""The specification of a model from a URDF, and the function ``generate``: the source of the model's module."""
+"""The functions ``make_spec``, the specification of a model from a URDF, and ``generate``, the source of its module."""
 
 import os
 from dataclasses import replace

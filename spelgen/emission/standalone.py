@@ -25,8 +25,8 @@ class Runtime:
     """The source of the runtime.
 
     definitions: definitions by name, in an order in which they can be executed. imports: import statements of other
-    packages. rows: names of the definitions in the file rows.py, which the rows of an arm need. public: names that a
-    module can import from ``spelgen.runtime``.
+    packages. rows: names of the classes in rows.py, which must be defined before the tables of an arm. public: names
+    that a module can import from ``spelgen.runtime``.
     """
 
     definitions: dict[str, Definition]
@@ -36,11 +36,11 @@ class Runtime:
 
 
 class Bundle(NamedTuple):
-    """The parts of a standalone module that come from the runtime: source text, before and after the arm."""
+    """The parts of a standalone module that are copied from the runtime."""
 
-    imports: str
-    rows: str
-    runtime: str
+    imports: str  # import statements
+    rows: str  # source text that precedes the tables of the arm
+    runtime: str  # source text that follows the tables
     contents: tuple[str, ...]  # names of the classes and functions in `runtime`
 
 
@@ -56,7 +56,7 @@ def bundle(arm: str, model: str) -> Bundle:
             used |= new
             pending += new
     needed = {name: definition for name, definition in runtime.definitions.items() if name in used}
-    # The classes of the rows must be defined before the rows; all other definitions follow after the arm.
+    # The tables of the arm consist of instances of the classes in rows.py, which must be defined before the tables.
     rows = [definition for name, definition in needed.items() if name in runtime.rows]
     definitions = {name: definition for name, definition in needed.items() if name not in runtime.rows}
     blocks = tuple(name for name, definition in definitions.items() if definition.is_block)

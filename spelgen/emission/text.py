@@ -1,4 +1,4 @@
-"""The text of a module from a ``ModelSpec``, and the reverse. Equal specifications give equal bytes.
+"""Conversion of a ``ModelSpec`` to the text of a module, and back. Equal specifications give equal bytes.
 
 Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. A module that is
 read is parsed, but not executed.
@@ -20,7 +20,7 @@ from spelgen.emission.parts import (
     term_names,
 )
 from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call
-from spelgen.emission.standalone import bundle, load_runtime
+from spelgen.emission.standalone import bundle, load_runtime, names_in
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
 from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
@@ -59,23 +59,27 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     torch only.
     """
     assembly = model_parts(spec)
-    arm = "\n\n\n".join(x for x in ("\n\n".join(_rows(spec, assembly)), _mass_entries(spec, assembly)) if x)
+    call = listed_call("super().__init__", Call("", assembly.model.arguments), 8) + SKIP
+    names = names_in(ast.parse(call))
+    arm = "\n\n".join(_rows(spec, assembly))
+    if MASS_ENTRIES.text in names:
+        arm += f"\n\n\n{_mass_entries(spec)}"
     model = render(
         "model.py.jinja",
         base=assembly.model.callee,
         summary=class_summary(spec),
-        has_networks=assembly.uses(GENERATOR),
-        call=listed_call("super().__init__", Call("", assembly.model.arguments), 8) + SKIP,
+        has_networks=GENERATOR.text in names,
+        call=call,
     )
     title = f"Port-Hamiltonian model of an arm with {counted(len(spec.joints), 'joint')}, by `spelgen build`."
     context = {"title": title, "header": header(spec), "arm": arm, "model": model, "spec": spec.to_json()}
     if standalone:
         return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
     # A module imports only the names that occur in its text.
-    used = set(re.findall(r"\w+", f"{arm}\n{model}")) & load_runtime().public
+    used = names_in(ast.parse(f"{arm}\n{model}")) & load_runtime().public
     # ruff's order of imported names: classes first.
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
-    return render("module.py.jinja", names=ordered, has_tensor=assembly.uses(MASS_ENTRIES), **context)
+    return render("module.py.jinja", names=ordered, has_tensor=MASS_ENTRIES.text in names, **context)
 
 
 def class_summary(spec: ModelSpec) -> str:
@@ -162,7 +166,7 @@ def _quoted(name: str) -> str:
 
 
 def _rows(spec: ModelSpec, assembly: ModelParts) -> list[str]:
-    """Return the statements that define the rows, each with a comment about units above it."""
+    """Return the statements that define the tables ``JOINTS``, ``LINKS``, ..., with comments about units above."""
     statements = []
     for name, rows in assembly.rows.items():
         about = _term_descriptions(spec) if name in ("FUNCTIONS", "CONSTANTS") else {}
@@ -189,10 +193,8 @@ def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
     return descriptions
 
 
-def _mass_entries(spec: ModelSpec, assembly: ModelParts) -> str:
-    """Return the source of ``mass_entries``, M from functions and constants; empty if the model does not use it."""
-    if not assembly.uses(MASS_ENTRIES):
-        return ""
+def _mass_entries(spec: ModelSpec) -> str:
+    """Return the source of the function ``mass_entries``, which computes M from functions and constants."""
     names = term_names(spec)
     arguments = ", ".join(f"{name}: Tensor" for name in names)
     start = f"def mass_entries({arguments}) -> Tensor:"

@@ -23,8 +23,6 @@ class ModelTuning:
     # [1] Smallest principal second moment of mass about the center of mass, divided by the largest: above
     # rounding errors.
     min_second_moment: float = 1e-10
-    # [1] Initial mass of a link without mass in the URDF, divided by the mass of the heaviest link.
-    default_mass: float = 0.01
     # [rad/s] Typical speed of a revolute joint without a velocity limit.
     angular_speed: float = 2.0
     # [m/s] Typical speed of a prismatic joint without a velocity limit.
@@ -37,7 +35,8 @@ class ModelTuning:
     full_effort_at: float = 0.5
     # [s] Initial ratio kd / kp of a servo.
     servo_lag: float = 0.05
-    # [1] Armature of a drive without data, divided by the joint's diagonal entry of the nominal M.
+    # [1] Armature of a drive of unknown rotor inertia, effort or speed, divided by the joint's diagonal entry of the
+    # nominal M.
     min_armature: float = 0.01
     # [1] Factor on the encoded positions that are inputs of friction networks; velocity inputs are of the
     # order of one.
@@ -46,10 +45,11 @@ class ModelTuning:
     friction_units: int = 8
     # [1] Smallest number of hidden units per group of outputs that depend on the same joints.
     min_units: int = 4
-    # [1] The same number for Kolmogorov-Arnold networks, whose units have a learned function per edge.
+    # [1] Smallest number of hidden units per group of outputs of a Kolmogorov-Arnold network, whose units have a
+    # learned function per edge.
     min_kan_units: int = 2
-    # [1] Units of Kolmogorov-Arnold networks, divided by the width in the options: each edge has a grid of
-    # weights.
+    # [1] Number of hidden units of Kolmogorov-Arnold networks, divided by the number for multilayer perceptrons (the
+    # option `width`); smaller, because each edge has several weights.
     kan_fraction: float = 0.25
     # [1] Units of the network of V, which has one output, divided by the width of the networks of M.
     potential_fraction: float = 0.5

@@ -106,7 +106,7 @@ def evaluate(
         results = _evaluate_commands(tested, logs, notes)
     else:
         require_torques(logs)
-        used = _preprocessing(tested.fit.preprocessing if tested.fit else None, preprocessing, logs)
+        used = _preprocessing(tested.preprocessing, preprocessing, logs)
         ahead = (steps, seconds)
         results = _evaluate_torques(tested, logs, notes, used, baselines or {}, ahead, truth, progress)
     return tested.assessed(results)
@@ -193,7 +193,10 @@ def _evaluate_torques(
 def _results(
     tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces
 ) -> Results:
-    """Return the results of an evaluation, to which names of the arm, the joints and the logs are added."""
+    """Return the results of an evaluation with the names of the arm, the joints and the logs, and without errors.
+
+    The caller adds the errors.
+    """
     return Results(
         robot=tested.spec.robot if tested.spec else type(tested.model).__name__,
         joints=tuple(tested.joints),

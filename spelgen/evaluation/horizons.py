@@ -31,9 +31,10 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
         r(t) = K (p(t) - p(0) - integral from 0 to t of (G tau + C^T qd - g - friction + r)),    r(0) = 0
 
-    (De Luca and Mattone, ICRA 2003, eq. 9; ICRA 2005), so that r' = K (d - r), with d the residual of the momentum
-    balance: r is d after a first-order filter with time constant 1 / K. The prediction keeps r constant, as in
-    offset-free control (Pannocchia and Rawlings, AIChE J. 49:426, 2003).
+    (De Luca and Mattone, ICRA 2003, eq. 9; ICRA 2005). Here p = M qd is the momentum, G the input matrix, C the
+    Coriolis matrix, g the gravity torque, and K [1/s] the gain of the observer. It follows that r' = K (d - r), with
+    the residual d of the momentum balance: r is d after a first-order filter with time constant 1 / K. The prediction
+    keeps r constant, as in offset-free control (Pannocchia and Rawlings, AIChE J. 49:426, 2003).
 
     Two details differ from the reference. First, d is assumed constant between samples, so that the filter has an exact
     solution. Second, r is divided by the step response of the filter, so that a constant disturbance is estimated
@@ -76,7 +77,7 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 def without_past(windows: Windows, past: int) -> Windows:
     """Return the windows without their first `past` steps.
 
-    The friction state z is not updated: it belongs to the first sample of the given windows.
+    The friction state z of the result is unchanged, so that it is the state before the removed steps.
     """
     dt, q, qd, tau = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
     return Windows(dt, q, qd, tau, windows.z)
@@ -108,9 +109,9 @@ class StateErrors:
 class Horizon:
     """Errors of all predictors at one prediction horizon.
 
-    steps: length [samples]. seconds: mean length [s]. windows: number of predictions. errors: errors per name; the
-    name of a predictor is for open-loop predictions, `observed(name)` for predictions with the disturbance that a
-    momentum observer estimates.
+    steps: length [samples]. seconds: mean length [s]. windows: number of predictions. errors: errors by key; the key is
+    the name of the predictor for open-loop predictions, and `observed(name)` for predictions with the disturbance that
+    a momentum observer estimates.
     """
 
     name: str

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -53,32 +52,11 @@ def rollout(
     return positions, torch.cat([qd, velocities], dim=1).reshape(shape)
 
 
-@dataclass(frozen=True)
-class Invariants:
-    """Measured invariants of a model: M is positive definite, and without input the energy H does not rise.
+def smallest_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
+    """Return the smallest eigenvalue of M over random q in [low, high] (n,), divided by the mean eigenvalue.
 
-    least_eigenvalue: smallest eigenvalue of M over 100,000 random q, divided by the mean eigenvalue; it must be
-    positive. energy_rise: largest rise of H in one of 10,000 steps of 1 ms without input, divided by the largest
-    kinetic energy; it must not be positive, except for rounding. energy_rise is None if the simulated arm did not move,
-    so that the kinetic energy is zero, or if the motion diverged.
+    It is positive if M is positive definite.
     """
-
-    least_eigenvalue: float
-    energy_rise: float | None
-
-
-def invariants(model: ArmModel, windows: Windows, low: Tensor, high: Tensor) -> Invariants:
-    """Return the smallest eigenvalue of M over random q, and the largest rise of the energy H without input.
-
-    model: model with M and H. windows: windows whose first states are the initial states of the motion without input.
-    low, high: bounds of q, (n,) [rad, m].
-    """
-    with torch.no_grad():
-        return Invariants(_least_eigenvalue(model, low, high), _energy_rise(model, windows))
-
-
-def _least_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
-    """Return the smallest eigenvalue of M over random q in [low, high] (n,), divided by the mean eigenvalue."""
     # The seed is fixed, so that the result is reproducible.
     generator = torch.Generator().manual_seed(0)
     count = TUNING.sampled_positions
@@ -88,8 +66,12 @@ def _least_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
     return (eigenvalues.min() / eigenvalues.mean().abs()).item()
 
 
-def _energy_rise(model: ArmModel, windows: Windows) -> float | None:
-    """Return the largest rise of H over steps of 1 ms without input, divided by the largest kinetic energy."""
+def energy_rise(model: ArmModel, windows: Windows) -> float | None:
+    """Return the largest rise of H in a step of 1 ms without input, divided by the largest kinetic energy.
+
+    The motion starts from the first states of the windows. The rise is not positive, except for rounding, if the model
+    is passive. None: the simulated arm did not move, so that the kinetic energy is zero, or the motion diverged.
+    """
     q, qd = windows.q[: TUNING.started_states, 0], windows.qd[: TUNING.started_states, 0]
     no_input = q.new_zeros(len(q), TUNING.free_steps, model.n)
     q, qd = rollout(model, q, qd, no_input, 1e-3)

@@ -1,13 +1,13 @@
 """The model that is evaluated, with its fit and its arm if known."""
 
 import copy
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 
-from spelgen.arm.configured_arm import Arm
+from spelgen.arm.configured_arm import Arm, urdf_path
 from spelgen.baselines.registry import FittedBaselines, LinearServoRecord, arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
@@ -17,6 +17,7 @@ from spelgen.evaluation.verdict import verdict
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import OnWindows
@@ -27,16 +28,22 @@ from spelgen.urdf.read import read_urdf
 
 @dataclass(frozen=True)
 class Subject:
-    """The evaluated model.
+    """The evaluated model, with data about its fit; the defaults are for a model without a fit.
 
-    joints: names of the joints in the URDF and in logs. urdf: URDF of the robot; None if unknown. fit: fit of the
-    model; None if unknown.
+    urdf: URDF of the robot; None if unknown. preprocessing: preprocessing of the fit. window: number of samples of the
+    training windows; a typical number for a model that was not fitted to windows. trained_on: names of the training and
+    validation logs. baselines: baselines that were fitted to these logs. fitted_urdf: URDF for which the baselines were
+    fitted. linear_servos: parameters of the linear servos that were fitted to these logs.
     """
 
     model: ArmModel
-    joints: Sequence[str]
     urdf: Path | None
-    fit: Fit | None
+    preprocessing: Preprocessing | None = None
+    window: int = TUNING.model_window
+    trained_on: frozenset[str] = frozenset()
+    baselines: FittedBaselines = field(default_factory=dict)
+    fitted_urdf: Path | None = None
+    linear_servos: LinearServoRecord | None = None
 
     @property
     def spec(self) -> ModelSpec | None:
@@ -44,11 +51,9 @@ class Subject:
         return spec_of(self.model)
 
     @property
-    def window(self) -> int:
-        """Number of samples of the training windows; a typical number for a model not fitted to windows."""
-        if self.fit is not None and isinstance(self.fit.config, OnWindows):
-            return self.fit.config.window
-        return TUNING.model_window
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints in the URDF and in logs."""
+        return tuple(self.model.joint_names)
 
     @property
     def reach(self) -> BristleReach:
@@ -58,21 +63,11 @@ class Subject:
         return reach if reach.elements else reach_of(self.model.joint_types)
 
     @property
-    def trained_on(self) -> frozenset[str]:
-        """Names of the training and validation logs of the model."""
-        names = [] if self.fit is None else [*self.fit.record.training, *self.fit.record.validation]
-        return frozenset(names)
-
-    @property
-    def baselines(self) -> FittedBaselines:
-        """Baselines that were fitted to the training logs of the model; {} if there are none."""
-        return {} if self.fit is None else self.fit.baselines
-
-    @property
     def fitted_arm(self) -> Arm | None:
         """Arm for which the baselines of the fit were fitted. Raises UrdfError, ArmError or SettingsError."""
-        urdf = None if self.fit is None else self.fit.urdf
-        return arm_of_model(self.model, urdf) if urdf is not None and self.baselines else None
+        if self.fitted_urdf is None or not self.baselines:
+            return None
+        return arm_of_model(self.model, self.fitted_urdf)
 
     def assessed(self, results: Results) -> Results:
         """Return the results of the evaluation of this model, with the assessment added."""
@@ -87,29 +82,30 @@ class Subject:
                     independent.append(joint.name)
         return replace(results, assessment=verdict(results, self.baselines, limits, independent))
 
-    @property
-    def linear_servos(self) -> LinearServoRecord | None:
-        """Parameters of the linear servos that were fitted to the training logs of the model."""
-        servo = None if self.fit is None else self.fit.record.servo
-        linear: LinearServoRecord | None = None if servo is None else servo["linear"]
-        return linear
-
 
 def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = None) -> Subject:
     """Return the subject of an evaluation.
 
     tested: a model, a fit or the folder of a run. arm: arm, or path of its URDF; None: the arm of the fit.
     """
-    if isinstance(tested, str | Path):
-        tested = load_run(tested)
-    model, fit = (tested.model, tested) if isinstance(tested, Fit) else (tested, None)
-    urdf = None if fit is None else fit.urdf
-    if arm is not None:
-        urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
+    fit = load_run(tested) if isinstance(tested, str | Path) else tested
+    model = fit.model if isinstance(fit, Fit) else fit
     # Logs are read as float64 on the CPU, so the model must have the same type and device.
     if any(weights.dtype != torch.float64 or not weights.is_cpu for weights in model.parameters()):
         model = copy.deepcopy(model).double().cpu()
-    return Subject(model, model.joint_names, urdf, fit)
+    if not isinstance(fit, Fit):
+        return Subject(model, urdf_path(arm))
+    record = fit.record
+    return Subject(
+        model,
+        urdf_path(arm) or fit.urdf,
+        preprocessing=fit.preprocessing,
+        window=fit.config.window if isinstance(fit.config, OnWindows) else TUNING.model_window,
+        trained_on=frozenset([*record.training, *record.validation]),
+        baselines=fit.baselines,
+        fitted_urdf=fit.urdf,
+        linear_servos=record.servo and record.servo["linear"],
+    )
 
 
 def read_test_logs(

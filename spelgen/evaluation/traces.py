@@ -195,8 +195,8 @@ def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Traj
     fast = np.quantile(np.abs(joined_column(pieces, "qd")), 0.995, axis=0)
     # The speeds are dense near zero, where friction reverses.
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)
-    speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n)
-    alone = torch.diag_embed(speeds)  # (81, n, n): only one joint moves at a time
+    speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n): 81 speeds per joint
+    alone = torch.diag_embed(speeds)  # (81, n, n): in row j only joint j moves
     positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)
     curves = {}
     for name, predictor in dynamics.items():

@@ -32,7 +32,11 @@ Limits = Sequence[tuple[float, float] | None]
 
 @dataclass
 class _Uses:
-    """Uses for which a model is sufficient, uses for which it is not, and the figures that prove both."""
+    """Uses of a model.
+
+    good: uses for which the model is sufficient. bad: uses for which the model is not sufficient. proofs: texts with
+    the figures that prove both.
+    """
 
     good: list[str] = field(default_factory=list)
     bad: list[str] = field(default_factory=list)
@@ -276,7 +280,11 @@ def _recommendations(
 def _outside(
     trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str], independent: Collection[str]
 ) -> list[str]:
-    """Return the quantities whose range in the test logs exceeds the range in the training logs by a tenth."""
+    """Return the quantities whose range in the test logs exceeds the range in the training logs by a tenth.
+
+    trained, tested: `coverage` of the training logs and of the test logs. independent: names of joints on whose
+    position the dynamics do not depend; the positions of these joints are omitted.
+    """
     exceeded = []
     for quantity, word in (("q", "positions"), ("qd", "velocities")):
         ranges = zip(joints, trained.get(quantity, ()), tested.get(quantity, ()), strict=False)

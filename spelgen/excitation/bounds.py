@@ -8,7 +8,7 @@ from math import nan, pi
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from spelgen.arm.arm import Chain
 from spelgen.errors import ArmError, SpelgenError, collect
@@ -49,9 +49,9 @@ def motion_bounds(
 ) -> MotionBounds:
     """Return bounds with the central fraction of the position ranges, and a fraction of the velocity limits.
 
-    joints: joints of the URDF by name; <mimic> joints among them then keep their own limits. ranges: position ranges by
-    name of the joint, in place of its limits. The default range of continuous joints is -pi to pi. Raises ArmError for
-    a joint without a range, or whose limits are not increasing.
+    joints: joints of the URDF by name; with them, ranges are reduced so that <mimic> joints keep their limits. ranges:
+    position ranges by name of the joint, in place of its limits. The default range of continuous joints is -pi to pi.
+    Raises ArmError for a joint without a range, or whose limits are not increasing.
     """
     limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
     for k, coordinate in enumerate(arm.coordinates):
@@ -107,6 +107,13 @@ class Surroundings(Group):
     floor: Number | None = None
     boxes: dict[str, Box] = Field(default_factory=dict)
     clearance: Positive = 0.01
+
+    @field_validator("boxes", mode="before")
+    @classmethod
+    def _by_name(cls, boxes: object) -> object:
+        if isinstance(boxes, list):
+            raise ValueError("boxes by name, as in {table: {size: [1, 1, 0.1], xyz: [0, 0, -0.05]}}")
+        return boxes
 
 
 def read_surroundings(path: Path) -> Surroundings:

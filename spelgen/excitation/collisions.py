@@ -106,9 +106,9 @@ class Collisions:
     def contact(self, motion: Motion) -> Contact | None:
         """Return the first contact of a motion; None guarantees that every distance is positive at all times.
 
-        Distances are computed at selected positions. Between two successive ones the distance of any two points changes
-        by at most 1.5 times the clearance, so between any position of the motion and the nearest selected one by at
-        most 0.75 times the clearance.
+        Distances are computed at selected positions, between which the distance of any two points changes by at most
+        1.5 times the clearance. At any other position of the motion, a distance therefore differs by at most 0.75 times
+        the clearance from its value at the nearest selected position.
         """
         lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
         path = np.concatenate([[0.0], np.cumsum(lengths)])

@@ -29,7 +29,10 @@ FRICTION = FrictionModel()
 
 
 class Criterion:
-    """Criterion to be minimized over the parameters of an `ExcitationTrajectory`."""
+    """Criterion to be minimized over the parameters (size,) of an `ExcitationTrajectory`.
+
+    size: number of parameters, see `ExcitationTrajectory`.
+    """
 
     def __init__(
         self, arm: Chain, trajectory: ExcitationTrajectory, collisions: Collisions | None = None

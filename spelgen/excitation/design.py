@@ -46,9 +46,8 @@ def excite(
     """Return an exciting motion, which starts and ends at rest; the same arguments give the same motion.
 
     The motion keeps the limits of position and velocity, also of <mimic> joints. It keeps effort limits, too, if the
-    URDF has effort limits and inertials and the optimizer finds a motion that keeps them. If the URDF has collision
-    geometry and Pinocchio is installed, the motion and the approach to it keep a clearance between links, and to the
-    surroundings.
+    URDF has effort limits and inertials and the optimizer finds such a motion. If the URDF has collision geometry and
+    Pinocchio is installed, motion and approach keep a clearance between links, and to the surroundings.
 
     Args:
         arm: configured arm.
@@ -66,14 +65,14 @@ def excite(
         seed: seed of the random motions.
         progress: function that is called with the number of finished trials and the number of all trials.
 
-    Raises SettingsError for an invalid value, ArmError for a joint whose limits are not increasing and if no motion
-    without a contact was found.
+    Raises SettingsError for an invalid value, ArmError for a joint without a range and if all motions had a contact.
     """
     harmonics = _checked_harmonics(duration, sample_rate, harmonics, reach, speed)
     ranges = arm.robot.joint, arm.settings.simulation.positions
     limits = motion_bounds(arm.chain, 1.0, 1.0, *ranges)
     bounds = motion_bounds(arm.chain, reach, speed, *ranges)
-    strongest = bounds.speed  # without a limit, the approach reaches its largest speed in one second
+    # Without a limit of the acceleration, the approach reaches its largest speed in one second.
+    strongest = bounds.speed
     if acceleration is not None:
         strongest = _joint_values("acceleration", acceleration, arm.chain, positive=True)
         bounds = replace(bounds, acceleration=strongest)
@@ -157,7 +156,7 @@ def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, pos
 def _collisions(
     arm: Arm, surroundings: Surroundings | Path | str | None, limits: MotionBounds
 ) -> tuple[Collisions | None, str]:
-    """Return the `Collisions` of an arm, or None if they cannot be computed, and a text about the checks for users."""
+    """Return (collisions, text): the `Collisions` of an arm, None if they cannot be computed; a text for users."""
     if not isinstance(surroundings, Surroundings):
         surroundings = Surroundings() if surroundings is None else read_surroundings(Path(surroundings))
     try:

@@ -24,7 +24,7 @@ class ExcitationTuning:
     effort: float = 0.9
     # [rad/s] Speed limit of revolute joints without a velocity limit.
     revolute_speed: float = 1.0
-    # [1] Points per harmonic at which limits of the motion are enforced.
+    # [1] Grid points per period of the highest harmonic, at which limits of the motion are enforced.
     grid: int = 40
     # [m/s] Speed limit of prismatic joints without a velocity limit.
     prismatic_speed: float = 0.25
@@ -32,7 +32,7 @@ class ExcitationTuning:
     faces: int = 20_000
     # [1] Random positions at which pairs of links are tested for a permanent overlap.
     positions: int = 200
-    # [1] Smallest fraction of these random positions at which a pair of links must be too close to count as
+    # [1] Smallest fraction of the random `positions` at which a pair of links must be too close to count as
     # permanently overlapping, as in MoveIt's setup assistant.
     overlap: float = 0.95
     # [1] Margin of the penalty divided by the clearance. It exceeds one, since links may be closer between the

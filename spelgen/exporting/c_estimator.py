@@ -1,7 +1,7 @@
-"""The estimator of payload, friction drift and external torques in C, a header and a source besides the model's files.
+"""Export of the estimator of payload, friction drift and external torques: a C header and a C source.
 
-The noise levels of the run are constants of the C code. The model's functions that only the estimator calls are CasADi
-expressions of the same formulas as `live.momentum`.
+They are added to the C files of the model. The noise levels, which were estimated in training, are constants of the C
+code. Functions of the model that only the estimator calls are CasADi expressions of the formulas of `live.momentum`.
 """
 
 import math
@@ -48,7 +48,10 @@ _ENTRIES = (
 
 
 def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFunction]:
-    """Return the C functions of the model that only the estimator calls, with the noise levels of the run."""
+    """Return the C functions that only the estimator calls: the terms of the momentum balance, and payload torques.
+
+    levels: noise levels of the run; their point of the last body is a constant of the C code.
+    """
     n, bodies = model.n, model.arm.bodies
     sizes = {"q": n, "qd": n, "qdd": n, "tau": n, "load": 10, "low": model.memory, "high": model.memory}
     inputs = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
@@ -72,8 +75,8 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     rotation, weight = pose[:3, :3], load[0] * constant(model.arm.gravity)
     load_momentum, load_gradient = payload.momentum(qd)
     moment = ca.cross(rotation @ load[1:4], constant(model.arm.gravity))
-    # The payload's gravity torque is J^T times its weight. Newton-Euler has larger rounding errors: the log
-    # odds then differ 40 times as much from the Python estimator's.
+    # The payload's gravity torque is J^T times its weight. The Newton-Euler algorithm would have larger rounding
+    # errors: the log odds of "no payload" would differ 40 times as much from the Python estimator.
     load_gradient += jacobian.T @ ca.vertcat(weight, moment)
     at_point = jacobian[:3, :] - ca.skew(rotation @ levels.point) @ jacobian[3:, :]
     outputs = {
@@ -83,12 +86,10 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
         ),
         "payload_torque": (payload.torque(qd, qdd),),
     }  # fmt: skip
-    functions = []
-    for entry in _ENTRIES:
-        functions.append(
-            c_function(model, entry, named_function(entry, outputs[entry.name], inputs, residuals))
-        )
-    return functions
+    return [
+        c_function(model, entry, named_function(entry, outputs[entry.name], inputs, residuals))
+        for entry in _ENTRIES
+    ]
 
 
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
@@ -104,19 +105,14 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     for name, level in levels:
         if isinstance(level, BlockNoise):
             tables |= {f"{name}_{key}": row for key, row in level}
-        elif name not in ("minutes", "point", "load_freedom"):
+        elif name not in ("minutes", "point", "peak_count", "load_freedom"):
             tables[name] = np.ravel(level)
     values = {
         "name": model.name,
         "upper": model.name.upper(),
         "n": model.n,
         "tuning": TUNING,
-        "supported": f"{levels.supported_alarms:.2g} per minute",
-        "windows": repr(levels.tail_peaks),
-        "evidence": repr(TUNING.evidence),
-        "quantile": repr(levels.load_quantile),
-        "iterations": TUNING.iterations,
-        "weights": TUNING.weights,
+        "levels": levels,
         "tables": {name: _numbers(row) for name, row in tables.items()},
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, model.input_inverse)),

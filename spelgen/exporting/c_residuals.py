@@ -1,8 +1,8 @@
-"""Residual terms of a model in C: networks as loops over tables, and functions of single joints.
+"""C code of the residual terms of a model, which are added to the rigid bodies.
 
-Splines are tables with a polynomial per interval; harmonics are powers of a phasor exp(i f q). The C
-code of an entry point first calls functions that compute its residual terms (see
-`residual_expressions`).
+Networks are loops over tables of weights. Functions of the position of one joint are splines (tables with a polynomial
+per interval) and ripple (harmonics, computed as powers of a phasor exp(i f q)). The C code of an entry point first
+calls the functions that compute its residual terms (see `residual_expressions`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ _CALLS = (
 
 
 def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the C variables of these residual terms, and the C calls that compute them."""
+    """Return the C variables of the residual terms ``names``, and the C calls that compute these variables."""
     uncomputed = set(names)
     symbols = residual_symbols(model)
     variables: list[str] = []
@@ -55,7 +55,7 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
 
 
 def network_source(model: TrainedModel) -> list[str]:
-    """Return the C text of all networks in a list; the list is empty if the model has no networks."""
+    """Return a list with one element, the C text of all networks; an empty list if the model has no networks."""
     n, residuals = model.n, model.residuals
     named = {"mass": residuals.mass, "potential": residuals.potential}
     networks = {name: network for name, network in named.items() if network is not None}
@@ -104,7 +104,10 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
 
 
 def joint_function_source(model: TrainedModel) -> list[str]:
-    """Return the C text of all residual functions of single joints in a list, empty if the model has none."""
+    """Return a list with one element, the C text of the residual terms that depend on one joint each.
+
+    These terms are splines, ripple and factors on friction. The list is empty if the model has none.
+    """
     residuals = model.residuals
     torque, factor = residuals.torque, residuals.friction
     if not (residuals.has_torque or factor):
@@ -135,10 +138,13 @@ def joint_function_source(model: TrainedModel) -> list[str]:
 
 
 def _polynomials(spline: BSpline) -> np.ndarray:
-    """Return the coefficients of 1, s, s^2, s^3 per interval, (intervals, 4); s rises from 0 to 1 in the interval."""
+    """Return the coefficients of 1, s, s^2 and s^3 of a cubic spline per interval of its knots, (intervals, 4).
+
+    s increases from 0 to 1 within an interval.
+    """
     curve = PPoly.from_spline((np.arange(len(spline.t)), spline.c, 3))
-    # The intervals of the three additional knots at each end are outside of the curve's range and are
-    # removed.
+    # A cubic B-spline has three additional knots at each end. The intervals between the additional knots are outside of
+    # the range of the spline and are removed.
     return np.asarray(curve.c[::-1, 3 : len(spline.c)].T)
 
 

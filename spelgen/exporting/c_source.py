@@ -16,8 +16,8 @@ from spelgen.templates import render
 _WIDTH = 118  # maximum length of a line
 FRICTION_STATES = ("z", "z_next", "z_start", "low", "high")
 """Inputs and outputs that are friction states, of type double; all others are of type ``real``."""
-# tanh, unlike SIN and COS, has no float version, because only functions of the friction state call it, in
-# double.
+# SIN and COS are macros for float or double. tanh is always the double function, because only the friction state, which
+# is double, needs it.
 _FORMS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
@@ -41,7 +41,11 @@ _FORMS = {
 
 @dataclass(frozen=True)
 class CFunction:
-    """An entry point in C. shapes: (rows,) or (rows, columns) per output. operations: upper bound of their number."""
+    """An entry point in C.
+
+    shapes: (rows,) or (rows, columns) per output. operations: upper bound of the number of arithmetic operations of a
+    call.
+    """
 
     entry: EntryPoint
     symbol: str
@@ -86,7 +90,7 @@ def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, st
         "n": model.n,
         "functions": functions,
         "facts": facts,
-        "joints": ", ".join(model.identifiers),
+        "joints": ", ".join(model.joint_labels),
         "memory": model.memory,
         "memory_note": note,
         "residuals": network_source(model) + joint_function_source(model),
@@ -114,7 +118,7 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
         shapes[name] = (rows, columns) if columns > 1 else (rows,)
         parameters.append(_parameter(model, name, str(rows * columns)))
         results.append(f"{name} ({', '.join(map(str, shapes[name]))}) [{unit}]")
-    # the comment above the function in the header: results with shapes and units
+    # The comment above the function in the header states the shapes and units of the results.
     about = f"{entry.about[0].upper()}{entry.about[1:]}: {', '.join(results)}."
     symbol = f"{model.name}_{entry.name}"
     signature = f"void {symbol}(\n    " + ",\n    ".join(parameters) + ")"
@@ -156,13 +160,15 @@ def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str
         if operation == ca.OP_OUTPUT:
             output, index = writes
             rows, columns = shapes[output]
-            row_by_row = index % rows * columns + index // rows  # CasADi's order is column-major
+            row_by_row = (
+                index % rows * columns + index // rows
+            )  # index in the row-major C array, from CasADi's column-major index
             lines.append(f"{outputs[output]}[{row_by_row}] = a{reads[0]};")
             continue
         if operation == ca.OP_INPUT:
             value = f"{inputs[reads[0]]}[{reads[1]}]"
         elif operation == ca.OP_CONST:
-            value = f"R({function.instruction_constant(k)!r})"  # repr keeps all digits
+            value = f"R({function.instruction_constant(k)!r})"  # the C literal has all digits of the constant
         else:
             value = _FORMS[operation].format(*(f"a{slot}" for slot in reads))
         # The keys of a dict are unique and keep the order of the first assignments; a set would lose this

@@ -41,13 +41,16 @@ def export_casadi(trained: Trained) -> Exported:
 
 
 def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
-    """Return CasADi functions by name, with SX expressions of bodies and friction, and MX of residual terms."""
+    """Return CasADi functions of the entry points, by name.
+
+    Rigid bodies and friction are SX expressions; residual terms are MX expressions.
+    """
     # Without residual terms all expressions are scalar, and SX is faster than MX with calls of SX
     # functions.
     if not model.residuals:
         return expression_functions(model, entries)
-    # The function that is differentiated includes the residual terms as functions of q. In the SX function
-    # they are symbols, whose dependence on q a derivative would omit.
+    # The function that is differentiated includes the residual terms as functions of q. In the SX function, the
+    # residual terms are symbols, so that a derivative would omit their dependence on q.
     bases = {name: ENTRY_POINTS[name.removesuffix("_derivatives")] for name in entries}
     expressions = expression_functions(model, {base.name: base for base in bases.values()})
     functions: dict[str, ca.Function] = {}
@@ -59,7 +62,10 @@ def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> 
 
 
 def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
-    """Return `function` with the states as its only inputs; its inputs for residual terms are computed from them."""
+    """Return a function of the inputs of ``entry`` only: it computes the residual terms and passes them to `function`.
+
+    function: function whose inputs are the inputs of ``entry``, then the residual terms.
+    """
     needed = residuals_needed(function)
     if not needed:
         return function
@@ -71,7 +77,10 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
-    """Return the Jacobians of a function with respect to its first inputs; output k is the Jacobian for input k."""
+    """Return the function of ``entry``, whose output k is the Jacobian of `function` with respect to input k.
+
+    function: function with a single output and the inputs of ``entry``, which may be more than the outputs.
+    """
     arguments = function.mx_in()
     (output,) = function.call(arguments)
     # Jacobians are dense: callers expect n x n numbers, including structural zeros.
@@ -119,7 +128,8 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
         values["energy"] = _network(residuals.potential, encoded)
         # Reverse mode takes about the time of one evaluation of the network.
         values["gravity"] = ca.gradient(values["energy"], q)
-    # The torque is computed as the derivative of this energy, so that both are consistent.
+    # The torque of splines and ripple is computed as the derivative of their potential energy, so that torque and
+    # energy are consistent.
     if residuals.has_torque:
         values["torque_energy"] = _torque_energy(residuals, q)
         values["torque"] = ca.gradient(values["torque_energy"], q)

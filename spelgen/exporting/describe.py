@@ -1,11 +1,10 @@
-"""The argument of every exporter, a trained model with its arm; and the conversion of this model to plain numbers."""
+"""``Trained``, a trained model with its arm, the argument of every exporter; its conversion to NumPy arrays."""
 
 from __future__ import annotations
 
 import copy
 import keyword
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -86,19 +85,18 @@ class Trained:
         return self.arm.tip or last_link(self.arm.robot, self.joint_names)
 
     def prepared(self) -> PreparedModel:
-        """Return a copy of the model with constant parameters and tip kinematics, for torch and ONNX programs."""
+        """Return a copy of the model with precomputed parameters, and the kinematics of the tip, for programs."""
         dtype = torch.float32 if self.float32 else torch.float64
         return self.model.prepared(tip_kinematics(self.arm), dtype=dtype)
 
     @property
     def memory(self) -> int:
         """Number of values in the friction state z of all joints; 0 for a model of networks."""
-        model = self.model
-        return model.n * model.elements if isinstance(model, RigidBodyDynamics) else 0
+        return self.model.n * self.model.elements
 
 
 def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
-    """Return a trained model as plain numbers. Raises RunError for a model without rigid bodies."""
+    """Return a trained model as NumPy arrays. Raises RunError for a model without rigid bodies."""
     # A copy in double precision on the CPU: the user's model may be in single precision or on a GPU.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
@@ -119,7 +117,7 @@ def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
     return TrainedModel(
         name=identifier(loaded.chain.name),
         arm=loaded.chain,
-        identifiers=unique_identifiers(model.joint_names),
+        joint_labels=tuple(_letters_and_digits(name) or "joint" for name in model.joint_names),
         inertias=array(exact.inertial_parameters),
         constant_mass=constant_mass,
         motors=array(motors_of(exact)),
@@ -141,22 +139,6 @@ def identifier(text: str) -> str:
     if not plain or plain[0].isdigit() or keyword.iskeyword(plain):
         return f"arm_{plain}".rstrip("_")
     return plain
-
-
-def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
-    """Return an identifier for each joint, similar to the joint's name; all identifiers differ."""
-    # The identifiers become names and comments of the exported code, so they must be valid there.
-    identifiers: list[str] = []
-    for number, name in enumerate(names, start=1):
-        plain = _letters_and_digits(name)
-        if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
-            plain = f"joint_{plain or number}"
-        unique, count = plain, 2
-        # Two joint names that differ only in invalid characters would give the same identifier.
-        while unique in identifiers:
-            unique, count = f"{plain}_{count}", count + 1
-        identifiers.append(unique)
-    return tuple(identifiers)
 
 
 def _letters_and_digits(text: str) -> str:
@@ -181,8 +163,7 @@ def _residuals(model: ArmModel) -> Residuals:
     """Return the residual terms of a model, without the terms that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
-    # Entries of the lower triangle of M without a contribution of any function are zero, and are
-    # omitted.
+    # Entries of the residual of M to which no function contributes are zero and are omitted.
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
@@ -200,13 +181,14 @@ def _residuals(model: ArmModel) -> Residuals:
 def _network(
     layers: Layers | None, encoding: JointEncoding, functions: np.ndarray | None = None
 ) -> SigmoidNetwork | None:
-    """Return the network y(q), or tanh(y(q)) @ functions; None if there are no layers or the last layer is zero.
+    """Return a network of tanh units as a network of sigmoids; None if it has no layers or a zero last layer.
 
-    Units become sigmoids, which take less time in C: tanh(x) = 2 sigmoid(2 x) - 1. The factors and the shift of this
-    formula are included in the weights and biases of the layers before and after the unit.
+    With the outputs y(q) of the given network, the outputs of the result are y(q), or tanh(y(q)) @ functions. Sigmoids
+    take less time in C: tanh(x) = 2 sigmoid(2 x) - 1. The factors and the shift of this formula are included in the
+    weights and biases of the layers before and after the unit.
 
     Args:
-        layers: weights and biases of tanh layers, of which the last is linear.
+        layers: weights and biases of the layers of tanh units, and of the last layer, which is linear.
         encoding: the inputs of the network, (2 n,): cos q and sin q of a revolute joint, (q - center) slope and zero of
             a prismatic joint.
         functions: linear map of tanh(y), (outputs of the last layer, outputs); None: the result is y.
@@ -232,7 +214,10 @@ def _network(
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
-    """Return a spline per index of a joint, from weights (n, splines); joints with only zero weights have none."""
+    """Return cubic splines by the index of the joint; joints whose coefficients are all zero are omitted.
+
+    weights: coefficients of k B-splines per joint, (n, k).
+    """
     splines = {}
     for joint in torch.nonzero(weights.any(dim=1)).flatten().tolist():
         # Three zero weights at each end make the curve and its first two derivatives zero at the ends.
@@ -244,7 +229,10 @@ def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
 
 
 def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
-    """Return the torque ripple for weights (n, 2 H): harmonics of the joint's revolution, then of the motor's.
+    """Return the torque ripple of the joints.
+
+    weights: coefficients of H cosines, then of H sines, (n, 2 H). The H frequencies are the harmonics of a revolution
+    of the joint, then of a revolution of the motor.
 
     An export computes harmonics k = 1, 2, ... of one frequency by a rotating phasor, in sequence. Harmonics with zero
     amplitude are therefore only removed after the last nonzero one.
@@ -253,8 +241,8 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
     cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
-        # number of harmonics of the joint, with frequencies 1, 2, ...; the motor has multiples of the gear
-        # ratio
+        # `regular` is the number of harmonics of the joint, with the frequencies 1, 2, ... per revolution. The other
+        # frequencies are multiples of the gear ratio.
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]

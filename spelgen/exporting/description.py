@@ -1,4 +1,4 @@
-"""A trained model as plain numbers, for exporters of source code, and the entry points: the functions of an export."""
+"""``TrainedModel``, a trained model as NumPy arrays; and the entry points, the functions that an export contains."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,10 @@ class SigmoidNetwork:
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Torque ripple of a joint [Nm]: sum over k = 1, 2, ... of cosines[k] cos(k frequency q) + sines[k] sin(...)."""
+    """Torque ripple of a joint [Nm]: a sum over k = 1, 2, ... at the position q of the joint.
+
+    The terms are cosines[k - 1] cos(k frequency q) + sines[k - 1] sin(k frequency q).
+    """
 
     joint: int
     frequency: float
@@ -60,7 +63,10 @@ class Residuals:
 
 
 def spline_energy(spline: BSpline) -> BSpline:
-    """Return the antiderivative of a torque spline whose values at both ends of the range have opposite signs."""
+    """Return the potential energy of a torque spline, its antiderivative.
+
+    The energies at both ends of the range have equal magnitudes and opposite signs, as in the runtime.
+    """
     energy = spline.antiderivative()
     count = len(energy.t) - energy.k - 1
     half = energy(spline.t[-4]) / 2
@@ -69,7 +75,10 @@ def spline_energy(spline: BSpline) -> BSpline:
 
 @dataclass(frozen=True, eq=False)
 class Servos:
-    """Constants of ``runtime.PositionServo``, (n,), and the delay [s]; limit: infinite if there is none."""
+    """Constants of position servos, (n,) each, as in ``runtime.PositionServo``, and the delay of the command [s].
+
+    limit: largest torque [Nm, N]; infinite for a servo without a limit.
+    """
 
     kp: np.ndarray
     kd: np.ndarray
@@ -82,17 +91,18 @@ class Servos:
 class TrainedModel:
     """A trained model of an arm with n joints: rad and Nm for revolute joints, m and N for prismatic joints.
 
-    name, identifiers: identifiers of the robot and of the joints in code. inertias: inertial parameters in the frames
-    of the joints, (bodies, 10). constant_mass: armature and constant residual terms of M, (n, n). motors: C, (n, n),
-    motor velocities per joint velocities. friction: the ``FrictionConstants`` of the runtime, as arrays. breakaway:
-    break-away displacements of the bristles, (n, K) [rad, m]. inputs: G, (n, n), joint torque per motor torque.
-    actuated: 0 for a passive joint, otherwise 1, (n,). torque_offset: measured torque at zero torque, (n,).
-    friction_compensation: torque per velocity that the drives add but do not report, (n,).
+    name: identifier of the robot in code. joint_labels: names of the joints in comments, of letters, digits and _.
+    inertias: inertial parameters in the frames of the joints, (bodies, 10). constant_mass: armature and constant
+    residual terms of M, (n, n). motors: C, (n, n), motor velocities per joint velocities. friction: the
+    ``FrictionConstants`` of the runtime, as arrays. breakaway: break-away displacements of the bristles, (n, K) [rad,
+    m]. inputs: G, (n, n), joint torque per motor torque. actuated: 0 for a passive joint, otherwise 1, (n,).
+    torque_offset: measured torque at zero torque, (n,). friction_compensation: torque per velocity that the drives
+    add but do not report, (n,).
     """
 
     name: str
     arm: Chain
-    identifiers: tuple[str, ...]
+    joint_labels: tuple[str, ...]
     inertias: np.ndarray
     constant_mass: np.ndarray
     motors: np.ndarray

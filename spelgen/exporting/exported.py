@@ -58,8 +58,8 @@ else:
 class Exported:
     """A trained model in the format of another tool.
 
-    files: contents by path in the folder; for a format of one file, by the part of the name after the stem. summary:
-    sentences for the user.
+    files: contents by the path of the file in the folder. For a format that is a single file, the keys are endings,
+    such as ``.urdf``, which are appended to the stem of its name. summary: sentences for the user.
     """
 
     to: str
@@ -124,7 +124,7 @@ def with_readme(
         to: name of the format.
         files: contents by file name.
         use: first line after the title, how the export is used.
-        about: end of the line of conventions, after the units and the tip.
+        about: conventions of the format; the text follows the units and the name of the tip in the same line.
         summary: results of the checks, sentences without full stops.
         example: lines of Python that run in the folder of the README.
     """

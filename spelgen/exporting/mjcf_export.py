@@ -40,8 +40,9 @@ overlap, and the model has no contacts."""
 
 
 def export_mjcf(trained: Trained) -> Exported:
-    """Return the MJCF of a trained model, with the model's rigid bodies, or with the nearest ones for networks.
+    """Return the MJCF of a trained model.
 
+    If the model computes M by networks, the file has the rigid bodies nearest to it (see `rigid_body_projection`).
     Raises RunError if MuJoCo computes another M, bias or forward dynamics for these bodies.
     """
     # MuJoCo simulates rigid bodies only, so residual terms are omitted and networks are projected onto rigid
@@ -110,7 +111,9 @@ def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
 
 
 def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:
-    """Return MuJoCo's M, bias and accelerations in the coordinates of the arm; no accelerations with mimic joints.
+    """Return M, bias and accelerations computed by MuJoCo, in the coordinates of the arm, by name.
+
+    For an arm with mimic joints, the result has no accelerations.
 
     Args:
         text: content of the MJCF file.
@@ -152,8 +155,9 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
 
 
 def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
-    """Return the content of the MJCF of a projection, and the names of links with omitted shapes.
+    """Return the content of the MJCF of a projection, and the names of links whose shapes are omitted.
 
+    A projection is the rigid bodies nearest to a model. Shapes that are flat or cannot be read are omitted.
     The file has the unrounded angles of the URDF, so that the tip has the same pose as in other tools that read the
     URDF. The actuators are one motor per nonzero column of G, or one position actuator per joint for position servos.
     """
@@ -205,7 +209,10 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
 
 
 def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> dict[str, object]:
-    """Return attributes of joint k, not a mimic joint; is_coupled: motors that several joints rotate, (n,)."""
+    """Return the MJCF attributes of the joint with the coordinate k.
+
+    is_coupled: whether several joints rotate the motor, (n,).
+    """
     friction, joint = projection.friction, projection.arm.chain.coordinates[k]
     # The torque of position servos is limited by the actuator, with the learned limit.
     effort = joint.effort if projection.servos is None else None
@@ -234,7 +241,7 @@ def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: 
 
 
 def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos: Servos) -> None:
-    """Add a position actuator for each joint; a user delays the command before setting the actuator's control."""
+    """Add a position actuator for each joint; the file does not contain the delays of the servos."""
     for k, joint in enumerate(joints):
         limit = servos.limit[k]
         # MuJoCo refuses an infinite force range; without the attribute the force is unlimited.

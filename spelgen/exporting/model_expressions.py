@@ -62,14 +62,16 @@ def _expressions(
 ) -> Outputs:
     """Return the expressions of all entry points except derivatives, and of ``force``.
 
-    The model is M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation, and ``force`` is M qdd + h + friction
-    - compensation, (n, 1).
+    The model is M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation, with the measured torque ``offset``
+    at zero torque and the torque ``compensation`` that the drives add. ``force`` is M qdd + h + friction -
+    compensation, (n, 1).
 
     Args:
-        model: the model as plain numbers.
+        model: the model as NumPy arrays.
         inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1).
         residuals: symbols of the residual terms, see ``residual_symbols``.
-        derivatives: whether the symbol ``first`` replaces ``rate`` and ``kinetic``, for derivatives with respect to q.
+        derivatives: whether the derivative of the residual of M with respect to q (symbol ``first``) replaces the time
+            derivative (``rate``) and the gradient of the kinetic energy (``kinetic``).
     """
     q, qd, qdd, tau, dq, u, z = inputs.values()
     standstill = ca.SX(model.n, 1)
@@ -135,13 +137,13 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
     """Return the friction torque of the motors, (n, 1) [Nm, N], by the formulas of ``runtime.friction_laws``.
 
     Args:
-        model: the model as plain numbers.
+        model: the model as NumPy arrays.
         qd: velocities of the motors, (n, 1) [rad/s, m/s].
         gravity: gravity torques of the motors, (n, 1) [Nm, N].
-        z: friction state, (n K, 1), the K elements of the first joint first.
+        z: friction state, (n K, 1), the K bristles of the first joint first.
     """
     constants = model.friction
-    # ca.reshape is column-major, so that each column has the K elements of a joint.
+    # ca.reshape is column-major, so that each column has the K bristles of a joint.
     deflection = ca.reshape(
         z * (constants.bristle_fractions / model.breakaway).ravel(), model.breakaway.shape[1], model.n
     )
@@ -153,7 +155,7 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
     speed = ca.fabs(qd) / constants.stribeck_velocity
     rounding = constants.stribeck_rounding
     slow = 1 / (1 + (1 + rounding) / 8 * speed**2 / (speed + rounding))
-    for _ in range(3):  # three squares are the power of 8
+    for _ in range(3):  # squaring three times gives the eighth power
         slow = slow * slow
     dry = constants.coulomb + constants.load_dependence * load + constants.stribeck * slow
     viscous = constants.viscous * qd + constants.saturation * _smooth_sign(qd, constants.saturation_velocity)
@@ -184,7 +186,7 @@ def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
 
 
 def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:
-    """Return values (n, 1) with each value repeated K times, once per element of the joint, (n K, 1)."""
+    """Return values (n, 1) with each value repeated K times, once per bristle of the joint, (n K, 1)."""
     return ca.vec(ca.repmat(values.T, breakaway.shape[1], 1))
 
 
@@ -202,10 +204,11 @@ def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
 
 
 def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Outputs:
-    """Return Jacobians, (n, n) each, of inverse dynamics (by q, qd) and forward dynamics (by q, qd, tau).
+    """Return Jacobians, (n, n) each, of inverse and forward dynamics.
 
-    Forward dynamics have dqdd/dx = -M^-1 dforce/dx at the computed qdd (Carpentier and Mansard, RSS
-    2018).
+    Inverse dynamics are differentiated with respect to q and qd, forward dynamics with respect to q, qd and tau. The
+    Jacobian of forward dynamics with respect to q or qd is -M^-1 times the Jacobian of ``force`` at the accelerations
+    of the forward dynamics (Carpentier and Mansard, RSS 2018).
     """
     expressions = _expressions(model, inputs, residuals, derivatives=True)
     (force,), (mass,) = expressions["force"], expressions["mass_matrix"]

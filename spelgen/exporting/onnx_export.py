@@ -97,7 +97,7 @@ def _cross(a: Tensor, b: Tensor, *, dim: int) -> Tensor:
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Return matrix^-1 right, (..., n, columns), by Gauss-Jordan elimination without pivoting; matrix: definite."""
-    n = matrix.shape[-1]  # constant: tracing unrolls the loop
+    n = matrix.shape[-1]  # a Python integer, so that tracing unrolls the loop over pivots
     identity = torch.eye(n, dtype=matrix.dtype)
     # Either of the matrix and the right-hand side may have no batch dimension.
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
@@ -111,7 +111,10 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def _solve_triangular(matrix: Tensor, right: Tensor, *, upper: bool, unitriangular: bool) -> Tensor:
-    """Return matrix^-1 right, (..., n, columns); matrix: triangular, its diagonal is replaced by ones."""
+    """Return matrix^-1 right, (..., n, columns); matrix: triangular, (..., n, n), with a diagonal that counts as ones.
+
+    All calls of the runtime have ``unitriangular=True``.
+    """
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
     return _solve(matrix - matrix * identity + identity, right)
 
@@ -190,5 +193,5 @@ def onnx_session(content: bytes) -> onnxruntime.InferenceSession:
     # One thread is used, since synchronising several takes longer than operations with small matrices.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # no warnings of unused inputs
+    options.log_severity_level = 3  # Only errors are printed, no warnings of unused inputs.
     return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])

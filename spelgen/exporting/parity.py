@@ -54,16 +54,22 @@ _REFERENCES: dict[str, Callable[..., Tensor]] = {
 
 @dataclass(frozen=True)
 class Parity:
-    """Largest difference per entry point, relative to the torch model's largest value; summary: a sentence."""
+    """Largest difference per entry point, relative to the largest value of the torch model.
+
+    summary: sentence for the user with the largest difference.
+    """
 
     differences: dict[str, float]
     summary: str
 
 
 def require_parity(differences: dict[str, float], tolerance: float, states: int) -> Parity:
-    """Return the result of a comparison. Raises RunError if a relative difference is above the tolerance."""
+    """Return the differences as a ``Parity``. Raises RunError if a difference is above the tolerance.
+
+    differences: largest relative difference per entry point.
+    """
     for name, difference in differences.items():
-        if not difference <= tolerance:  # also raised for NaN
+        if not difference <= tolerance:  # True for NaN, too
             raise RunError(
                 f"{name} differs from the model by {difference:.1e}",
                 element="parity check",

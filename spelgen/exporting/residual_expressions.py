@@ -33,8 +33,8 @@ def residual_symbols(model: TrainedModel) -> Symbols:
     has_potential = residuals.potential is not None
     sizes = {
         "mass": (entries, entries, 1),
-        # Directional derivatives: exported code computes each in one sweep over the network; `first` would
-        # take n sweeps.
+        # `rate` and `kinetic` are directional derivatives of the network, each computed in one sweep; the Jacobian
+        # `first` would take n sweeps.
         "rate": (entries, entries, 1),
         "kinetic": (entries, n, 1),
         # `first`, `second` and the slopes occur only in derivatives of the dynamics.
@@ -56,7 +56,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
 
 
 def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
-    """Return the symmetric matrix, (n, n), that has these values, (m, 1), at the nonzero entries of R."""
+    """Return the symmetric matrix, (n, n), with ``values``, (m, 1), at the m nonzero entries of the residual R of M."""
     matrix = ca.SX(model.n, model.n)
     for k, (row, column) in enumerate(model.residuals.entries):
         matrix[row, column] = matrix[column, row] = values[k]
@@ -64,7 +64,10 @@ def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
 
 
 def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: bool) -> ca.SX:
-    """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1); derivatives: ``first`` replaces ``rate`` and ``kinetic``."""
+    """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1), with the residual R of M, which a network computes.
+
+    derivatives: whether the symbol ``first`` replaces ``rate`` and ``kinetic``.
+    """
     if not derivatives:
         return symmetric(model, symbols["rate"]) @ qd - symbols["kinetic"]
     kinetic = symbols["first"].T @ in_kinetic_energy(model, qd)
@@ -72,7 +75,7 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
 
 
 def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
-    """Return the coefficient of each entry of R in the energy 1/2 qd^T R qd, (m, 1); qd: (n, 1)."""
+    """Return the coefficients, (m, 1), of the entries of the residual R of M in 1/2 qd^T R qd; qd: (n, 1)."""
     products = []
     for row, column in model.residuals.entries:
         # An off-diagonal entry occurs twice in R, so the factor 1/2 cancels.
@@ -82,7 +85,10 @@ def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
 
 
 def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
-    """Return pairs of a symbol that depends on q, as a column of any length, and the Jacobian with respect to q."""
+    """Return pairs (symbol, Jacobian) for the residual terms that depend on q.
+
+    The symbol is a column, (k, 1). The Jacobian with respect to q, (k, n), consists of symbols, too.
+    """
     # One row per friction factor, which depends on the position of its own joint only.
     joints = np.eye(model.n)[list(model.residuals.friction)]
     # `second` is (m, n n): each block of n columns is the Jacobian of one column of `first`.

@@ -49,11 +49,11 @@ class NearestFriction(NamedTuple):
 class RigidBodyProjection:
     """Parameters of an arm of n joints in the form that a URDF and a settings file can contain.
 
-    inertias: inertial parameters in the frames of the joints, (bodies, 10), as in ``Body``. armature: rotor inertia of
-    the motors, (n,) [kg m^2, kg]. motors: C, (n, n), motor velocities per joint velocities. inputs: G at q = 0, (n, n).
-    exact: whether the rigid bodies are the trained model's own, not the nearest ones. mass_error, gravity_error:
-    relative root mean square difference between the rigid bodies and the trained model, of M and of the gravity torque.
-    bodies: float64 model that consists of the rigid bodies only.
+    inertias: inertial parameters in the frames of the joints, (bodies, 10), as in ``Body``. armature: rotor inertia
+    of the motors, (n,) [kg m^2, kg]. motors: C, (n, n), motor velocities per joint velocities. inputs: G at q = 0,
+    (n, n), joint torque per motor torque. exact: whether the rigid bodies are the trained model's own, not the
+    nearest ones. mass_error, gravity_error: relative root mean square difference between the rigid bodies and the
+    trained model, of M and of the gravity torque. bodies: float64 model that consists of the rigid bodies only.
     """
 
     arm: Arm
@@ -131,8 +131,7 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
         """Return the sum of the cost and the ridge, ()."""
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
-        # The bodies of the URDF have all parameters zero, so the ridge is a sum of squares of the
-        # parameters.
+        # The parameters are zero for the bodies of the URDF, so the ridge is the sum of squares of the parameters.
         weights = torch.cat([parameter.flatten() for parameter in bodies.parameters()])
         distance: Tensor = (mass_error.square().sum() / model.n + gravity_error.square().sum()) / len(q)
         return distance + 0.5 * TUNING.ridge * weights.square().sum()

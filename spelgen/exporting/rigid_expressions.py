@@ -1,4 +1,4 @@
-"""Rigid bodies as CasADi expressions: torques by recursive Newton-Euler, M and V by the recursion of the structure.
+"""Rigid bodies as CasADi expressions: torques by recursive Newton-Euler, M and V by ``structure.recursion``.
 
 Quantities of a body are expressed in its joint's frame, whose z is the joint axis (Featherstone, Rigid Body Dynamics
 Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi omits operations
@@ -62,9 +62,9 @@ class RigidBodies:
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
         """Return M qdd + h of the bodies without armature, (n, 1) [Nm, N]; zeros of qd cause no operations."""
-        # The motion of the base and then of each body, in its own frame: angular velocity, angular
-        # acceleration, acceleration of the origin, and spin. Gravity is replaced by an upward acceleration of
-        # the base.
+        # The list has the motion of the base and of each body, in the frame of the body: angular velocity w, angular
+        # acceleration w', acceleration of the origin, and the matrix skew(w') + w w^T - |w|^2 1 (`spin`). Gravity is
+        # replaced by an upward acceleration of the base.
         gravity = np.array(self.arm.gravity, dtype=float)
         motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
         wrenches: list[Wrench] = []
@@ -81,12 +81,12 @@ class RigidBodies:
                 w = w + _Z * speed
                 rate = rate + _Z * added + turning
             else:
-                # The Coriolis acceleration is 2 w x v.
+                # The Coriolis acceleration is 2 w x v, with the velocity v along the prismatic joint.
                 acceleration = acceleration + _Z * added + 2 * turning
             # With this matrix, spin @ p is the acceleration of a point p of the body relative to the origin.
             spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
             motions.append((w, rate, acceleration, spin))
-            # Newton's equation gives the force, Euler's about the origin of the frame the torque.
+            # Newton's equation gives the force; Euler's equation about the origin of the frame gives the torque.
             force = mass * acceleration + spin @ moment
             torque = ca.cross(moment, acceleration) + inertia @ rate
             wrenches.append((force, torque + ca.cross(w, inertia @ w)))
@@ -100,8 +100,8 @@ class RigidBodies:
     def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return the momentum M qd and d/dq of the kinetic energy, both without armature, (n, 1) each.
 
-        The momentum of all bodies that a joint carries is projected onto the joint axis S for M qd, and onto dS/dt =
-        twist x S for the gradient.
+        For M qd, the momentum of all bodies that a joint carries is projected onto the joint axis S. For the gradient,
+        the momentum is projected onto dS/dt = twist x S.
         """
         # The twist of the base and then of each body, in its own frame: angular velocity, and velocity of the
         # origin.
@@ -126,7 +126,7 @@ class RigidBodies:
         return momentum, gradient
 
     def _rows(self) -> zip[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
-        """Return rows, parents first: body, its mass, first moment (3, 1) and tensor (3, 3), and its frame."""
+        """Return tuples (body, (mass, first moment (3, 1), tensor (3, 3)), frame), parents first."""
         return zip(self.bodies, self.inertias, self.frames, strict=True)
 
     def _carry(self, wrenches: list[Wrench]) -> None:
@@ -147,7 +147,7 @@ def _along(body: Body, wrench: Wrench) -> ca.SX:
 
 
 def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q, (n, 1); see ``structure`` for the recursion."""
+    """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q, (n, 1), by ``structure.recursion``."""
     positions = []
     for joint, base in enumerate(base_denominators(model.arm)):
         # Angles of mimic joints are integer multiples of the leader's angle divided by `base`.

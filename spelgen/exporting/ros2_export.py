@@ -46,7 +46,7 @@ def export_ros2(trained: Trained) -> Exported:
     sources, checked = c_files(replace(trained, entries=entries, levels=levels))
     package = f"{model.name}_dynamics"
     context = {"package": package, "controller": controller, "name": model.name, "upper": model.name.upper()}
-    context |= {"joints": ", ".join(model.identifiers), "estimator": estimator}
+    context |= {"joints": ", ".join(model.joint_labels), "estimator": estimator}
     context["dependencies"] = sorted(_DEPENDENCIES + (_CONTROLLER_DEPENDENCIES if controller else ()))
     paths = _PATHS
     if controller:
@@ -74,7 +74,8 @@ def _missing_part(trained: Trained) -> tuple[str, str] | None:
         return "controller", "it needs an effort interface of every joint"
     if trained.levels is None:
         return "estimator", "its noise levels are found from the training logs of a fit"
-    # The estimator's payload is in the frame of the last body, but published in the frame of the tip link.
+    # The estimator computes the payload in the frame of the last body, and the controller publishes it in the frame
+    # of the tip link: both frames must belong to the same body.
     if model.tip.carrier != len(model.arm.bodies) - 1:
         return "estimator", "the tip link is not part of the last body"
     return None

@@ -80,7 +80,7 @@ def calls(model: PreparedModel, names: Sequence[str], zeros: str, no_state: str)
     Args:
         model: model that was exported.
         names: names of the programs.
-        zeros: Python expression for an array of zeros, (5, n).
+        zeros: Python expression for an array of zeros, (5, n), in the example a batch of five states.
         no_state: Python expression for z, if the program friction_memory is not exported.
     """
     lines = [f"q = qd = qdd = tau = dq = {zeros}  # a batch of 5; dq: change of q since the last step"]
@@ -98,13 +98,13 @@ def _saved(program: torch.export.ExportedProgram) -> bytes:
     """Return the content of the .pt2 file of a program."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # shared memory, harmless for constants
+        warnings.simplefilter("ignore")  # constants share memory, which has no effect on constants
         torch.export.save(program, buffer)
     return buffer.getvalue()
 
 
 def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
-    """Return a function that loads the programs from files and evaluates one by name, for arrays of states."""
+    """Load the programs from their files; return a function that evaluates one, by name, for arrays of states."""
     # The parity check runs the saved files, not the programs in memory.
     programs = {name: torch.export.load(io.BytesIO(content)).module() for name, content in files.items()}
 

@@ -16,7 +16,7 @@ from spelgen.exporting.rigid_body_projection import (
     rigid_body_projection,
     sampled_positions,
 )
-from spelgen.urdf.document import urdf_bytes
+from spelgen.urdf.document import read_document
 
 _LAW = (
     "viscous qd + saturation turned(qd, saturation_velocity) + dry direction, with "
@@ -56,9 +56,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     """
     robot = projection.arm.robot
     arm = projection.arm.chain
-    # The URDF is untrusted, so the parser loads no entities and no files from the network.
-    parser = etree.XMLParser(resolve_entities=False, no_network=True)
-    root = etree.fromstring(urdf_bytes(robot.path), parser)
+    root = read_document(robot.path).root
     links = {element.get("name"): element for element in root.findall("link")}
     joints = {element.get("name"): element for element in root.findall("joint")}
     chain = choose_chain(robot, arm.joint_names, None)
@@ -132,7 +130,7 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
-    # The factor is omitted from the file if it is one at all positions.
+    # The factor on friction, which depends on the position, is omitted if it is one at all positions.
     if (factor != 1).any():
         constants["position_factor"] = np.stack([factor.min(axis=0), factor.max(axis=0)], axis=-1)
     return constants

@@ -203,8 +203,8 @@ class Validation:
     def substeps(self, present: int | None = None) -> int:
         """Return the number of integration steps per sample interval.
 
-        The number is the given one, or else the smallest number with a small integration error (see `choose_substeps`).
-        present: lower bound of the number; None: 1.
+        The solver dopri5 has one step. For rk4 the number is the constructor's argument `substeps` or, if this is None,
+        the smallest number with a small integration error (see `choose_substeps`), at least `present`.
         """
         if self.solver != "rk4":
             return 1

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from spelgen.arm.configured_arm import Arm
+from spelgen.arm.configured_arm import Arm, urdf_path
 from spelgen.baselines.registry import FittedBaselines, arm_of_model, fit_baselines
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, OptionError, RunError, SettingsError, SpelgenError
@@ -99,7 +99,7 @@ def fit(
     logs = [logs] if isinstance(logs, Trajectory) else logs
     config = choose_config(model, config, lambda: sample_rates(logs))
     # A resumed run uses its own copy of the URDF: the user's file may have changed.
-    urdf = run.urdf if run is not None and options.resume else _urdf(arm)
+    urdf = run.urdf if run is not None and options.resume else urdf_path(arm)
     folder = None if run is None else run.path
     request = FitRequest(model, logs, config, preprocessing, validation, seed, urdf, options, began, folder)
     objective = objective_of(request)
@@ -271,10 +271,3 @@ def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rat
 def sample_rates(logs: Sequence[Trajectory]) -> list[float]:
     """Return the sample rates [Hz] of the logs that are long enough for accelerations."""
     return [log.sample_rate for log in logs if log.duration >= SHORTEST]
-
-
-def _urdf(arm: Arm | Path | str | None) -> Path | None:
-    """Return the path of the URDF of a loaded arm, or the given path; None without an arm."""
-    if arm is None:
-        return None
-    return Path(arm) if isinstance(arm, str | Path) else arm.robot.path

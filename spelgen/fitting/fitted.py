@@ -95,7 +95,7 @@ class Fit:
 
     @property
     def result(self) -> str:
-        """The result in words: the error of the fitted torques, or the validation loss of other objectives."""
+        """Text with the nMSE of the fitted torques; for objectives other than torque, with the validation loss."""
         nmse = self.torque_nmse
         if not nmse:
             return f"validation loss {self.best_validation:.3g}"
@@ -209,7 +209,7 @@ class Fit:
         motion: q, qd, qdd (T, n), and the friction state z and direction, None if unknown (see `DynamicsSamples`).
         """
         like = next(self.model.parameters())
-        # torch does not accept arrays with negative strides, which filters return
+        # Arrays are copied, since filters return negative strides, which torch does not accept.
         inputs = [torch.as_tensor(np.ascontiguousarray(x)).to(like) for x in motion if x is not None]
         with torch.no_grad():
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()

@@ -82,7 +82,7 @@ class LeastSquaresProblem(Protocol[Parameters]):
     """
 
     def residual(self, x: Parameters) -> Tensor:
-        """Return the residual of T samples, (T, n), or its sum of squares per joint, (n,), as `cost` needs it."""
+        """Return the residual of T samples, (T, n), or its sum of squares per joint, (n,); it is passed to `cost`."""
 
     def cost(self, x: Parameters, residual: Tensor) -> float:
         """Return the cost at x, computed from the result of `residual` at x; infinite if the residual diverged."""

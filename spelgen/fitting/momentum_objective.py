@@ -50,7 +50,8 @@ class MomentumObjective(Objective):
         self.config = self.config.resolved(len(self.data.training))
         self.regularizer = None
         if self.config.urdf_weight:
-            # The regularizer is made from the initial model, whose mean M is its unit of M, also if a run is resumed.
+            # The mean M of the initial model is the unit of M in the regularizer. A resumed run has the same unit: here
+            # its model still has the initial weights.
             self.regularizer = urdf_regularizer(self.request.urdf, self.model, self.data.training, self.notes)
         return self.data
 
@@ -134,7 +135,7 @@ class MomentumObjective(Objective):
         """Return the learning rate after a fraction (0 to 1) of the training: linear warm-up times cosine decay."""
         cosine = (1 + math.cos(math.pi * min(fraction, 1.0))) / 2
         decay = TUNING.final_rate + (1 - TUNING.final_rate) * cosine
-        # 1e-3: the learning rate of the first step is not zero
+        # Without the term 1e-3, the learning rate of the first step would be zero.
         warm_up = min(1.0, (fraction + 1e-3) / TUNING.warm_up)
         return (self.config.learning_rate or DEFAULTS.learning_rate) * warm_up * decay
 

@@ -85,7 +85,7 @@ class Posterior:
     def propagate(self, function: Callable[[ArmModel], Tensor]) -> Propagated:
         """Return the value (...) of a function of the model, and its derivative df/dx R, (..., k).
 
-        R R^T is the covariance of the fitted parameters x.
+        R (K, k) is a factor of the covariance R R^T of the K fitted parameters x.
         """
 
         def at(x: Tensor) -> Tensor:
@@ -172,7 +172,7 @@ class Posterior:
         friction_line = _friction_line(model)
 
         def constants(model: ArmModel) -> Tensor:
-            """Return the quantities of all joints: (4, n), or (5, n) if gains are trained."""
+            """Return armature, viscous friction, Coulomb friction, offset and, if trained, gain, (4, n) or (5, n)."""
             rows = [model.armature, *friction_line(model), model.torque_offset]
             if isinstance(model.inputs, MotorInputs) and trained:
                 rows.append(model.inputs.gains().sum(dim=1))
@@ -309,8 +309,8 @@ def _friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
     """Return a function that approximates the friction of a model by viscous and Coulomb friction, (2, n).
 
     The approximation is a straight line, fitted by least squares to the friction torque at speeds up to the typical
-    speed. The friction torque is averaged over random positions; there, gravity load and residual terms are taken from
-    ``model``.
+    speed. The friction torque is averaged over random positions. The gravity load and the residual terms at these
+    positions are computed once, from ``model``; the function may be called with models of other friction.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
     places = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]

@@ -68,10 +68,11 @@ def _adaptive_step(
     z: Tensor,
     step: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Integrate over one interval with adaptive steps; arguments and results as for `runge_kutta`, (W, n) each.
+    """Return q, p and z at the end of one interval, integrated with adaptive steps, and q' at its start.
 
-    Dormand and Prince, J. Comput. Appl. Math. 6 (1980), differentiated through the solver. All windows are solved
-    together, with time in units of their own intervals.
+    Dormand and Prince, J. Comput. Appl. Math. 6 (1980), differentiated through the solver. All W windows are solved
+    together, with time in units of each window's interval. rhs: function of (q, p, z) that returns q' and p'. q, p:
+    positions and momenta, (W, n). z: friction state, (W, n, K). step: duration of the interval [s].
     """
     from torchdiffeq import odeint  # imported only if needed, since the import takes half a second
 
@@ -88,9 +89,10 @@ def _adaptive_step(
 def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequence[str]) -> Tensor:
     """Return predicted minus measured positions, (..., n) [rad, m]; for revolute joints wrapped to +-pi.
 
-    For rotations about a common axis, R = exp(q e), the geodesic distance |log(R^T R')| / sqrt(2) on SO(3) is the
-    wrapped angle |q' - q - 2 pi round((q' - q) / 2 pi)|. This is the position error in the loss (eq. 8) of the paper
-    whose model is the preset `spel`, computed without matrices.
+    Let R = exp(q e) and R' = exp(q' e) be rotations by q and q' about one axis, where e is the skew-symmetric matrix of
+    the unit axis. Their geodesic distance |log(R^T R')| / sqrt(2) on SO(3) is the wrapped angle |q' - q - 2 pi
+    round((q' - q) / 2 pi)|. This is the position error in the loss (eq. 8) of the paper whose model is the preset
+    `spel`, computed without matrices.
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured

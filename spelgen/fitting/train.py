@@ -1,16 +1,18 @@
 """Fit a module to log files and write a run folder: the function behind `spelgen train`."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from spelgen.emission.assemble import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
-from spelgen.fitting.fit import AUTOMATIC, QUIET, FitOptions, RunOptions, choose_config, fit, sample_rates
+from spelgen.fitting.fit import QUIET, FitOptions, RunOptions, choose_config, fit, sample_rates
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder, fitted_model
+from spelgen.fitting.run_record import Record
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import BoundedLogs, read_bounded_logs
 from spelgen.logs.trajectory import Trajectory
@@ -27,39 +29,42 @@ def train(
     *,
     urdf: Path | str | None = None,
     source: Path | str | None = None,
-    preprocessing: Preprocessing = AUTOMATIC,
-    validation: float | None = None,
-    seed: int | None = None,
+    of_logs: Mapping[str, Any] | None = None,
     require: Callable[[Sequence[Trajectory]], list[Diagnostic]] | None = None,
     options: RunOptions = QUIET,
 ) -> Fit:
-    """Fit the module to the logs and write a run folder (see `RunFolder`); further arguments: see `fit`.
+    """Fit the module to the logs and write a run folder (see `RunFolder`).
 
     module: the built module. data: log files. urdf: URDF that the module was built from, for the regularizer and the
     baselines; by default, the file with the URDF's original name in the module's folder. source: run folder whose model
     is adapted; used if there is no module. config: a configuration, or options for an objective that depends on the
-    logs. require: function that raises an error for unusable logs before the fit, or returns findings. validation,
-    seed: by default 0.25 and 0. A resumed run by default uses the recorded values and the recorded mapping of the logs.
+    logs. of_logs: fields of `Preprocessing`, validation_fraction and seed, by name. require: function that raises an
+    error for unusable logs before the fit, or returns findings. A resumed run uses the recorded options and the
+    recorded mapping of the logs, unless the arguments replace them.
 
     Raises ModuleError, LogError, and RunError if the folder contains a run or cannot be resumed with these arguments.
     """
     run = RunFolder(folder)
-    robot = None
-    notes: list[Diagnostic] = []
+    robot, notes, settings = None, list[Diagnostic](), dict(of_logs or {})
     if options.resume:
         # The record is read first, so that a missing run is reported before the logs are read.
         record = run.read_record()
-        config = config or record.config
-        seed = record.seed if seed is None else seed
-        validation = validation or record.validation_fraction
-        if preprocessing is AUTOMATIC:
-            preprocessing = record.preprocessing
+        # Validation logs that were passed from Python are not stored in a file, so the run cannot be resumed here.
+        if record.validation_fraction is None and record.validation:
+            raise RunError(
+                "a run whose validation logs were passed from Python", file=run.path,
+                do="resume it by spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
+            )  # fmt: skip
+        config = _resumed(config, record)
+        recorded = {"seed": record.seed, "validation_fraction": record.validation_fraction}
+        settings = {**recorded, **asdict(record.preprocessing), **settings}
         options = replace(options, mapping=options.mapping or record.mapping)
-        # `fit` loads the weights from the checkpoint
+        # The model is made with initial weights: `fit` loads the fitted weights from the checkpoint.
         model = run.untrained_model()
     else:
         model = load_module(module) if module is not None else fitted_model(RunFolder(source or folder))
         robot, notes = robot_of(None if module is None else Path(module), urdf, model.spec)
+    seed, validation = settings.pop("seed", 0), settings.pop("validation_fraction", None) or 0.25
 
     @cache
     def logs() -> BoundedLogs:
@@ -72,9 +77,19 @@ def train(
     if require is not None:
         notes += require(opened)
     return fit(
-        model, opened, config, preprocessing=preprocessing, validation=validation or 0.25, seed=seed or 0, arm=robot,
+        model, opened, config, preprocessing=Preprocessing(**settings), validation=validation, seed=seed, arm=robot,
         folder=folder, options=replace(options, notes=[*options.notes, *notes]),
     )  # fmt: skip
+
+
+def _resumed(config: FitConfig | FitOptions | None, record: Record) -> FitConfig | FitOptions:
+    """Return the configuration of a resumed fit: recorded options, unless `config` replaces them."""
+    if not isinstance(config, FitOptions):
+        return config or record.config
+    objective, options = config.objective or record.objective, config.options
+    if objective == record.objective:
+        options = {**record.options, **options}
+    return FitOptions(objective, options)
 
 
 def robot_of(

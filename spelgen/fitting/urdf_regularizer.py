@@ -13,7 +13,7 @@ from torch import Tensor
 
 from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.emission.assemble import ArmModel
-from spelgen.errors import Diagnostic
+from spelgen.errors import Diagnostic, in_one_line
 from spelgen.fitting.tuning import TUNING
 from spelgen.logs.windows import Windows
 
@@ -59,8 +59,7 @@ def urdf_regularizer(
         return _at_random_positions(urdf, model, windows)
     # Pinocchio and its parser raise exceptions of many types; the fit continues without a regularizer
     except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        message = f"fitted without the URDF's regularizer: {reason}"
+        message = f"fitted without the URDF's regularizer: {in_one_line(error)}"
         notes.append(Diagnostic("info", "no-regularizer", urdf.name, None, message))
         return None
 

@@ -41,22 +41,29 @@ from spelgen.runtime.body_chain import BodyChain
 FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
 STEPS = max(HINTS.shifts)
 SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s] time shifts of the torque that are compared
+# [samples] Times around a sample at which its signals are kept: signals of the filter's bandwidth are determined by
+# values every 20 ms.
+OFFSETS = np.arange(-HINTS.longest_offset, HINTS.longest_offset + 1, 2)
 
 
 class DriveSamples(NamedTuple):
-    """S samples of a moving arm with n joints, and time-shifted torques.
+    """S samples of a moving arm with n joints, and time-shifted signals.
 
-    q, qd, qdd: (S, n) [rad, m, s]. bent: (S, n, K) bristle deflections, divided by the break-away displacements.
-    direction: (S, n) direction of dry friction, see `DynamicsSamples`. torques: (S, n, D) [Nm, N] joint torques,
-    shifted in time by each of the D `SHIFTS`.
+    around: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and joint torques [Nm, N] at each of the E times `OFFSETS` after the
+    sample; beyond the ends of a recording its first or last value. bent: (S, n, K) bristle deflections, divided by the
+    break-away displacements. direction: (S, n) direction of dry friction, see `DynamicsSamples`. torques: (S, n, D)
+    [Nm, N] joint torques, shifted in time by each of the D `SHIFTS`.
     """
 
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
+    around: np.ndarray
     bent: np.ndarray
     direction: np.ndarray
     torques: np.ndarray
+
+    @property
+    def motion(self) -> np.ndarray:
+        """Positions, velocities and accelerations without time shift, (3, S, n) [rad, s; m, s]."""
+        return np.moveaxis(self.around[:, :, :3, len(OFFSETS) // 2], 2, 0)
 
     @property
     def tau(self) -> np.ndarray:
@@ -69,10 +76,10 @@ class DriveSamples(NamedTuple):
 
 
 class DriveLog:
-    """Collector of the samples of successive trajectories, which keeps at most twice `DriveHintTuning.samples`.
+    """Collector of the samples of successive trajectories.
 
-    If there are more samples, every second one is removed. If there are many trajectories, only every second, fourth,
-    ... trajectory is used, since filtering all of a long log takes minutes.
+    Whenever it has more than twice `DriveHintTuning.samples` samples, every second one is removed. If there are many
+    trajectories, only every second, fourth, ... trajectory is used, since filtering all of a long log takes minutes.
     """
 
     def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
@@ -103,27 +110,42 @@ class DriveLog:
             samples = dynamics_samples(
                 [piece], pauses=True, preprocessing=self._preprocessing, reach=self._reach
             )
-            self._samples += [self._shifted(x).thinned(self._every) for x in samples if len(x.q) > 2 * STEPS]
+            self._samples += [self._shifted(x) for x in samples if len(x.q) > 2 * STEPS]
         while self._count > 2 * HINTS.samples:
             if len(self._samples) > HINTS.trajectories:
                 self._samples = self._samples[1::2]
                 self._step *= 2
             else:
-                self._samples = [x.thinned(2) for x in self._samples]
-                self._every *= 2
+                self._thin()
+
+    def _thin(self) -> None:
+        self._samples = [x.thinned(2) for x in self._samples]
+        self._every *= 2
 
     def _shifted(self, samples: DynamicsSamples) -> DriveSamples:
-        """Return the samples of the moving arm with all time-shifted torques, which do not exist at both ends."""
+        """Return every `_every`-th sample at which the arm moves, with the time-shifted signals.
+
+        Samples at both ends are omitted, because shifted torques are not available there.
+        """
         inner = samples[STEPS:-STEPS]
         assert inner.z is not None and inner.direction is not None
-        torques = sliding_window_view(samples.tau @ self._inputs.T, len(SHIFTS), axis=0)
-        columns = (inner.q, inner.qd, inner.qdd, inner.z / self._reach.values, inner.direction, torques)
-        moving = is_moving(inner.qd)
-        return DriveSamples(*(column[moving] for column in columns))
+        moving = np.flatnonzero(is_moving(inner.qd))
+        while (
+            len(moving[:: self._every]) > 2 * HINTS.samples
+        ):  # windows of all samples of hours would need gigabytes
+            self._thin()
+        tau = samples.tau @ self._inputs.T
+        signals = np.stack([samples.q, samples.qd, samples.qdd, tau], axis=2)
+        signals = np.pad(signals, ((OFFSETS[-1], OFFSETS[-1]), (0, 0), (0, 0)), mode="edge")
+        around = sliding_window_view(signals, 2 * OFFSETS[-1] + 1, axis=0)[STEPS:-STEPS, ..., ::2]
+        torques = sliding_window_view(tau, len(SHIFTS), axis=0)
+        columns = (around, inner.z, inner.direction, torques)
+        around, z, direction, torques = (column[moving[:: self._every]] for column in columns)
+        return DriveSamples(around, z / self._reach.values, direction, torques)
 
     @property
     def _count(self) -> int:
-        return sum(len(x.q) for x in self._samples)
+        return sum(len(x.around) for x in self._samples)
 
     def samples(self) -> DriveSamples | None:
         """Return the collected samples, at most `DriveHintTuning.samples`; None if there are none."""
@@ -167,7 +189,8 @@ def drive_rows(
 
 def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> DriveProblem:
     """Return the least-squares problem for the joint torques of samples without time shift."""
-    regressors = drive_rows(chain, samples.q, samples.qd, samples.qdd, drives.speeds)
+    q, qd, qdd = samples.motion
+    regressors = drive_rows(chain, q, qd, qdd, drives.speeds)
     rows = np.concatenate([regressors, samples.tau[..., None]], axis=2)
     products = block_products(rows, HINTS.blocks)
     return DriveProblem(samples, drives.speeds, rows, products, products[..., -1, -1].mean(axis=1))
@@ -237,7 +260,7 @@ class DriveProblem:
     def coupled(self, coupling: Coupling) -> DriveProblem:
         """Return a copy whose Gram matrices of both coupled joints belong to a model with this coupling."""
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
-        motion = np.stack([self.samples.qd, self.samples.qdd])
+        motion = self.samples.motion[1:]
         qd, qdd = motion[..., [joint]] + ratio * motion[..., [moved_by]]
         columns = FRICTION.columns(qd, qdd)[:, 0]  # (S, effects)
         n, effects = self.rows.shape[1], columns.shape[1]
@@ -299,7 +322,7 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
 
 
 def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
-    """Return True if a candidate lowers the errors per block (B,) significantly, and below the fraction `gain`.
+    """Return True if a candidate lowers the errors per block (B,) significantly, and their mean by the factor `gain`.
 
     logged: (B,) errors without the candidate. mended: (B,) errors with it. candidates: number of candidates of which
     this is the best.

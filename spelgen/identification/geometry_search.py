@@ -12,14 +12,23 @@ from typing import NamedTuple
 import numpy as np
 
 from spelgen.arm.arm import Chain
+from spelgen.identification.drive_hints import OFFSETS
 from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, HypothesisFit
 from spelgen.identification.tuning import GEOMETRY
+from spelgen.logs.dynamics_samples import FREQUENCY
 from spelgen.settings.log_mapping import SCALES
 
 RIGHT_ANGLE = np.pi / 2
-# Numbers of penalties `GEOMETRY.rare` that are added to the cost of changes which are rarer than a wrong sign or order.
-# They decide between changes that explain the torques equally well.
-RARE = {"gravity": 1, "joint-zero": 2, "torque-unit": 2, "joint-unit": 2, "gravity-compensated": 3}
+# Code of a change -> penalty on its cost, in multiples of `GEOMETRY.rare`, for changes that are rarer than a wrong sign
+# or order. The penalty decides between changes that explain the torques equally well.
+RARE = {
+    "gravity": 1,
+    "joint-zero": 2,
+    "torque-unit": 2,
+    "joint-unit": 2,
+    "gravity-compensated": 3,
+    "joint-delay": 2,
+}
 
 
 # fields of `Hypothesis` that a change of the order of joints permutes
@@ -41,14 +50,27 @@ class Scaling(NamedTuple):
     torque: np.ndarray
 
 
-ANGLES = {SCALES[unit]: unit for unit in ("turns", "deg")}
+UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
 
 
-def angle_scalings(arm: Chain) -> list[Scaling]:
-    """Return the candidates for angles of all revolute joints in revolutions, and in degrees; [] if there are none."""
-    turning = np.array([x.joint_type == "revolute" for x in arm.coordinates])
-    ones = np.ones(len(turning))
-    return [Scaling("joint-unit", np.where(turning, size, ones), ones) for size in ANGLES if turning.any()]
+def position_unit(joint_type: str, scale: float) -> str:
+    """Return the unit of positions whose factor to SI units is nearest to the magnitude of `scale`."""
+    return min(UNITS[joint_type], key=lambda unit: abs(np.log(abs(scale) / SCALES.get(unit, 1.0))))
+
+
+def position_scalings(arm: Chain, scale: np.ndarray) -> list[Scaling]:
+    """Return the candidates for positions of all joints of a type in another unit than the mapping states.
+
+    scale: (n,) factor from logged positions to SI units, with the sign of the joint.
+    """
+    types, ones = np.array(arm.joint_types), np.ones(len(scale))
+    scalings = []
+    for joint_type, units in UNITS.items():
+        for unit in units:
+            motion = np.where(types == joint_type, SCALES.get(unit, 1.0) / np.abs(scale), ones)
+            if (motion != 1).any():
+                scalings.append(Scaling("joint-unit", motion, ones))
+    return scalings
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +96,7 @@ def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ())
     scalings: candidates for wrong units.
     """
     # the many hypotheses are compared on few samples, and the best ones below on more
-    coarse = problem.thinned(200)
+    coarse = problem.thinned(GEOMETRY.coarse_samples)
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
     # At most three changes are combined, where an order of all joints is one change: more changes could explain any
@@ -82,7 +104,12 @@ def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ())
     for _ in range(3):
         best = min(fits, key=_rank)
         tried = single_changes(coarse, best, scalings)
-        if best is unchanged and min(tried, key=_rank).cost < unchanged.cost - GEOMETRY.needed:
+        better = min(tried, key=_rank)
+        # orders are searched only if no single change explains the torques, since the search takes seconds
+        is_wrong = (
+            better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
+        )
+        if best is unchanged and is_wrong and better.errors.max() > GEOMETRY.explained:
             tried += reordered(coarse, unchanged)
         if min(tried, key=_rank).cost > best.cost - GEOMETRY.needed:
             break
@@ -111,7 +138,7 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
 def _rescaled(
     problem: GeometryProblem, unchanged: HypothesisFit, scalings: Sequence[Scaling]
 ) -> tuple[HypothesisFit, ...]:
-    """Return a tuple with the fit of the best torque unit if its cost is below the unchanged log's cost, else ().
+    """Return the fit for the best candidate for another torque unit, as a tuple; () if the unchanged log has less cost.
 
     No significant cost decrease is required: light bodies can explain torques that are too small, so that the cost
     shows little. The evidence for the factor is the magnitude of gravity, from which the candidates were computed.
@@ -135,7 +162,7 @@ def single_changes(
     fits = [problem.fit(hypothesis) for hypothesis in changed]
     for k, coordinate in enumerate(problem.arm.coordinates):
         fits += _with_offset(problem, base, k, coordinate.joint_type == "revolute")
-    return fits + _with_gravity(problem, base)
+    return [*fits, *_with_delays(problem, base), *_with_gravity(problem, base)]
 
 
 def _changed(base: Hypothesis, code: str, **changes: object) -> Hypothesis:
@@ -178,10 +205,11 @@ def _scaled(base: Hypothesis, scalings: Sequence[Scaling]) -> Iterator[Hypothesi
 
 
 def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[HypothesisFit]:
-    """Return the fits of the best orders of joints, for all columns, for the torques and for the motion.
+    """Return fits with the best order of the joints: of all columns, of the torque columns, and of the motion columns.
 
-    An order is improved by exchanging two joints at a time. The search also starts at random orders, since the cost has
-    local minima for arms with many joints.
+    Each start of the search gives one fit, unless it ends at the present order. An order is improved by exchanging two
+    joints at a time. The search also starts at random orders, since the cost has local minima for arms with many
+    joints.
     """
     joints = problem.arm.joint_names
     starts = [np.arange(len(joints)), np.arange(len(joints))[::-1]]
@@ -205,27 +233,44 @@ def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[Hypoth
     return list(fits.values())
 
 
-def _refined(
+def _descend(
     problem: GeometryProblem,
-    fit: HypothesisFit,
-    jacobian: Callable[[HypothesisFit], np.ndarray],
-    moved: Callable[[HypothesisFit, np.ndarray], Hypothesis | None],
-) -> HypothesisFit:
-    """Return the fit after at most four Gauss-Newton steps of D continuous quantities of its hypothesis.
+    at: Callable[[np.ndarray], Hypothesis],
+    start: np.ndarray,
+    *,
+    largest: float,
+    smallest: float,
+    allowed: Callable[[np.ndarray], np.ndarray] = np.asarray,
+) -> tuple[np.ndarray, HypothesisFit]:
+    """Return continuous quantities of a hypothesis, (D,), with a low cost, and their fit.
 
-    The iteration ends when a step does not lower the cost, or is negligible. jacobian: function of a fit that returns
-    the derivative of the torques with respect to the quantities, (S, n, D). moved: function of a fit and a step (D,)
-    that returns the changed hypothesis, or None if the step is negligible.
+    At most four Gauss-Newton steps are made. The descent ends when a step does not lower the cost, or is negligible.
+
+    Args:
+        problem: least-squares problem of the log.
+        at: function of the quantities (D,) that returns the hypothesis.
+        start: (D,) initial values.
+        largest: bound of each component of a step, which is clipped.
+        smallest: norm below which a step is negligible.
+        allowed: function of values (D,) after a step that returns the nearest allowed values.
     """
+    values, fit = start, problem.fit(at(start))
+    difference = 1e-4 * largest
     for _ in range(4):
-        hypothesis = moved(fit, problem.step(fit, jacobian(fit)))
-        if hypothesis is None:
+        residual = problem.residual(fit.hypothesis, fit.parameters)
+        columns = []
+        for shift in difference * np.eye(len(values)):
+            changed = problem.residual(at(values + shift), fit.parameters)
+            columns.append((changed - residual) / difference)
+        step = np.clip(problem.step(fit, np.stack(columns, axis=2)), -largest, largest)
+        new = allowed(values + step)
+        if np.linalg.norm(new - values) < smallest:
             break
-        best = problem.fit(hypothesis)
+        best = problem.fit(at(new))
         if best.cost > fit.cost:
             break
-        fit = best
-    return fit
+        values, fit = new, best
+    return values, fit
 
 
 def _with_offset(
@@ -238,41 +283,72 @@ def _with_offset(
     """
     reading = base.hypothesis
     unit = np.eye(len(reading.offset))[joint]
-    smallest = GEOMETRY.min_angle if revolute else GEOMETRY.min_shift
+    min_offset = GEOMETRY.min_angle if revolute else GEOMETRY.min_shift
 
-    def shifted(offset: float) -> Hypothesis:
-        return _changed(reading, "joint-zero", offset=reading.offset + offset * unit)
+    def shifted(values: np.ndarray) -> Hypothesis:
+        return _changed(reading, "joint-zero", offset=reading.offset + values * unit)
 
-    def offset_of(fit: HypothesisFit) -> float:
-        return float(fit.hypothesis.offset[joint] - reading.offset[joint])
-
-    def jacobian(fit: HypothesisFit) -> np.ndarray:
-        step = 1e-4  # rad, m
-        change = problem.torque(shifted(offset_of(fit) + step), fit.parameters)
-        change = change - problem.torque(fit.hypothesis, fit.parameters)
-        return np.asarray(change[..., None] / step)
-
-    def moved(fit: HypothesisFit, step: np.ndarray) -> Hypothesis | None:
-        step = np.clip(step, -1.0, 1.0)
-        negligible = smallest if not offset_of(fit) else GEOMETRY.min_shift
-        return None if abs(step[0]) < negligible else shifted(offset_of(fit) + float(step[0]))
-
-    starts = [0.0, *(RIGHT_ANGLE * np.array([1, 2, -1]))] if revolute else [0.0]
-    fits = [problem.fit(shifted(start)) for start in starts]
-    best = _refined(problem, min(fits, key=lambda fit: fit.cost), jacobian, moved)
-    offset, is_right_angle = offset_of(best), False
+    starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if revolute else np.zeros((1, 1))
+    start = min(starts, key=lambda x: problem.fit(shifted(x)).cost)
+    # from the unchanged zero, a step as small as calibration errors is no other zero
+    smallest = GEOMETRY.min_shift if start.any() else min_offset
+    offset, best = _descend(problem, shifted, start, largest=1.0, smallest=smallest)
+    is_right_angle = False
     if revolute:
         offset = (offset + np.pi) % (2 * np.pi) - np.pi
-        right = RIGHT_ANGLE * round(offset / RIGHT_ANGLE)
+        right = RIGHT_ANGLE * np.round(offset / RIGHT_ANGLE)
         exact = problem.fit(shifted(right))
-        is_right_angle = bool(right) and exact.cost < best.cost + GEOMETRY.right_angle
+        is_right_angle = bool(right.any()) and exact.cost < best.cost + GEOMETRY.right_angle
         if is_right_angle:
             best, offset = exact, right
-    # Without a decrease of the misfit the offset has the same effect as other masses, and is as uncertain as the masses
-    # of the URDF.
-    if abs(offset) < smallest or best.misfit > base.misfit - GEOMETRY.needed / 2:
+    # An offset must also lower the torque residual (misfit), and not only the prior term: otherwise it only replaces a
+    # change of the masses, whose values in the URDF are uncertain.
+    if abs(offset[0]) < min_offset or best.misfit > base.misfit - GEOMETRY.needed / 2:
         return []
-    return [best if is_right_angle else problem.fit(shifted(round(offset, 4)))]
+    return [best if is_right_angle else problem.fit(shifted(offset.round(4)))]
+
+
+def _with_delays(problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+    """Yield the fits for delays of one joint's motion, torque, or both, and of all torques.
+
+    Delays as short as the apparent ones that friction causes are omitted, and a second delay. Samples without their
+    neighbours show none.
+    """
+    reading = base.hypothesis
+    if problem.samples.values.shape[3] == 1 or "joint-delay" in reading.codes:
+        return
+    units = np.eye(len(reading.offset))
+    still = np.zeros(len(units))
+    candidates = [(still, still + 1.0), *((unit, still) for unit in units)]
+    candidates += [(still, unit) for unit in units] + [(unit, unit) for unit in units]
+    longest, stateful = OFFSETS[-1] / FREQUENCY, problem.with_hysteresis()
+    errors, stateful_errors = base.errors, stateful.fit(reading).errors
+    for motion, torque in candidates:
+
+        def delayed(
+            delay: np.ndarray, motion: np.ndarray = motion, torque: np.ndarray = torque
+        ) -> Hypothesis:
+            return _changed(
+                reading,
+                "joint-delay",
+                motion_delay=reading.motion_delay + delay * motion,
+                torque_delay=reading.torque_delay + delay * torque,
+            )
+
+        # a step from 0 would be too short for noisy torques, whose derivative is mostly noise
+        starts = GEOMETRY.delay_start * np.array([[0.0], [1.0], [-1.0]])
+        delay, _ = _descend(
+            problem, delayed, min(starts, key=lambda x: problem.fit(delayed(x)).cost), largest=0.05, smallest=0.002,
+            allowed=lambda x: np.clip(x, -longest, longest),
+        )  # fmt: skip
+        if abs(delay[0]) >= GEOMETRY.min_delay:
+            fit = problem.fit(delayed(delay.round(3)))
+            # Friction with a history also resembles a delay. A delay explains a joint's residual with both friction
+            # models.
+            is_better = fit.errors < GEOMETRY.delay_gain * errors
+            is_better &= stateful.fit(fit.hypothesis).errors < GEOMETRY.delay_gain * stateful_errors
+            if is_better.any():
+                yield fit
 
 
 def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[HypothesisFit]:
@@ -285,22 +361,25 @@ def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[Hypothe
     size = float(np.linalg.norm(present))
     standard = size or 9.81  # m/s^2
 
-    def moved(fit: HypothesisFit, step: np.ndarray) -> Hypothesis | None:
-        gravity = np.array(fit.hypothesis.gravity)
-        new = gravity + step
-        new *= standard / max(float(np.linalg.norm(new)), 1e-9)
-        return None if np.linalg.norm(new - gravity) < 0.01 * standard else _falling(base, new)
+    def normalised(gravity: np.ndarray) -> np.ndarray:
+        return np.asarray(gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9))
 
     # gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as with a
     # vertical prismatic joint
     starts = [problem.fit(_falling(base, standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
     lowest = min(fit.cost for fit in starts)
-    starts = [next(fit for fit in starts if fit.cost < lowest + GEOMETRY.rare), *([base] if size else [])]
-    refined = [_refined(problem, fit, lambda x: _gravity_jacobian(problem, x), moved) for fit in starts]
-    best = min(refined, key=lambda fit: fit.cost)
-    new, fits = np.array(best.hypothesis.gravity), []
-    if size:
-        fits.append(_with_compensation(problem, base))
+    start = next(fit for fit in starts if fit.cost < lowest + GEOMETRY.rare)
+    descents = []
+    for fit in [start, *([base] if size else [])]:
+        direction = np.array(fit.hypothesis.gravity)
+        descents.append(
+            _descend(
+                problem, lambda x: _falling(base, x), direction, largest=standard, smallest=0.01 * standard,
+                allowed=normalised,
+            )
+        )  # fmt: skip
+    new, best = min(descents, key=lambda x: x[1].cost)
+    fits = [_with_compensation(problem, base)] if size else []
     if np.linalg.norm(new - present) > GEOMETRY.min_angle * size:
         nearest = np.linalg.norm(new) * np.sign(new) * (np.abs(new) == np.abs(new).max())
         axis = problem.fit(_falling(base, nearest))
@@ -315,21 +394,17 @@ def _falling(base: HypothesisFit, gravity: np.ndarray, code: str = "gravity") ->
     return _changed(base.hypothesis, code, gravity=(x, y, z))
 
 
-def _gravity_jacobian(problem: GeometryProblem, fit: HypothesisFit) -> np.ndarray:
-    """Return the derivative (S, n, 3) of the torques of a fit with respect to the vector of gravity."""
-    without = problem.torque(_falling(fit, np.zeros(3)), fit.parameters)
-    torques = [problem.torque(_falling(fit, unit), fit.parameters) - without for unit in np.eye(3)]
-    return np.stack(torques, axis=2)
-
-
 def _with_compensation(problem: GeometryProblem, base: HypothesisFit) -> HypothesisFit:
     """Return the fit for torques from which a controller's gravity compensation is missing, entirely or in part.
 
     Gravity is multiplied by a fraction of at most a half, or by zero if this fits about equally well.
     """
-    present, code = np.array(base.hypothesis.gravity), "gravity-compensated"
-    without = problem.fit(_falling(base, np.zeros(3), code))
-    part = problem.step(without, (_gravity_jacobian(problem, without) @ present)[..., None])
+    present = np.array(base.hypothesis.gravity)
+    without = problem.fit(_falling(base, np.zeros(3), "gravity-compensated"))
     # a fraction of more than a half in all joints is ascribed to wrong masses of the URDF, not to a compensation
-    some = problem.fit(_falling(base, (np.clip(part, -0.5, 0.5) * present).round(3), code))
+    part, _ = _descend(
+        problem, lambda x: _falling(base, x * present, "gravity-compensated"), np.zeros(1), largest=0.5, smallest=1e-3,
+        allowed=lambda x: np.clip(x, -0.5, 0.5),
+    )  # fmt: skip
+    some = problem.fit(_falling(base, (part * present).round(3), "gravity-compensated"))
     return some if some.cost < without.cost - GEOMETRY.ambiguous else without

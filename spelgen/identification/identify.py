@@ -138,7 +138,7 @@ class _Equations:
             yield np.concatenate([bodies, columns], axis=2), block.tau
 
     def _noise(self, friction: FrictionModel, solution: Solution) -> np.ndarray:
-        """Return the standard deviations (n,) [Nm, N] of the torque residual, see `deviations`."""
+        """Return standard deviations (n,) [Nm, N] of the torque residual, enlarged for its correlation in time."""
         residuals = [rows @ solution.parameters - tau for rows, tau in self._rows(friction)]
         return deviations(residuals, solution.rank)
 

@@ -105,7 +105,8 @@ class Solution:
 
         Args:
             triangles: triangular factors of the samples.
-            errors: (n,) standard deviation of each joint's torque error, times the square of the joint's weight.
+            errors: (n,) s_j w_j^2, with the standard deviation s_j of the torque error and the weight w_j of joint j;
+                the middle factor of the sandwich is the sum of (s_j w_j^2)^2 Y_j^T Y_j, with the regressor Y_j.
             combination: (k, r) coefficients of the fitted parameters in each combination.
         """
         rows = triangles.factors[..., self.columns]

@@ -11,48 +11,83 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag
 
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.identification.drive_hints import FRICTION, drive_rows
+from spelgen.identification.drive_hints import FRICTION, OFFSETS, drive_rows
 from spelgen.identification.least_squares import block_products, varying
 from spelgen.identification.tuning import GEOMETRY
+from spelgen.logs.dynamics_samples import FREQUENCY
 
 Vector3 = tuple[float, float, float]
 
 
-class MotionSamples(NamedTuple):
-    """S samples of motion and joint torques of n joints: q, qd, qdd [rad, s; m, s] and tau [Nm; N], each (S, n)."""
+@dataclass(frozen=True, eq=False)
+class MotionSamples:
+    """S samples of motion and joint torques of n joints.
 
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
-    tau: np.ndarray
+    values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at E times around each sample, see `DriveSamples`;
+    E = 1 for samples without their neighbours. bent: (S, n, K) bristle deflections of the unchanged log; K = 0 for
+    samples without a history of motion.
+    """
+
+    values: np.ndarray
+    bent: np.ndarray
 
     @classmethod
-    def joined(cls, samples: Sequence[MotionSamples]) -> MotionSamples:
-        """Return the concatenation of several sets of samples."""
-        return cls(*map(np.concatenate, zip(*samples, strict=True)))
+    def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
+        """Return the samples of signals, (S, n) each, without their neighbours."""
+        return cls(np.stack([q, qd, qdd, tau], axis=2)[..., None], np.zeros((*q.shape, 0)))
+
+    @property
+    def motion(self) -> np.ndarray:
+        """Positions, velocities and accelerations, (3, S, n)."""
+        return np.moveaxis(self._central[..., :3], 2, 0)
+
+    @property
+    def tau(self) -> np.ndarray:
+        """Joint torques, (S, n)."""
+        return self._central[..., 3]
+
+    @property
+    def _central(self) -> np.ndarray:
+        return self.values[..., self.values.shape[3] // 2]
+
+    def at(self, delays: np.ndarray) -> np.ndarray:
+        """Return the signals (S, n, 4) at the times `delays` (n, 4) [s] after the samples."""
+        if not delays.any():
+            return self._central
+        weights = CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))(delays)
+        return np.asarray(np.einsum("snie,nie->sni", self.values, weights))
 
     def thinned(self, count: int) -> MotionSamples:
         """Return at most `count` samples, evenly spaced."""
-        stride = -(-len(self.q) // count) or 1
-        return MotionSamples(*(column[::stride] for column in self))
+        stride = -(-len(self.values) // count) or 1
+        return MotionSamples(self.values[::stride], self.bent[::stride])
+
+
+def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
+    """Return the concatenation of several sets of samples."""
+    values, bent = (
+        np.concatenate(columns) for columns in zip(*((x.values, x.bent) for x in samples), strict=True)
+    )
+    return MotionSamples(values, bent)
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Hypothesis about a log: assignment of columns to n joints, scales and offsets of the joints, and gravity.
+    """Hypothesis about a log: columns, scales, offsets and delays of n joints, and gravity.
 
     The position of joint k is motion_scale[k] times the logged position of joint motion_source[k], plus offset[k] [rad,
     m]. The torque of joint k is torque_scale[k] times the logged torque of joint torque_source[k].
 
-    codes: codes of the changes, as in findings; empty for the unchanged log. gravity: vector of gravity in the frame of
-    the root link [m/s^2].
+    codes: codes of the changes, as in findings; empty for the unchanged log. motion_delay, torque_delay: (n,) [s] delay
+    of the logged positions and velocities, and of the torques, of each joint. gravity: vector of gravity in the frame
+    of the root link [m/s^2].
     """
 
     codes: tuple[str, ...]
@@ -61,6 +96,8 @@ class Hypothesis:
     motion_scale: np.ndarray
     torque_scale: np.ndarray
     offset: np.ndarray
+    motion_delay: np.ndarray
+    torque_delay: np.ndarray
     gravity: Vector3
 
     @classmethod
@@ -68,26 +105,40 @@ class Hypothesis:
         """Return the hypothesis of the unchanged log, in SI units and without offsets."""
         order, ones = np.arange(len(arm.coordinates)), np.ones(len(arm.coordinates))
         x, y, z = map(float, arm.gravity)
-        return cls((), order, order, ones, ones, 0.0 * ones, gravity=(x, y, z))
+        zeros = 0.0 * ones
+        return cls((), order, order, ones, ones, zeros, zeros, zeros, (x, y, z))
 
     @property
     def motion_key(self) -> tuple[bytes, Vector3]:
         """Key under which the regressor is cached: it depends only on the motion and on gravity."""
-        arrays = (self.motion_source, self.motion_scale, self.offset)
+        arrays = (self.motion_source, self.motion_scale, self.offset, self.motion_delay)
         return b"".join(x.tobytes() for x in arrays), self.gravity
+
+    @property
+    def _scales(self) -> np.ndarray:
+        """Factors of q, qd, qdd and tau of each joint, (n, 4)."""
+        return np.stack([*[self.motion_scale] * 3, self.torque_scale], axis=1)
 
     def signals(self, samples: MotionSamples) -> MotionSamples:
         """Return the samples of the joints, in SI units, for logged samples under this hypothesis."""
-        q, qd, qdd = (x[:, self.motion_source] * self.motion_scale for x in samples[:3])
-        return MotionSamples(q + self.offset, qd, qdd, samples.tau[:, self.torque_source] * self.torque_scale)
+        of_joint = _permuted(samples.values, self.motion_source, self.torque_source)
+        delays = np.stack([*[self.motion_delay] * 3, self.torque_delay], axis=1)
+        signals = MotionSamples(of_joint, samples.bent).at(delays) * self._scales
+        signals[..., 0] += self.offset
+        return MotionSamples(signals[..., None], samples.bent)
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the logged samples for `samples` of the joints under this hypothesis: the inverse of `signals`."""
-        motion, torque = np.argsort(self.motion_source), np.argsort(self.torque_source)
-        q = (samples.q - self.offset) / self.motion_scale
-        qd, qdd = samples.qd / self.motion_scale, samples.qdd / self.motion_scale
-        tau = samples.tau / self.torque_scale
-        return MotionSamples(q[:, motion], qd[:, motion], qdd[:, motion], tau[:, torque])
+        """Return the logged samples for `samples` of the joints: the inverse of `signals` without delays."""
+        signals = samples.values.copy()
+        signals[:, :, 0] -= self.offset[:, None]
+        signals /= self._scales[..., None]
+        signals = _permuted(signals, np.argsort(self.motion_source), np.argsort(self.torque_source))
+        return MotionSamples(signals, samples.bent)
+
+
+def _permuted(values: np.ndarray, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    """Return signals (S, n, 4, E) in which joint k has the motion of joint motion[k] and the torque of torque[k]."""
+    return np.concatenate([values[:, motion, :3], values[:, torque, 3:]], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +195,7 @@ class GeometryProblem:
         self.prior_mean = np.append(mean, np.zeros(drives))
         self._precision = block_diag(precision, np.zeros((drives, drives)))
         self._counted: np.ndarray | None = None
+        self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
 
     def thinned(self, count: int) -> GeometryProblem:
@@ -161,6 +213,15 @@ class GeometryProblem:
         fewer._equations, fewer._counted = {}, counted[..., None]
         return fewer
 
+    def with_hysteresis(self) -> GeometryProblem:
+        """Return the problem with a friction model whose dry friction has a history, the bristles' deflections."""
+        extended = copy(self)
+        extended._equations, extended._has_hysteresis = {}, True
+        added = self.samples.bent.shape[2] * len(self.speeds)
+        extended.prior_mean = np.append(self.prior_mean, np.zeros(added))
+        extended._precision = block_diag(self._precision, np.zeros((added, added)))
+        return extended
+
     def without_gravity(self, joint: int) -> GeometryProblem:
         """Return the problem of the unchanged log with a model in which one joint's torque contains no gravity."""
         weightless = replace(self.unchanged, gravity=(0.0, 0.0, 0.0))
@@ -169,6 +230,13 @@ class GeometryProblem:
         other = copy(self)
         other._equations = {self.unchanged.motion_key: (rows, block_products(rows, 1)[:, 0])}
         return other
+
+    def gravity_ratio(self, fit: HypothesisFit) -> float:
+        """Return the least-squares ratio of the gravity torques of a fit to those of the URDF; 0 without gravity."""
+        weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
+        columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
+        fitted, stated = columns @ fit.parameters, columns @ self.prior_mean
+        return float((fitted * stated).sum() / max(float(np.square(stated).sum()), 1e-12))
 
     def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
         """Return the standard deviation (S, n) [Nm, N] of the model's torques due to the parameters' covariance."""
@@ -179,9 +247,10 @@ class GeometryProblem:
         """Return the friction parameters and rotor inertias of a fit, (effects, n), in the order of `FRICTION`."""
         return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
-    def torque(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
-        """Return the model's torques (S, n) [Nm, N] with the parameters (K,) under a hypothesis."""
-        return np.asarray(self.equations(hypothesis)[0] @ parameters)
+    def residual(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
+        """Return the model's torques with the parameters (K,) minus the logged ones, (S, n) [Nm, N]."""
+        torque = self.equations(hypothesis)[0] @ parameters
+        return np.asarray(torque - hypothesis.signals(self.samples).tau)
 
     def equations(self, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
         """Return the regressor Y (S, n, K) under a hypothesis, and Y^T Y of each joint, (n, K, K).
@@ -191,8 +260,12 @@ class GeometryProblem:
         """
         key = hypothesis.motion_key
         if key not in self._equations:
-            q, qd, qdd, _ = hypothesis.signals(self.samples)
+            q, qd, qdd = hypothesis.signals(self.samples).motion
             rows = drive_rows(body_chain(self.arm, hypothesis.gravity), q, qd, qdd, self.speeds)
+            if self._has_hysteresis:
+                # the deflections of drive j act on joint i with the factor C_ji, like its other friction
+                bristles = self.samples.bent[:, None] * self.speeds.T[:, :, None]
+                rows = np.concatenate([rows, bristles.reshape(*q.shape, -1)], axis=2)
             rows = rows if self._counted is None else rows * self._counted
             if len(self._equations) >= 30:  # bounds the memory of the cache: an entry has about 1 MB
                 self._equations.pop(next(iter(self._equations)))
@@ -203,8 +276,8 @@ class GeometryProblem:
         """Return the fit that minimises the cost under a hypothesis, by iteratively reweighted least squares.
 
         The noise variance of each joint is marginalised: the joint's negative log likelihood is N / 2 log(sum of
-        squared residuals). The prior of the inertial parameters is a Student t distribution: `scale` is its weight in
-        an iteration.
+        squared residuals). The prior of the inertial parameters is a Student t distribution, so that its precision
+        is reweighted in each iteration.
         """
         rows, normal = self.equations(hypothesis)
         tau = hypothesis.signals(self.samples).tau
@@ -234,7 +307,7 @@ class GeometryProblem:
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of additional quantities, fitted together with the parameters of a fit.
 
-        columns: (S, n, D) derivative of the torques with respect to these quantities.
+        columns: (S, n, D) derivative of the residual with respect to these quantities.
         """
         rows, _ = self.equations(fit.hypothesis)
         tau, known = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
@@ -252,8 +325,8 @@ class GeometryProblem:
 
         A violation adds half of its squared standard score to the cost, up to a bound. The bound is needed since a
         drive may compensate friction, and since errors of the friction model may resemble inertia: fits of recorded
-        arms have friction that drives the motion (shanghai, joint 6) or a negative rotor inertia (airbot), but not
-        both.
+        arms have friction that drives the motion (joint 6 of one arm of benchmarks/recordings.py) or a negative rotor
+        inertia (another arm), but not both.
 
         Args:
             x: (K,) parameters.

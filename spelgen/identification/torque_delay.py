@@ -116,11 +116,12 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     estimates = []
     # Dry friction with and without a state, with the same filter as the torques. A delay that only one of both models
     # shows is an error of this model.
+    _, qd, qdd = samples.motion
     for dry in (samples.bent, samples.direction[..., None]):
-        friction = FRICTION.columns(samples.qd, samples.qdd, dry, problem.speeds)
+        friction = FRICTION.columns(qd, qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
-    # The model without a state is always used: its errors are symmetric and do not resemble a delay.
-    # Errors of a friction state do.
+    # The model without a state is always used: its errors do not lag behind the motion, and do not resemble a delay.
+    # Errors of a friction state lag behind the motion and do.
     memory, direct = estimates
     likely = [direct]
     # on recorded arms the squared residual with a friction state is 0.3 to 0.8 times the squared residual without
@@ -152,8 +153,8 @@ def _estimate(rows: np.ndarray) -> _Estimate:
         squares = unexplained @ products.sum(axis=1) @ unexplained
         noise = np.sqrt(np.maximum(squares / len(rows), np.square(TUNING.least_noise * least)))
     spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
-    # The delay is unknown if it is near the largest shift, where the minimum may be outside. Equal estimates
-    # without each block mean too few samples.
+    # The delay is unknown if it is near the largest shift, where the minimum may be outside. If the
+    # jackknife estimates of all blocks are equal, there are too few samples.
     unknown = abs(delay) > SHIFTS[-2] or spread == 0
     standard_error = np.inf if unknown else float(np.sqrt(spread))
     return _Estimate(delay, standard_error, float((squares / least**2).sum()))

@@ -29,11 +29,14 @@ class DriveHintTuning:
     # [1] Number of blocks of time in the cross-validation; each block is held out once.
     blocks: int = 10
     # [1] A coupling is accepted if its squared residual is below this fraction of the squared residual without the
-    # coupling and, in each block, of the squared torque. For the wrist of the TX40 these fractions are 0.05 and 0.03.
+    # coupling and, in each block, of the squared torque. For the
+    # coupled wrist joints of a Staubli TX40 these fractions are 0.05 and 0.03.
     coupling_gain: float = 0.5
     # [1] Time shifts of the torque, in samples of 10 ms. They cover the delays of loggers and field buses; an apparent
     # delay of more than 30 ms may be due to friction.
     shifts: tuple[int, ...] = (-3, -2, -1, 0, 1, 2, 3)
+    # [samples] Largest time shift of the signals of one joint, 160 ms.
+    longest_offset: int = 16
     # [1] Number of samples that are used, which is ample for the about 70 parameters of six joints.
     samples: int = 1500
     # [1] Smallest number of samples for the detection of couplings; tests of the geometry need a quarter of it.
@@ -58,12 +61,25 @@ class LogGeometryTuning:
     ambiguous: float = 8.0
     # Unit of the penalties for changes that are rarer than a wrong sign or order.
     rare: float = 1.0
+    # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
+    explained: float = 0.05
+    # [1] Mean relative residual variance of the joints above which a log is probably in another order.
+    unexplained: float = 0.3
+    # [1] Largest number of samples for the comparison of all hypotheses.
+    coarse_samples: int = 200
     # [1] Largest number of samples for the final comparison of the best hypotheses.
     confirming_samples: int = 800
     # [rad] Zero offsets and tilts of the base below this bound are calibration errors.
     min_angle: float = 0.09
     # [m] Zero offsets of prismatic joints below this bound are calibration errors.
     min_shift: float = 0.01
+    # [s] Delays of single joints below this bound are ascribed to friction, whose apparent delay is up to 30 ms.
+    min_delay: float = 0.03
+    # [s] Delay, late or early, from which the search for a delay starts if it fits better than no delay.
+    delay_start: float = 0.06
+    # [1] Largest ratio of a joint's squared residuals with and without a delay of its signals; wrong delays have
+    # ratios from 0.78 on, on recordings of seven arms.
+    delay_gain: float = 0.65
     # Cost increase up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
     # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.

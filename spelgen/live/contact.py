@@ -57,10 +57,11 @@ class ContactObserver:
     def residual(
         self, t: float, at: Balance, payload: Payload, drift: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low-pass filtered torque residual after model, payload and drift, and a variance, (n,) each.
+        """Return the low-pass filtered torque residual, (n,) [Nm, N], and its variance, (n,).
 
-        The variance is due to changing accelerations, an unknown friction state and the uncertain payload. It does not
-        include the noise of the observer.
+        The residual is the torque without the contributions of model, payload, and drift. The variance is due to
+        changing accelerations, an unknown friction state and the uncertain payload. It does not include the noise of
+        the observer.
         """
         rate = TUNING.bandwidth
         scale, disturbance = drift.T
@@ -89,7 +90,8 @@ class ContactObserver:
             self.baseline = self.baseline + gain * (disturbance - self.baseline)
         self.t, self.inputs = t, inputs
         torque, friction, uncertainty, slow, fast = self.low[:5]
-        # regressor Phi of the payload, (n, 10), as in `Block`
+        # Filtered regressor of the payload, (n, 10). Its product with the inertial parameters of the payload is the
+        # contribution of the payload to the residual.
         regressor = rate * at.load_momentum - self.low[5:].T
         signal = (
             torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline

@@ -44,7 +44,7 @@ class EstimatorState:
 
 
 class Estimator:
-    """Online estimator for a fit of a rigid-body model to torques.
+    """Online estimator of payload, friction drift and external torques, for a rigid-body model fitted to torques.
 
     ``step`` processes one measured sample, ``replay`` a log. Samples with values that are not finite, samples out of
     order and jumps are refused and counted in ``refused``.

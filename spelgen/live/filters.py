@@ -128,12 +128,15 @@ class LoadFilter:
         gain = covariance / variance
         if block.moving[joint]:
             self.surprise += residual**2 / expected
+            self.x += gain * residual
+            self.P -= np.outer(gain, covariance)
         else:
-            gain[np.arange(len(gain)) != columns[-1]] = 0.0
-        self.x += gain * residual
-        # Joseph's form of the update is valid for any gain, also if it is not the optimal one.
-        product = np.outer(gain, covariance)
-        self.P += variance * np.outer(gain, gain) - product - product.T
+            # Joseph's form of the update is valid for any gain: all gains except the one of d are zero.
+            d, product = columns[-1], gain[columns[-1]] * covariance
+            self.x[d] += gain[d] * residual
+            self.P[d] -= product
+            self.P[:, d] -= product
+            self.P[d, d] += variance * gain[d] ** 2
         self.log_likelihood -= 0.5 * (np.log(variance) + residual**2 / variance)
 
 

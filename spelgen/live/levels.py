@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.registry import arm_of_model
 from spelgen.dynamics.bristles import bristle_reach, encoder_step
 from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
@@ -35,30 +34,25 @@ from spelgen.live.tuning import TUNING
 from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.trajectory import Trajectory, joined_column
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-from spelgen.settings.fits import TorqueFit
 
 
 def noise_levels(fit: Fit) -> NoiseLevels:
     """Return the stored or estimated noise levels of a fit. Raises RunError if they cannot be read or estimated."""
     levels = stored_levels(fit)
-    if levels is not None:
-        return levels
-    if not fit.logs:
-        raise RunError(
-            "no noise levels of the estimator", file=fit.folder, expected="a run with estimator.json",
-            do=f"fit it again by `spelgen train` to torques, with at least {TUNING.min_samples} samples of motion",
-        )  # fmt: skip
-    levels = cross_validated_levels(fit)
-    keep_levels(fit, levels)
+    if levels is None:
+        if not fit.logs:
+            raise RunError(
+                "no noise levels of the estimator", file=fit.folder, expected="a run with estimator.json",
+                do=f"fit it again by `spelgen train` to torques, with at least {TUNING.min_samples} samples of motion",
+            )  # fmt: skip
+        levels = cross_validated_levels(fit)
+        keep_levels(fit, levels)
     return levels
 
 
-def keep_levels(fit: Fit, levels: NoiseLevels | None = None) -> None:
-    """Write noise levels into the run folder of a fit; levels None: estimate them if the fit is to torques."""
-    of_torques = isinstance(fit.config, TorqueFit) and isinstance(fit.model, RigidBodyDynamics)
-    if levels is None and of_torques and fit.logs:
-        levels = cross_validated_levels(fit)
-    if levels is not None and fit.folder is not None:
+def keep_levels(fit: Fit, levels: NoiseLevels) -> None:
+    """Write noise levels into the run folder of a fit, if it has one."""
+    if fit.folder is not None:
         write_json(RunFolder(fit.folder).estimator, levels.model_dump(mode="json"))
 
 
@@ -78,14 +72,18 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         ends = np.linspace(0, len(logs[0]), count + 1).astype(int)
         logs = [logs[0][start:stop] for start, stop in itertools.pairwise(ends)]
     folds = [logs[k::count] for k in range(min(count, len(logs)))]
-    effort, tip = np.full(fit.model.n, np.inf), np.zeros(3)
+    effort, point = np.full(fit.model.n, np.inf), np.zeros(3)
     if fit.urdf is not None and fit.urdf.exists():
-        effort, tip = limits(arm_of_model(fit.model, fit.urdf))
+        arm = arm_of_model(fit.model, fit.urdf)
+        effort, tip = np.array([joint.effort or np.inf for joint in arm.chain.coordinates]), tip_frame(arm)
+        # The contact force is estimated at the tip, or at the origin of the last body if another body carries the tip.
+        if tip.carrier == len(arm.chain.bodies) - 1:
+            point = tip.pose[:3, 3]
     tested = []
     for k, fold in enumerate(folds):
         others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
         tested.append((fitted_to(fit, others), fold))
-    levels = find_levels(tested, effort, tip)
+    levels = find_levels(tested, effort, point)
     # Serialization rounds the numbers. The rounded numbers are returned, so that a later read of the run folder gives
     # the same ones.
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
@@ -111,17 +109,6 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
     fitted = model.requires_grad_(False).eval()
     assert isinstance(fitted, RigidBodyDynamics)
     return fitted
-
-
-def limits(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
-    """Return the torque limits of an arm, (n,) [Nm, N], infinite if unknown, and the position of the tip, (3,) [m].
-
-    The position is in the frame of the last body; it is zero if another body carries the tip.
-    """
-    effort = np.array([joint.effort or np.inf for joint in arm.chain.coordinates])
-    tip = tip_frame(arm)
-    is_last = tip.carrier == len(arm.chain.bodies) - 1
-    return effort, tip.pose[:3, 3] if is_last else np.zeros(3)
 
 
 class HeldOutSample(NamedTuple):
@@ -186,11 +173,11 @@ def find_levels(
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
     """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
 
-    The logs are without payload, so each estimated payload is an error. Windows of consecutive blocks are independent
-    trials. Each trial has two normalised squared errors: of the mass, and of the mass and first moments. Each error is
-    averaged over the trials; the prior value counts as `prior_trials` more trials. The factor is the largest average
-    over both errors and all window lengths: errors of the model average out slowly, so that longer windows may have
-    larger normalised errors.
+    The logs are without payload, so each estimated payload is an error. Each window of consecutive blocks is one trial,
+    with two normalised squared errors: of the mass, and of mass and first moments. The mean of an error over the trials
+    includes the prior value with the weight of `prior_trials` trials. The factor is the largest of the means for both
+    errors and for all lengths of windows. A longer window may have a larger normalised error, because the errors of
+    the model are correlated over time.
     """
     factors = []
     for window in TUNING.trial_blocks:
@@ -202,11 +189,7 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
                 load.predict(block.duration)
                 for joint in range(load.n):
                     load.update(block, joint)
-            theta, covariance = load.x[:4], load.P[:4, :4]
-            squares += (
-                theta[0] ** 2 / covariance[0, 0],
-                theta @ np.linalg.solve(covariance, theta) / len(theta),
-            )
+            squares += [load.x[:k] @ np.linalg.solve(load.P[:k, :k], load.x[:k]) / k for k in (1, 4)]
         freedom = trials + TUNING.prior_trials
         prior = TUNING.prior_trials * TUNING.prior_variance
         factors.append((float(squares.max() + prior) / freedom, freedom))
@@ -257,30 +240,64 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
-    """Return the levels with the noise of the momentum observer and the exponential tail of its peaks added."""
-    columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    times = np.array([sample.t for samples in tested for sample in samples])
-    for samples in tested:
-        observer, drift = (
-            ContactObserver(levels, TUNING.alarms_per_minute),
-            JointFilters.of_drift(levels.drift),
-        )
-        for t, qd, at, is_resumed, block in samples:
-            if is_resumed:
-                observer.restart()
-            columns.append((*observer.residual(t, at, NO_REPORT, drift.x), qd))
-            if block is not None:
-                drift.update(block, block.y)
-    signal, variance, qd = (np.array(column) for column in zip(*columns, strict=True))
+    """Return a copy of the levels with two more estimates, from held-out samples of each tested log.
+
+    The estimates are the noise of the momentum observer, and the exponential tail of the observer's peaks.
+    """
+    residuals = [_observer_residuals(levels, samples) for samples in tested]
+    signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))
     levels = levels.model_copy(update=_observer_noise(signal, qd, levels))
-    beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
-    ratio = beyond / np.sqrt(variance + np.square(levels.observer))
-    # Large values at neighbouring samples are one event, so only the largest value of each time window counts.
-    starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
-    peaks = np.maximum.reduceat(ratio, starts, axis=0)
-    start = np.quantile(peaks, 1 - TUNING.tail, axis=0)
-    tail = np.where(peaks > start, peaks - start, np.nan)
-    return levels.model_copy(update={"peak_start": start, "peak_scale": np.nanmean(tail, axis=0)})
+    peaks = []
+    for samples, (signal, variance, qd) in zip(tested, residuals, strict=True):
+        beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
+        ratio = beyond / np.sqrt(variance + np.square(levels.observer))
+        # Large values at neighbouring samples are one event, so only the largest value of each time window counts.
+        times = np.array([sample.t for sample in samples])
+        starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
+        peaks.append(np.maximum.reduceat(ratio, starts, axis=0))
+    return levels.model_copy(update=held_out_tail(peaks, levels))
+
+
+def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
+    """Return the exponential tail of the peaks of logs, (W, n) each, increased for the differences between logs.
+
+    Thresholds of the other logs, multiplied by one factor, give at most as many alarms in each log as the default rate
+    allows for all logs together. All joints have the same factor: the joint that needs the largest one differs between
+    logs.
+    """
+    excess: list[float] = []
+    for k, peaks_of_log in enumerate(peaks):
+        others = levels.model_copy(update=_peak_tail([*peaks[:k], *peaks[k + 1 :]]))
+        excess += (peaks_of_log / others.thresholds(TUNING.alarms_per_minute)).max(axis=1).tolist()
+    allowed = int(TUNING.alarms_per_minute * len(excess) * TUNING.window / 60)
+    return _peak_tail(peaks, max(sorted(excess, reverse=True)[allowed], TUNING.other_days))
+
+
+def _observer_residuals(
+    levels: NoiseLevels, samples: Sequence[HeldOutSample]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the residual of the momentum observer, its variance and the velocities, (T, n) each."""
+    observer = ContactObserver(levels, TUNING.alarms_per_minute)
+    drift = JointFilters.of_drift(levels.drift)
+    columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for t, qd, at, is_resumed, block in samples:
+        if is_resumed:
+            observer.restart()
+        columns.append((*observer.residual(t, at, NO_REPORT, drift.x), qd))
+        if block is not None:
+            drift.update(block, block.y)
+    signal, variance, speed = (np.array(column) for column in zip(*columns, strict=True))
+    return signal, variance, speed
+
+
+def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, object]:
+    """Return the exponential tail of the peaks of logs, (W, n) each, after multiplication by a factor."""
+    together = factor * np.concatenate(peaks)
+    start = np.quantile(together, 1 - TUNING.tail, axis=0)
+    # A joint without residuals has no peaks above the start.
+    count = max(int((together > start).sum(axis=0).max()), 1)
+    scale = np.maximum(together - start, 0).sum(axis=0) / count
+    return {"peak_start": start, "peak_scale": scale, "peak_count": count}
 
 
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:
@@ -288,23 +305,22 @@ def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> 
 
     signal: torque residual of the observer, (T, n) [Nm, N]. qd: velocities, (T, n).
     """
-    best: dict[str, np.ndarray] = {}
-    lowest = np.full(len(levels.speed), np.inf)
-    for speed, ratio in itertools.product(TUNING.resting_speeds, TUNING.resting_ratios):
+    grid = np.array(list(itertools.product(TUNING.resting_speeds, TUNING.resting_ratios)))
+    noise, costs = np.zeros((2, len(grid), len(levels.speed)))
+    for k, (speed, ratio) in enumerate(grid):
         shape = 1 + np.square(ratio * np.exp(-np.abs(qd) / (speed * levels.speed)))
         # The median is used because peaks are modelled separately; 0.455 is the median of a squared standard normal
         # variable.
         level = np.sqrt(np.median(signal**2 / shape, axis=0) / 0.455)
-        level = np.maximum(level, TUNING.min_observer_noise * levels.effort)
-        normalised = np.abs(signal) / (level * np.sqrt(shape))
+        noise[k] = np.maximum(level, TUNING.min_observer_noise * levels.effort)
+        normalised = np.abs(signal) / (noise[k] * np.sqrt(shape))
         # Huber's cost is quadratic for residuals up to TUNING.outlier, and linear beyond.
         inner = np.minimum(normalised, TUNING.outlier)
-        cost = np.mean(np.log(level**2 * shape) + inner * (2 * normalised - inner), axis=0)
-        found = {
-            "observer": level,
-            "resting": TUNING.outlier * ratio * level,
-            "resting_speed": speed * levels.speed,
-        }
-        best = {key: np.where(cost < lowest, x, best.get(key, x)) for key, x in found.items()}
-        lowest = np.minimum(cost, lowest)
-    return best
+        costs[k] = np.mean(np.log(noise[k] ** 2 * shape) + inner * (2 * normalised - inner), axis=0)
+    best = costs.argmin(axis=0)
+    observer, (speed, ratio) = noise[best, np.arange(len(best))], grid[best].T
+    return {
+        "observer": observer,
+        "resting": TUNING.outlier * ratio * observer,
+        "resting_speed": speed * levels.speed,
+    }

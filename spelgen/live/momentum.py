@@ -23,11 +23,12 @@ _BLOCK = 2048  # samples computed at a time, to limit the memory
 
 
 class Balance(NamedTuple):
-    """Terms of the momentum balance at samples, (T, n) or (T, n, 10), in SI units.
+    """Terms of the momentum balance at T samples, (T, n) except for the payload and the Jacobian, in SI units.
 
     momentum: p. torque: G (tau - offset) + friction compensation + dL/dq. friction: mean of the friction torques at
     both bounds of the friction state. uncertainty: half the difference of the friction torques at both bounds.
-    load_momentum: P. load_torque: N. jacobian: Jacobian of a point of the last body, (T, 3, n), in root axes.
+    load_momentum, load_torque: P and N, momentum and torque per inertial parameter of the payload, (T, n, 10).
+    jacobian: Jacobian of a point of the last body, (T, 3, n), in root axes.
     """
 
     momentum: np.ndarray
@@ -40,7 +41,9 @@ class Balance(NamedTuple):
 
 
 def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return P and N, (T, n, 10), and the Jacobian of a point of the last body, (T, 3, n), in root axes.
+    """Return the terms P and N of a payload, and the Jacobian of a point of the last body, (T, 3, n), in root axes.
+
+    P and N, (T, n, 10), are the momentum and the torque per inertial parameter of the payload in the momentum balance.
 
     Args:
         chain: kinematics of the bodies.
@@ -81,12 +84,10 @@ def balance(
         samples: q, qd and tau, (T, n).
         bounds: lower and upper bound of the friction state, (T, n, K) [rad, m].
     """
-    blocks: list[list[np.ndarray]] = []
     with torch.no_grad():
-        for start in range(0, len(samples[0]), _BLOCK):
-            tensors = [torch.from_numpy(x[start : start + _BLOCK]) for x in (*samples, *bounds)]
-            blocks.append([x.numpy() for x in _terms(model, torch.from_numpy(point), *tensors)])
-    return Balance(*map(np.concatenate, zip(*blocks, strict=True)))
+        columns = [torch.from_numpy(x).split(_BLOCK) for x in (*samples, *bounds)]
+        blocks = [_terms(model, torch.from_numpy(point), *block) for block in zip(*columns, strict=True)]
+        return Balance(*(torch.cat(term).numpy() for term in zip(*blocks, strict=True)))
 
 
 def _terms(

@@ -44,10 +44,11 @@ class NoiseLevels(BaseModel):
     momentum observer for a moving joint [Nm, N]. resting: additional threshold for a joint at rest, which is three
     standard deviations of the additional noise [Nm, N] and decreases with exp(-|qd| / resting_speed). resting_speed:
     [rad/s, m/s]. peak_start, peak_scale: start and scale of the exponential tail of the peaks of the external torque
-    divided by its standard deviation; the tail is the largest fifth of the peaks. load_variance: factor on the
-    covariance of estimated payloads, an estimate with load_freedom degrees of freedom. speed: largest speed of the
-    training logs [rad/s, m/s]. encoder: encoder step of positions [rad, m]. effort: torque limit [Nm, N]. minutes:
-    duration of the training logs [min]. point: position of the tip in the frame of the last body, (3,) [m].
+    divided by its standard deviation; the tail is the largest fifth of the peaks, of which there are peak_count per
+    joint. load_variance: factor on the covariance of estimated payloads, an estimate with load_freedom degrees of
+    freedom. speed: largest speed of the training logs [rad/s, m/s]. encoder: encoder step of positions [rad, m].
+    effort: torque limit [Nm, N]. minutes: duration of the training logs [min]. point: position of the tip in the frame
+    of the last body, (3,) [m].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -59,6 +60,7 @@ class NoiseLevels(BaseModel):
     resting_speed: Vector
     peak_start: Vector
     peak_scale: Vector
+    peak_count: int
     load_variance: float
     load_freedom: float
     speed: Vector
@@ -74,14 +76,15 @@ class NoiseLevels(BaseModel):
 
     @property
     def load_quantile(self) -> float:
-        """Half width of 95 % intervals of a payload, in standard deviations: Student's t, for an estimated variance.
+        """Half width of 95 % intervals of a payload, in standard deviations.
 
-        `load_variance` was estimated without a payload; the decision between payload and no payload uses it unchanged.
-        Intervals use at least its prior value, because with a payload, friction and its errors are larger than in the
-        training logs.
+        It is a quantile of Student's t distribution, because the variance is estimated, times a factor. The factor
+        `load_variance` is estimated from logs without payload, and the decision between payload and no payload uses
+        it unchanged. Intervals are wider for two reasons: errors are larger on other days than in the training logs,
+        and a payload increases friction and the errors of friction.
         """
-        with_load = max(TUNING.prior_variance / self.load_variance, 1.0)
-        return float(stdtrit(self.load_freedom, 0.975)) * math.sqrt(with_load)
+        width = max(TUNING.other_days, math.sqrt(TUNING.prior_variance / self.load_variance))
+        return float(stdtrit(self.load_freedom, 0.975)) * width
 
     @property
     def supported_alarms(self) -> float:
@@ -105,7 +108,12 @@ class NoiseLevels(BaseModel):
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the thresholds of the external torque divided by its standard deviation, (n,) [1].
 
+        The scale of an exponential tail, estimated from m = peak_count peaks, is uncertain. With the prior 1 / scale a
+        further peak exceeds the start by more than x with the probability (1 + x / (m scale))^-m.
+
         alarms_per_minute: rate of false alarms of all joints together [1/min].
         """
-        tail = self.peak_start + self.peak_scale * math.log(self.tail_peaks / alarms_per_minute)
-        return TUNING.other_days * np.maximum(tail, 1.0)
+        odds = self.tail_peaks / alarms_per_minute
+        excess = self.peak_count * (odds ** (1 / self.peak_count) - 1)
+        thresholds: np.ndarray = np.maximum(self.peak_start + self.peak_scale * excess, 1.0)
+        return thresholds

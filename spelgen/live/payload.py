@@ -29,10 +29,10 @@ class Payload:
     """Payload that is fixed to the last body, in the frame of this body; all values are zero without a payload.
 
     status: "payload", "no payload", or "not yet" if the motion does not determine which. log_odds: log odds of "no
-    payload" against a payload. limit: 95 % upper limit of the mass, for any status [kg]. mass [kg], center (3,) [m],
-    inertia about the centre of mass (xx, xy, xz, yy, yz, zz) [kg m^2]: each with lower and upper limits of 95 %
-    intervals, (..., 2). parameters: mass m, first moments m c, and inertia about the origin of the frame, (10,).
-    covariance: covariance of the parameters, (10, 10).
+    payload" against a payload. limit: 95 % upper limit of the mass, for any status [kg]. mass [kg], center (3,) [m].
+    inertia: (xx, xy, xz, yy, yz, zz) about the centre of mass [kg m^2]. The fields ``..._interval`` are the lower and
+    upper limits of 95 % intervals, (2,), (3, 2) and (6, 2). parameters: mass m, first moments m c, and inertia about
+    the origin of the frame, (10,). covariance: covariance of the parameters, (10, 10).
     """
 
     status: Status = "not yet"
@@ -61,24 +61,15 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
         factor: factor by which the covariance of the likelihood is multiplied (`NoiseLevels.load_variance`).
         quantile: half width of the 95 % intervals in standard deviations.
     """
+    found: list[tuple[np.ndarray, np.ndarray, float]] = []
     try:
-        return _found_payload(mean, covariance, factor, quantile)
+        precision = _inverse(covariance)
+        linear = precision @ mean / factor
+        precision = (precision - np.diag(TUNING.load_prior**-2.0)) / factor
+        for scale in TUNING.scales:
+            found.append(_at_scale(precision, linear, scale, found[-1][0] if found else None))
     except np.linalg.LinAlgError:
         return NO_REPORT
-
-
-def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quantile: float) -> Payload:
-    """Return the payload. Raises LinAlgError if a matrix is not positive definite.
-
-    mean, covariance: estimate of the payload filter, (10,) and (10, 10), including the filter's prior. factor: factor
-    on the covariance of the likelihood. quantile: half width of the 95 % intervals in standard deviations.
-    """
-    precision = _inverse(covariance)
-    linear = precision @ mean / factor
-    precision = (precision - np.diag(TUNING.load_prior**-2.0)) / factor
-    found: list[tuple[np.ndarray, np.ndarray, float]] = []
-    for scale in TUNING.scales:
-        found.append(_at_scale(precision, linear, scale, found[-1][0] if found else None))
     thetas, inverses, evidence = (np.array(column) for column in zip(*found, strict=True))
     log_odds = float(math.log(len(found)) - logsumexp(evidence))
     weights = softmax(evidence)
@@ -103,11 +94,12 @@ def _at_scale(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the MAP estimate, its covariance, and the log evidence, for a prior mean of mass ``scale``.
 
-    Newton's method minimizes weight (1/2 theta^T precision theta - linear . theta) - 1/2 log det J + 1/2 tr(W^-1 J),
-    with the pseudo-inertia J of theta and the scale matrix W of the Wishart prior. It starts at ``start`` with a weight
-    of one, or at the prior mean with an increasing weight: the maximum of the likelihood may be far outside of the cone
-    of consistent parameters, at whose boundary Newton's method would stall (Boyd and Vandenberghe, Convex Optimization,
-    2004, 11.3). Twice the cost is self-concordant, so that steps damped by the Newton decrement are feasible (9.6.4).
+    Newton's method minimizes w (1/2 theta^T precision theta - linear . theta) - 1/2 log det J + 1/2 tr(W^-1 J), with
+    the pseudo-inertia J of theta, the scale matrix W of the Wishart prior, and the weight w of the likelihood. With a
+    ``start``, w is 1. Otherwise the prior mean is the start, and w increases to 1: the maximum of the likelihood may be
+    far outside of the cone of consistent parameters, at whose boundary Newton's method would stall (Boyd and
+    Vandenberghe, Convex Optimization, 2004, 11.3). Twice the cost is self-concordant, so that steps damped by the
+    Newton decrement are feasible (9.6.4).
     """
     # The prior mean is a ball whose centre is at a distance from the origin along z.
     height, about_z = TUNING.distance, 2 / 5 * TUNING.radius**2

@@ -36,8 +36,9 @@ class LogEstimate:
     """The estimates along a log.
 
     states: estimates after each sample. payload: estimate at the end of the log. since: time at which this payload was
-    first reported [s]; None without a payload. changes: times of detected changes of the load [s]. drift: difference of
-    friction at the end of the log from the model, per joint [%]. refused: number of refused samples for each reason.
+    first reported [s]; None without a payload. changes: times of detected changes of the load [s]. drift: relative
+    difference between friction at the end of the log and friction of the model, per joint [%]. refused: number of
+    refused samples for each reason.
     """
 
     log: Trajectory

@@ -139,7 +139,10 @@ class LiveTuning:
 
     @property
     def evidence(self) -> float:
-        """Constant terms of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of the Gaussian."""
+        """Sum of the terms of the log evidence that do not depend on logs or on the prior mean.
+
+        They are the constants of the Wishart density (with |dJ/dtheta| = 1/2) and of Laplace's approximation.
+        """
         wishart = 2 * self.degrees * math.log(2) + float(multigammaln(self.degrees / 2, 4))
         return 5 * math.log(2 * math.pi) - math.log(2) - wishart
 

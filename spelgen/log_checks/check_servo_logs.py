@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,7 +14,7 @@ from spelgen.log_checks.report import JointFollowing, JointReport, percent, sign
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.logs.checks import Check, Findings, run_checks
 from spelgen.logs.filtering import derivative
-from spelgen.logs.joint_signals import is_factor, mapping_line
+from spelgen.logs.joint_signals import Advice, is_factor, mapping_line
 from spelgen.logs.trajectory import Trajectory, delayed_commands, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
@@ -29,9 +29,9 @@ DELAYS = np.linspace(-0.1, 0.4, 51).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # [1] fewest samples of a gap-free piece, which the smoothing polynomial needs
 FOLLOWS = SIGNALS.agreement
-# Encoders of bus servos have 2**k counts per turn, with k from 10 to 14. Positions in degrees therefore have the same
-# quantisation step at all joints: 360/2**k, or 360/(2**k - 1) with LeRobot. LeRobot's normalised positions have another
-# step at each joint: 200 divided by the counts of the joint's calibrated range.
+# Encoders of bus servos have 2**k counts per turn, with k from 10 to 14. Positions therefore have the same quantisation
+# step at all joints: 360/2**k degrees, or 360/(2**k - 1) with LeRobot. LeRobot's normalised positions have another step
+# at each joint: 200 divided by the counts of the joint's calibrated range.
 # NORMALISED_RANGE: largest magnitude of a normalised position. NORMALISED_STEPS: smallest and largest quantisation step
 # of normalised positions, for calibrated ranges of 800 to 5000 counts.
 NORMALISED_RANGE, NORMALISED_STEPS = 100.001, (0.04, 0.25)
@@ -40,28 +40,51 @@ NORMALISED_RANGE, NORMALISED_STEPS = 100.001, (0.04, 0.25)
 SAME_STEP, ENCODER_STEP = 1e-3, 4e-3
 
 
-def find_normalised(joints: Sequence[JointReport]) -> str | None:
-    """Find normalised positions of LeRobot that the mapping declares as degrees.
+def find_servo_unit(joints: Sequence[JointReport], unit: str) -> Advice | None:
+    """Find positions of servos that are logged in another unit than the mapping states, "deg" or "rad".
 
-    Normalised positions have another quantisation step at each joint, positions in degrees have the encoder's step.
+    The steps of the encoders show the unit. Positions without steps that move by less than 0.1 rad at all joints, and
+    by more than 0.5 as radians, were not in degrees. Normalised positions have another step at each joint.
     """
-    if max(joint.largest("q") for joint in joints) > np.radians(NORMALISED_RANGE):
+    steps = {joint.name: float(np.degrees(joint.steps["q"])) for joint in joints if joint.steps["q"]}
+    ranges = np.array([joint.high["q"] - joint.low["q"] for joint in joints])
+    other, factor = ("rad", 180 / np.pi) if unit == "deg" else ("deg", np.pi / 180)
+    values = np.array(list(steps.values()))
+    if _are_encoders(values):
         return None
-    found = {joint.name: float(np.degrees(joint.steps["q"])) for joint in joints if joint.steps["q"]}
-    steps = np.array(list(found.values()))
+    message = f"positions in {other}: they move by up to {ranges.max():.3g} rad when read in {unit}"
+    if _are_encoders(values * factor):
+        counts = 360 / float(np.median(values * factor))
+        return Advice(
+            f"{message}, in steps of an encoder with {counts:.0f} counts", keys={"units": {"q": other}}
+        )
+    if unit != "deg":
+        return None
+    if ranges.max() < 0.1 and 0.5 < ranges.max() * factor < 4 * np.pi:
+        return Advice(message, keys={"units": {"q": other}})
     low, high = NORMALISED_STEPS
-    if len(steps) < 2 or steps.min() < low or steps.max() > high or np.ptp(steps) < SAME_STEP * steps.max():
+    is_normalised = max(joint.largest("q") for joint in joints) <= np.radians(NORMALISED_RANGE)
+    is_normalised &= len(values) > 1 and values.min() >= low and values.max() <= high
+    if not is_normalised or np.ptp(values) < SAME_STEP * values.max():
         return None
-    turns = 360 / steps
-    is_encoder = np.abs(turns / 2 ** np.round(np.log2(turns)) - 1) < ENCODER_STEP
-    if is_encoder.mean() > 0.5:
-        return None
-    values = ", ".join(f"{name} {step:.4f}" for name, step in found.items())
-    return f"degrees of another step for each joint ({values}), as LeRobot's normalised positions have"
+    listed = ", ".join(f"{name} {step:.4f}" for name, step in steps.items())
+    return Advice(
+        f"degrees of another step for each joint ({listed}), as LeRobot's normalised positions have"
+    )
 
 
-NORMALISED = Check(
-    "normalised", "error", find_normalised, expected="degrees, with the step of the encoders (4096 counts: 0.0879)",
+def _are_encoders(steps: np.ndarray) -> bool:
+    """Return True if most quantisation steps (J,) [degrees] are steps of encoders with 2**10 to 2**14 counts."""
+    counts = 360 / steps
+    powers = np.clip(np.round(np.log2(counts)), 10, 14)
+    return bool(len(steps) and (np.abs(counts / 2**powers - 1) < ENCODER_STEP).mean() > 0.5)
+
+
+UNIT: Check[Sequence[JointReport]] = Check(
+    "degrees", "error", lambda _: None, expected="the unit that 'units' under 'logs' states, rad by default"
+)
+NORMALISED: Check[Sequence[JointReport]] = Check(
+    "normalised", "error", lambda _: None, expected="degrees, with the step of the encoders (4096 counts: 0.0879)",
     do="write 'units: {q: normalised}' and 'calibration:' with the content of LeRobot's calibration file under 'logs' "
     "in the robot's YAML",
 )  # fmt: skip
@@ -163,7 +186,10 @@ class ServoLogs:
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports of the joints completed by their tracking, and tables; add findings to the summary."""
+        """Return the joint reports with the tracking of the commands added, and the tables for display.
+
+        The findings are added to `summary`.
+        """
         names = self._arm.chain.joint_names
         saturation = np.full(len(names), np.inf)
         for k, coordinate in enumerate(self._arm.chain.coordinates):
@@ -171,9 +197,7 @@ class ServoLogs:
             if coordinate.effort and kp:
                 saturation[k] = coordinate.effort / kp
         mapping = self._logs[0].mapping
-        if all(mapping.unit("q", name) == "deg" for name in names):
-            for normalised, found in run_checks([NORMALISED], reports, self._logs[0].accepted):
-                summary.add(normalised, found.message, "all joints")
+        self._check_unit(reports, {mapping.unit("q", name) for name in names}, summary)
         following = measure_following(self._logs, saturation)
         if following is None:
             message = f"no {FILTER_SAMPLES} samples without a gap: no servo is determined"
@@ -201,6 +225,22 @@ class ServoLogs:
                 break  # reported for one trajectory only: logs of one robot have the same sample rate
         return completed, (*signal_tables(completed, ("q", "u")), _following_table(completed))
 
+    def _check_unit(
+        self, reports: Sequence[JointReport], units: Collection[str | None], summary: Findings
+    ) -> None:
+        """Add an error about positions in another unit than the mapping states for all joints."""
+        (unit, *others) = units
+        if others or unit not in (None, "rad", "deg"):
+            return
+        finding = find_servo_unit(reports, unit or "rad")
+        if finding is None:
+            return
+        check = UNIT if finding.keys else NORMALISED
+        # the general doubt about degrees of LeRobot is no news beside this error
+        summary.notes[:] = [x for x in summary.notes if "unless they are LeRobot's" not in x.message]
+        if check.code not in self._logs[0].accepted:
+            summary.add(check, finding.message, "all joints", keys=finding.keys)
+
 
 def _odd_command(
     k: int,
@@ -210,10 +250,10 @@ def _odd_command(
     is_copy: bool,
     mapping: LogMapping,
 ) -> LogError | Diagnostic | None:
-    """Return the finding about the command of joint k; None if there is none.
+    """Return the finding about the logged command of joint k, or None.
 
-    It is an error if the logged command cannot be the command of this joint. is_copy: True if the logged command
-    equals the logged position in all samples.
+    The finding is an error if the column cannot contain the commands of this joint, otherwise a warning. is_copy: True
+    if the logged command equals the logged position in all samples.
     """
     where = f"joint {joints[k]!r}"
     # correlation and gain at the delay with the largest correlation, so that a slow servo is not reported as a fault

@@ -12,9 +12,14 @@ import numpy as np
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic
 from spelgen.identification.drive_hints import Coupling, DriveLog, DriveSamples, drive_problem
-from spelgen.identification.geometry_search import Scaling, angle_scalings, compare_readings
+from spelgen.identification.geometry_search import (
+    UNITS,
+    Scaling,
+    compare_readings,
+    position_scalings,
+)
 from spelgen.identification.least_squares import varying
-from spelgen.identification.log_geometry import GeometryProblem, HypothesisFit, MotionSamples
+from spelgen.identification.log_geometry import GeometryProblem, HypothesisFit, MotionSamples, joined_samples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.listing import Listing, number
@@ -28,6 +33,7 @@ from spelgen.log_checks.robot_checks import (
     JointEvidence,
     find_no_gravity,
     fit_gravity,
+    rounded_factor,
     torque_factors,
 )
 from spelgen.logs.bags import BAG
@@ -60,12 +66,12 @@ class TorqueLogs:
         """Add a trajectory. Raises LogError if it has no torques."""
         require_torques([trajectory])
         inputs = self._drives.inputs.T
-        samples = []
+        pieces = []
         for x in split_at_gaps(trajectory, shortest=3):
-            samples.append(MotionSamples(x.q, x.qd, np.gradient(x.qd, x.t, axis=0), x.tau @ inputs))
-        if samples:
+            pieces.append(MotionSamples.of(x.q, x.qd, np.gradient(x.qd, x.t, axis=0), x.tau @ inputs))
+        if pieces:
             # 400 samples of a trajectory suffice, since gravity and friction change slowly
-            self._samples.append(MotionSamples.joined(samples).thinned(400))
+            self._samples.append(joined_samples(pieces).thinned(400))
         self._moving.add(trajectory)
         self._flat.append(FlatTops.of(trajectory.q, trajectory.tau @ inputs))
         self._declared.append(set(trajectory.accepted))
@@ -76,11 +82,14 @@ class TorqueLogs:
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports of the joints completed by the fit of gravity, and tables; add findings to the summary."""
+        """Return the joint reports with the fit of gravity added, and the tables for display.
+
+        The findings are added to `summary`.
+        """
         # a check is omitted if the mapping accepts it, or if every trajectory does
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
-        chain, empty = self._arm.chain, np.zeros((0, len(reports)))
-        motion = MotionSamples.joined([MotionSamples(*[empty] * 4), *self._samples]).thinned(6000)
+        chain, empty = self._arm.chain, MotionSamples.of(*np.zeros((4, 0, len(reports))))
+        motion = joined_samples([empty, *self._samples]).thinned(6000)
         completed, evidence = [], []
         fits = fit_gravity(chain, motion)
         for coordinate, report, gravity in zip(chain.coordinates, reports, fits, strict=True):
@@ -103,9 +112,12 @@ class TorqueLogs:
         has_errors, faults = bool(summary.errors), dict[Check[JointEvidence], dict[str, str]]()
         for joint in evidence:
             passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
-            if has_errors:  # one message per cause
+            # if the log has an error, torques beyond the limits of the drive are a consequence of the same fault
+            if has_errors:
                 passed.add("torque-beyond-drive")
-            if joint not in weightless:  # wrong masses in the URDF may explain a torque without gravity
+            # If the masses of a joint are wrong in the URDF, its torque may also be uncorrelated with the URDF's
+            # gravity: only joints whose torques fit better without gravity are reported.
+            if joint not in weightless:
                 passed.add(WITHOUT_GRAVITY)
             for check, found in run_checks(CHECKS, joint, passed):
                 if check.severity == "error":
@@ -148,8 +160,8 @@ class TorqueLogs:
         """
         samples = motion
         if moving is not None:
-            samples = MotionSamples(moving.q, moving.qd, moving.qdd, moving.tau)
-        if len(samples.q) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
+            samples = MotionSamples(moving.around, moving.bent)
+        if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
         reading = mapped_reading(self._arm.chain, self._mapping, self._drives)
         return GeometryProblem(self._arm.chain, samples, self._drives.speeds, self._seconds, reading)
@@ -161,17 +173,17 @@ class TorqueLogs:
         accepted: set[str],
         summary: Findings,
     ) -> bool:
-        """Return True if the torques agree with the arm's geometry, without clipping; otherwise add the finding.
+        """Return True if the torques are not clipped and no hypothesis about the log fits significantly better.
 
-        False is returned for clipped torques, and if a hypothesis such as other signs, orders or zeros of the joints
-        fits significantly better. Warnings about mechanical stops and about inertials of the URDF are added, too.
+        Hypotheses are, for example, other signs, orders or zeros of the joints. Otherwise the finding is added, and
+        False is returned. Warnings about mechanical stops and about inertials of the URDF are added, too.
         """
         limits = find_limits(problem, FlatTops.joined(self._flat))
         summary.notes.extend(limits.notes)
         if limits.errors and CLIPPED not in accepted:
             summary.errors.extend(limits.errors)
             return False
-        comparison = compare_readings(problem, self._scalings(evidence))
+        comparison = compare_readings(problem, self._scalings(evidence, problem))
         if not comparison.better:
             summary.notes.extend(_link_notes(problem, comparison.unchanged))
         if not comparison.better or set(comparison.codes) <= accepted:
@@ -184,17 +196,28 @@ class TorqueLogs:
             summary.errors.append(finding)
         return False
 
-    def _scalings(self, evidence: Sequence[JointEvidence]) -> list[Scaling]:
-        """Return the candidates for other units: of torques, from the magnitude of gravity, and of all angles.
+    def _scalings(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> list[Scaling]:
+        """Return candidate unit corrections: factors on torques, from the magnitude of gravity, and on all positions.
 
-        Units that the mapping states are not changed.
+        A unit of torques that the mapping states is not changed.
         """
         names, ones = self._arm.chain.joint_names, np.ones(len(evidence))
         scalings = []
-        for factors in torque_factors(evidence, [not self._is_declared(name) for name in names]):
-            scalings.append(Scaling("torque-unit", ones, factors))
-        if not any(self._mapping.unit("q", name) for name in names):
-            scalings += angle_scalings(self._arm.chain)
+        undeclared = [self._mapping.unit("tau", name) in (None, "mNm") for name in names]
+        candidates = torque_factors(evidence, undeclared)
+        coarse = problem.thinned(GEOMETRY.coarse_samples)
+        ratio = coarse.gravity_ratio(coarse.fit(coarse.unchanged))
+        if all(undeclared) and ratio > 0 and not 1 / 5 < ratio < 5:
+            candidates.append(rounded_factor(1 / ratio) * ones)
+        scalings += [Scaling("torque-unit", ones, factors) for factors in candidates]
+        scale = np.array([self._mapping.scale("q", name) for name in names])
+        # the unit of velocities must be that of the positions, so that both are changed by the same factor
+        units = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
+        if units <= {
+            (None, None),
+            *((unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])),
+        }:
+            scalings += position_scalings(self._arm.chain, scale)
         return scalings
 
     def _check_drives(self, moving: DriveSamples, summary: Findings) -> None:
@@ -216,8 +239,8 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointEvidence]) 
     confirmed = []
     for k in suspicious:
         cost = problem.without_gravity(k).fit(problem.unchanged).cost
-        # also confirmed if the residual with gravity has a tenth of the torque's variance: then the URDF's gravity is
-        # not in this torque
+        # A torque without gravity is reported if the model without gravity has the lower cost, or if the residual of
+        # the model with gravity has more than 10 % of the torque's variance.
         if fit.errors[k] > 0.1 or cost < fit.cost:
             confirmed.append(joints[k])
     return confirmed

@@ -72,13 +72,13 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     """
     problem, findings = problem.thinned(GEOMETRY.confirming_samples), Findings()
     samples = problem.unchanged.signals(problem.samples)
-    at_torque, at_position = (_at_levels(*x) for x in ((flat.tau, samples.tau), (flat.q, samples.q)))
+    at_torque, at_position = (_at_levels(*x) for x in ((flat.tau, samples.tau), (flat.q, samples.motion[0])))
     free = ~(at_torque | at_position).any(axis=0)
     if free.all():
         return findings
     # the model is fitted only to samples outside flat tops, which are not at a limit
     fit = problem.on_torques(free).fit(problem.unchanged)
-    residual = problem.torque(problem.unchanged, fit.parameters) - samples.tau
+    residual = problem.residual(problem.unchanged, fit.parameters)
     deviation, (_, _, friction, *_) = problem.prediction_deviation(fit), problem.drive_parameters(fit)
     # The residual of few samples underestimates the noise: the 30 degrees of freedom of a joint's parameters are
     # subtracted.

@@ -7,7 +7,7 @@ import numpy as np
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
 from spelgen.errors import Diagnostic, LogError
-from spelgen.identification.geometry_search import ANGLES, HypothesisComparison
+from spelgen.identification.geometry_search import HypothesisComparison, position_unit
 from spelgen.identification.log_geometry import Hypothesis, HypothesisFit
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.joint_signals import joint_keys, plain_number, settings_line
@@ -15,15 +15,15 @@ from spelgen.settings.log_mapping import LogMapping
 
 GEOMETRY_CODES = (
     "joint-order", "torque-order", "motion-order", "joint-sense", "torque-sense", "joint-zero", "joint-unit",
-    "torque-unit", "torque-scale", "gravity", "gravity-compensated",
+    "joint-delay", "torque-unit", "torque-scale", "gravity", "gravity-compensated",
 )  # fmt: skip
 RIGHT = "joints, zeros, units and gravity as the URDF and the settings state them"
 
 
 def mapped_reading(arm: Chain, mapping: LogMapping, drives: Drives) -> Hypothesis:
-    """Return the hypothesis of the unchanged log, with the scales and offsets of the mapping.
+    """Return the `Hypothesis` without changes: signs, scales and offsets of the joints are those of the mapping.
 
-    The torque scale includes the gear ratio of the drives if each motor drives one joint.
+    The torque scale includes the gear ratios of the drives if each motor drives one joint.
     """
     joints = arm.joint_names
     gears = np.diag(drives.inputs) if np.count_nonzero(drives.inputs) == len(joints) else np.ones(len(joints))
@@ -72,8 +72,11 @@ class Remedies:
         texts = []
         keys = {name: self._joint_keys(k, reading) for k, name in enumerate(self.arm.joint_names)}
         changed = {name: changes for name, changes in keys.items() if changes}
-        if changed:
-            line = settings_line(joint_keys(changed, self.arm.joint_names))
+        of_log = joint_keys(changed, self.arm.joint_names) if changed else {}
+        if _is_common(reading.torque_delay):
+            of_log["torque_delay"] = plain_number(self.mapping.torque_delay + reading.torque_delay[0])
+        if of_log:
+            line = settings_line(of_log)
             texts.append(f"'{line}' under 'logs' in the robot's YAML")
         if reading.gravity != self.unchanged.gravity:
             gravity = settings_line({"gravity": list(map(plain_number, reading.gravity))})
@@ -99,8 +102,8 @@ class Remedies:
         sign = 1 if factor > 0 else -1
         if sign < 0:
             keys["sign"] = -present.sign
-        if abs(factor) in ANGLES:
-            unit = ANGLES[abs(factor)]
+        if abs(factor) != 1:
+            unit = self._unit(k, reading)
             keys["units"] = {"q": unit, "qd": f"{unit}/s"}
         gain = float(reading.torque_scale[k] / unchanged.torque_scale[k]) * sign
         if gain != 1.0:
@@ -109,6 +112,11 @@ class Remedies:
                 keys["torque_offset"] = present.torque_offset * gain * sign
         if reading.offset[k] != unchanged.offset[k]:
             keys["offset"] = plain_number(reading.offset[k])
+        delays = {"q": reading.motion_delay[k], "qd": reading.motion_delay[k], "tau": reading.torque_delay[k]}
+        stated = present.delay.model_dump()
+        late = {x: plain_number(stated[x] + delays[x]) for x in mapping.quantities if delays[x]}
+        if late and not _is_common(reading.torque_delay):
+            keys["delay"] = {**present.delay.model_dump(exclude_unset=True), **late}
         return keys
 
     def _change(self, code: str, reading: Hypothesis) -> tuple[np.ndarray, str]:
@@ -128,6 +136,12 @@ class Remedies:
         if not (torque[motion < 0] < 0).all():
             sense = "positions and velocities of the opposite sense, and torques of the right one"
         largest = torque[np.abs(np.log(np.abs(torque))).argmax()]
+        units = dict.fromkeys(self._unit(int(j), reading) for j in order if abs(motion[j]) != 1)
+        delay = np.where(reading.motion_delay, reading.motion_delay, reading.torque_delay)
+        shown = 1e3 * float(delay[np.abs(delay).argmax()])
+        late = "torques" if not reading.motion_delay.any() else "positions and velocities"
+        if reading.motion_delay.any() and reading.torque_delay.any():
+            late = "positions, velocities and torques"
         changes = {
             "joint-order": (reading.motion_source != order, "the columns of other joints"),
             "motion-order": (reading.motion_source != order, "the positions and velocities of other joints"),
@@ -138,10 +152,17 @@ class Remedies:
                 np.abs(torque) != 1,
                 f"torques of another unit, {1 / largest:.3g} times as large",
             ),
-            "joint-unit": (np.abs(motion) != 1, f"positions in {ANGLES.get(np.abs(motion).max(), 'deg')}"),
+            "joint-unit": (np.abs(motion) != 1, f"positions in {' and '.join(units)}"),
+            "joint-delay": (
+                delay != 0,
+                f"{late} logged {abs(shown):.3g} ms {'later' if shown > 0 else 'earlier'}",
+            ),
             "joint-zero": (shifts != 0, f"positions with another zero, by {shift}"),
         }
         return changes.get(code) or (order >= 0, self._gravity_text(code, reading))
+
+    def _unit(self, k: int, reading: Hypothesis) -> str:
+        return position_unit(self.arm.coordinates[k].joint_type, float(reading.motion_scale[k]))
 
     def _place(self, joints: np.ndarray) -> str:
         """Return a text that names the joints in a mask (n,), for a finding."""
@@ -168,6 +189,11 @@ class Remedies:
         present = np.array(self.unchanged.gravity)
         turned = float(np.linalg.norm(present - np.array(best.gravity)))
         return best.codes == ("gravity",) and turned < GEOMETRY.serious_angle * float(np.linalg.norm(present))
+
+
+def _is_common(delay: np.ndarray) -> bool:
+    """Return True if all joints have the same delay (n,), and it is not 0."""
+    return bool(delay.any() and (delay == delay[0]).all())
 
 
 def _evidence(best: HypothesisFit, unchanged: HypothesisFit) -> str:

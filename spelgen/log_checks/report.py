@@ -197,7 +197,8 @@ def joint_report(
 ) -> JointReport:
     """Return the report of the joint with this index, without gravity and tracking.
 
-    measured: statistics of all trajectories. products: (2n, 2n) sum of `velocity_products` over them.
+    measured: statistics of all trajectories. products: (2n, 2n) Gram matrix of the increments of the
+    integrals of qd and of q, summed over all trajectories, see `velocity_products`.
     """
     low, high, noise, steps = {}, {}, {}, {}
     for name in measured[0].signals:

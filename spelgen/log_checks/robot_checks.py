@@ -32,6 +32,8 @@ class RobotCheckTuning:
     # [1] The torque contains gravity if its correlation with the URDF's gravity torque is above this number, and does
     # not if the magnitude of the correlation is below 1 minus this number. In between nothing is concluded.
     seen: float = 0.7
+    # [1] Gravity is visible if its standard deviation is at least this fraction of the torque's, in logs of a UR10e.
+    visible: float = 0.2
     # [1] A column of the regressor is linearly dependent on others if the norm of its residual after projection onto
     # them is below this fraction of its norm.
     dependent: float = 1e-8
@@ -43,13 +45,14 @@ TUNING = RobotCheckTuning()
 def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
     """Return the fit of the gravity torque of the URDF to the torque of each joint in samples of motion."""
     # with fewer than 100 samples gravity and friction are confounded
-    if len(motion.q) < 100:
-        return [GravityFit()] * motion.q.shape[1]
-    still, qd = np.zeros_like(motion.q), motion.qd
-    rows = regressor(arm, motion.q, still, still)  # (S, n, 10 B)
+    q, qd, qdd = motion.motion
+    if len(q) < 100:
+        return [GravityFit()] * q.shape[1]
+    still = np.zeros_like(q)
+    rows = regressor(arm, q, still, still)  # (S, n, 10 B) for S samples and B bodies
     load = rows @ urdf_parameters(arm)
     # friction and the joint's own inertia are removed, since in a slow swing they are correlated with gravity
-    friction = np.stack([np.ones_like(qd), qd, np.tanh(qd / SAMPLES.moving), motion.qdd], axis=2)
+    friction = np.stack([np.ones_like(qd), qd, np.tanh(qd / SAMPLES.moving), qdd], axis=2)
     fits = []
     for joint in range(qd.shape[1]):
         signals = np.column_stack([motion.tau[:, joint], load[:, joint], rows[:, joint]])
@@ -60,8 +63,8 @@ def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
 def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
     """Return the fit of gravity to the torque of one joint.
 
-    signals: (S, 2 + K), the torque, the gravity torque of the URDF, and the K regressor columns of gravity. friction:
-    (S, F) columns of friction and inertia, which are removed from the signals by projection.
+    signals: (S, 2 + K) for S samples, the torque, the gravity torque of the URDF, and the K regressor columns of
+    gravity. friction: (S, F) columns of friction and inertia, which are removed from the signals by projection.
     """
     remainders = _without(friction, signals)
     lengths = np.linalg.norm(remainders, axis=0)
@@ -84,7 +87,10 @@ def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
 
 
 def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the residual of values (S,) or (S, K) after projection onto the span of the columns (S, C)."""
+    """Return the residual of values after projection onto the span of the columns.
+
+    columns: (S, C) for S samples. values: (S,) or (S, K).
+    """
     basis = orth(columns, rcond=TUNING.dependent)
     return np.asarray(values - basis @ (basis.T @ values))
 
@@ -108,9 +114,7 @@ class JointEvidence(NamedTuple):
         Both are NaN for a joint whose gravity torque is too small.
         """
         fit = self.report.gravity
-        # The ratio is undetermined if gravity is small. In logs of a UR10e, gravity is visible if its standard
-        # deviation is at least a fifth of the torque's.
-        if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < 0.2:
+        if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < TUNING.visible:
             return nan, nan  # every comparison with NaN is false
         return fit.factor, fit.correlation
 
@@ -151,20 +155,21 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
     for k, joint in enumerate(joints):
         factor, correlation = joint.report.gravity.factor, joint.report.gravity.correlation or 0.0
         # for a joint with little gravity the ratio is known only if the torque is nearly proportional to gravity
-        is_known = joint.gravity_in_torque()[1] > TUNING.seen or correlation > SIGNALS.agreement
+        share = abs(factor or 0.0) * (joint.report.gravity.relative_deviation or 0.0)
+        is_known = (correlation > TUNING.seen and share > TUNING.visible) or correlation > SIGNALS.agreement
         if factor is None or not (is_known and undeclared[k]):
             continue
         seen.append(factor)
         if not 1 / 5 < factor < 5:
             single = np.ones(len(joints))
-            single[k] = _rounded(1 / factor)
+            single[k] = rounded_factor(1 / factor)
             factors.append(single)
     if factors and all(undeclared):
-        factors.append(np.full(len(joints), _rounded(1 / float(np.median(seen)))))
+        factors.append(np.full(len(joints), rounded_factor(1 / float(np.median(seen)))))
     return factors
 
 
-def _rounded(factor: float) -> float:
+def rounded_factor(factor: float) -> float:
     """Return a rounded factor: 0.001, from mNm to Nm, if it is close; else with one significant digit, or with two.
 
     One digit is enough if it changes the factor by less than 10 %.

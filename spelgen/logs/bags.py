@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -29,8 +29,23 @@ FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
 MAGIC = b"\x89MCAP0\r\n"  # bytes at the beginning and at the end of a complete MCAP file
 SCHEMA, CHANNEL, MESSAGE_RECORD, CHUNK = 3, 4, 5, 6  # operation codes of MCAP
 
-StampedState = tuple[int, int, Any]
-"""Time stamp [ns] in a joint state's header (0 if not set), time [ns] of the recorder, and the joint state."""
+RawState = tuple[str, int, bytes]
+"""Topic, time [ns] of the recorder, and encoded joint state."""
+
+
+class StampedState(NamedTuple):
+    """Joint state of one message.
+
+    topic: topic of the message. stamp: time stamp [ns] in the header; 0 if the publisher has set none. recorded: time
+    [ns] of the recorder. state: decoded message.
+    """
+
+    topic: str
+    stamp: int
+    recorded: int
+    state: Any
+
+
 TimedState = tuple[int, Any]
 """Time [ns] of a joint state, and the joint state."""
 
@@ -43,8 +58,9 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     LogError for a bag that cannot be read, and if `rosbags` is not installed.
     """
     remarks: list[str] = []
-    messages = _stamped(list(_messages(path, mapping.topic, remarks)), remarks)
-    table = _joint_states(path, messages, list(map(mapping.log_name, joints)))
+    names = list(map(mapping.log_name, joints))
+    messages = _of_one_arm(list(_messages(path, mapping.topic, remarks)), names, path, remarks)
+    table = _joint_states(path, _stamped(messages, remarks), names)
     # ROS defines the fields of a joint state in SI units, so columns and units of the mapping do not apply
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
@@ -58,50 +74,71 @@ def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[Timed
     The times are the stamps of the message headers or, if no message has a stamp, the times of the recorder. Both
     clocks are never mixed, since they may differ by hours.
     """
-    # a stamp of 0 means that the publisher has set none
-    stamped = [(stamp, state) for stamp, _, state in messages if stamp]
+    stamped = [(x.stamp, x.state) for x in messages if x.stamp]
     if messages and not stamped:
         remarks.append("no message has a stamp: times are those at which the recorder received them")
-        return [(recorded, state) for _, recorded, state in messages]
+        return [(x.recorded, x.state) for x in messages]
     if len(stamped) < len(messages):
         remarks.append(f"{counted(len(messages) - len(stamped), 'message')} without a stamp left out")
     return stamped
 
 
+def _of_one_arm(
+    messages: Sequence[StampedState], names: Sequence[str], path: Path, remarks: list[str]
+) -> list[StampedState]:
+    """Return the messages that contain any of the joints `names`; they may be in several messages and topics.
+
+    If most of these messages contain all joints, the others are omitted. Raises LogError if several topics contain the
+    same joint, and if no message contains a joint.
+    """
+    arm = set(names)
+    of_arm = [x for x in messages if not arm.isdisjoint(x.state.name)]
+    if not of_arm:
+        logged = list(dict.fromkeys(name for x in messages for name in x.state.name))
+        got = f"joint states of {', '.join(logged) or 'no joint'} only"
+        raise LogError(got, file=path, expected=", ".join(names), do=_names_line(names, logged))
+    joints_of: dict[str, set[str]] = {}
+    for message in of_arm:
+        joints_of.setdefault(message.topic, set()).update(arm.intersection(message.state.name))
+    if sum(map(len, joints_of.values())) > len(set.union(*joints_of.values())):
+        topics = sorted(joints_of)
+        got, do = f"joint states on the topics {', '.join(topics)}", mapping_line({"topic": topics[0]})
+        raise LogError(got, file=path, expected="one of them", do=f"{do}, or the other topic")
+    missing = [name for name in names if name not in set.union(*joints_of.values())]
+    if missing:
+        got, expected = f"joint states without {', '.join(missing)}", "states of all joints of the arm"
+        present = ", ".join(name for name in names if name not in missing)
+        do = f"write 'moving_joints: [{present}]' into the robot's YAML if the others do not move, or map their names"
+        raise LogError(got, file=path, expected=expected, do=do)
+    complete = [x for x in of_arm if arm.issubset(x.state.name)]
+    if len(complete) > len(of_arm) / 2:
+        if len(complete) < len(of_arm):
+            remarks.append(f"{counted(len(of_arm) - len(complete), 'message')} without all joints left out")
+        return complete
+    return of_arm
+
+
 def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[str]) -> pa.Table:
     """Return a table with the columns `t`, `q_<name>`, `qd_<name>` and `tau_<name>` of the joints `names`.
 
-    Fields that are empty in all messages are omitted.
+    Fields that are empty in all messages are omitted; values of joints that a message does not contain are NaN.
     """
     times: list[int] = []
-    rows: list[list[np.ndarray]] = []
-    other_names: dict[str, None] = {}
+    rows: list[np.ndarray] = []
     for stamp, state in messages:
-        missing = [name for name in names if name not in state.name]
-        if len(missing) == len(names):
-            other_names |= dict.fromkeys(state.name)
-            continue
-        element = f"message {len(rows) + 1}"
-        if missing:
-            got, expected = (
-                f"a message with the joints {', '.join(state.name)}",
-                f"{', '.join(missing)} in it too",
-            )
-            do = "record one message with the states of all joints of the arm, as joint_state_broadcaster publishes"
-            raise LogError(got, file=path, element=element, expected=expected, do=do)
-        indices, row = [state.name.index(name) for name in names], []
-        for field in FIELDS.values():
-            logged = np.asarray(getattr(state, field), dtype=float)
-            if len(logged) not in (0, len(state.name)):
-                got = f"{len(logged)} values for {len(state.name)} joints"
+        row = np.full((len(FIELDS), len(names)), np.nan)
+        logged = [k for k, name in enumerate(names) if name in state.name]
+        indices = [state.name.index(names[k]) for k in logged]
+        for values, field in zip(row, FIELDS.values(), strict=True):
+            array = np.asarray(getattr(state, field), dtype=float)
+            if len(array) not in (0, len(state.name)):
+                got, element = f"{len(array)} values for {len(state.name)} joints", f"message {len(rows) + 1}"
                 raise LogError(got, file=path, element=f"{element}, {field}", expected="one of each")
             # ROS allows empty fields in a joint state, such as a missing effort
-            row.append(logged[indices] if len(logged) else np.full(len(names), np.nan))
+            if len(array):
+                values[logged] = array[indices]
         times.append(stamp)
         rows.append(row)
-    if not rows:
-        got = f"joint states of {', '.join(other_names) or 'no joint'} only"
-        raise LogError(got, file=path, expected=", ".join(names), do=_names_line(names, list(other_names)))
     columns = {"t": (np.array(times) - times[0]) * 1e-9}
     # array of the three quantities q, qd and tau of n joints at T times, (3, n, T)
     for quantity, by_joint in zip(FIELDS, np.array(rows).transpose(1, 2, 0), strict=True):
@@ -152,10 +189,10 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
             unfinished = [] if is_ros1 else _unfinished(path)
             if unfinished:
                 messages = _without_end(unfinished, topic, path, remarks)
-            for recorded, raw in messages:
+            for name, recorded, raw in messages:
                 state: Any = decode(raw, MESSAGE)
                 clock = state.header.stamp
-                yield clock.sec * 1_000_000_000 + clock.nanosec, recorded, state
+                yield StampedState(name, clock.sec * 1_000_000_000 + clock.nanosec, recorded, state)
     except (LogError, GeneratorExit):
         raise
     except Exception as error:  # rosbags, its storages and their decompressors raise many types
@@ -164,14 +201,15 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
         raise LogError(got, file=path, do=None if isinstance(error, MemoryError) else do) from error
 
 
-def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> Iterator[tuple[int, bytes]]:
-    """Yield the recorder's times [ns] and the encoded joint states of one topic, read with `rosbags`."""
+def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> Iterator[RawState]:
+    """Yield the encoded joint states of a topic, or of all topics for None, read with `rosbags`."""
     with open_bag(path) as reader:
         topics = {f"{x.topic} ({x.msgtype})" for x in reader.connections}
         connections = [x for x in reader.connections if x.msgtype == MESSAGE]
-        chosen = _chosen_topic({x.topic for x in connections}, topics, topic, path)
-        for _, recorded, raw in reader.messages([x for x in connections if x.topic == chosen]):
-            yield recorded, raw
+        _require_topic({x.topic for x in connections}, topics, topic, path)
+        chosen = [x for x in connections if topic in (None, x.topic)]
+        for connection, recorded, raw in reader.messages(chosen):
+            yield connection.topic, recorded, raw
 
 
 def _unfinished(path: Path) -> list[Path]:
@@ -188,38 +226,31 @@ def _unfinished(path: Path) -> list[Path]:
 
 def _without_end(
     files: Sequence[Path], topic: str | None, path: Path, remarks: list[str]
-) -> Iterator[tuple[int, bytes]]:
-    """Yield the recorder's times [ns] and the encoded joint states of one topic, from MCAP files without an end."""
+) -> Iterator[RawState]:
+    """Yield the encoded joint states of a topic, or of all topics for None, from MCAP files without an end."""
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
         got = "a recording that was not closed, without a complete message of joint states"
         raise LogError(got, file=path, expected="an MCAP file with an end", do="try `mcap recover FILE`")
-    chosen = _chosen_topic({name for name, _, _ in messages}, set(), topic, path)
+    _require_topic({name for name, _, _ in messages}, set(), topic, path)
     remarks.append("the recording was not closed: all complete messages were read")
-    yield from ((recorded, raw) for name, recorded, raw in messages if name == chosen)
+    yield from (message for message in messages if topic in (None, message[0]))
 
 
-def _chosen_topic(topics: set[str], present: set[str], topic: str | None, path: Path) -> str:
-    """Return the topic to read: `topic`, or the only one of `topics` if `topic` is None.
+def _require_topic(topics: set[str], present: set[str], topic: str | None, path: Path) -> None:
+    """Raise LogError for a bag without joint states, or without joint states on the requested topic.
 
-    topics: all topics with joint states. present: topics of all types, for the error. Raises LogError for a topic that
-    is not among `topics`, and for several topics if none was requested.
+    topics: all topics with joint states. present: topics of all types, for the error. topic: None for any topic.
     """
-    if topic in topics:
-        return topic
-    if topic is None and len(topics) == 1:
-        return topics.pop()
-    names, do = ", ".join(sorted(topics)), None
-    got, expected = f"no joint states on {topic}", f"one of {names}"
     if not topics:
         got, expected = f"only the topics {', '.join(sorted(present)) or '(none)'}", f"one of {MESSAGE}"
-    elif topic is None:
-        got, expected = f"joint states on the topics {names}", "one of them"
-        do = "name it by 'topic' under 'logs'"
-    raise LogError(got, file=path, expected=expected, do=do)
+        raise LogError(got, file=path, expected=expected)
+    if topic is not None and topic not in topics:
+        expected = f"one of {', '.join(sorted(topics))}"
+        raise LogError(f"no joint states on {topic}", file=path, expected=expected)
 
 
-def mcap_messages(path: Path, message_type: str) -> Iterator[tuple[str, int, bytes]]:
+def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:
     """Yield topic, recorder's time [ns] and encoded content of all complete messages of a type in an MCAP file."""
     types: dict[int, str] = {}
     topics: dict[int, str] = {}

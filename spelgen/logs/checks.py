@@ -28,6 +28,7 @@ from spelgen.logs.joint_signals import (
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import SLOWEST, is_dense, shows_accelerations
 from spelgen.logs.unit_checks import (
+    find_copied,
     find_held,
     find_time_unit,
     find_too_rare,
@@ -199,6 +200,11 @@ CHECKS: list[Check[JointSignals]] = [
     Check(
         "no-torques", "error", find_no_torques, everywhere=True, expected="the torques that moved it",
         do="check the names of the columns and the logger",
+    ),
+    Check(
+        "torque-copied", "error", find_copied, everywhere=True,
+        expected="a column of its own for the torque of each joint",
+        do="check the logger, and the names of the columns under 'logs'",
     ),
     Check(
         "velocity-is-no-derivative", "warning", find_wrong_velocity, expected="dq/dt",

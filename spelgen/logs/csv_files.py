@@ -1,5 +1,6 @@
 """Reader of CSV logs in the dialects of spreadsheets and loggers."""
 
+import codecs
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -56,11 +57,14 @@ def csv_columns(file: Path) -> pa.Table:
 def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
     """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
 
-    Columns may be separated by commas, semicolons or tabs; numbers may have decimal commas; the encoding may be UTF-8,
-    UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
+    Columns may be separated by commas, semicolons, tabs or single spaces; numbers may have decimal commas; the encoding
+    may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
     """
     text = _beginning(file)
+    # spaces also occur within names, and therefore separate columns only if nothing else does
     delimiter = max(",;\t", key=text.header.count)
+    if delimiter not in text.header:
+        delimiter = " "
     cells = text.header.split(delimiter)
     names = _joint_state_columns(cells, file) if is_number(cells[0]) else None
     start = '"' if delimiter == "," else f"(^|{delimiter}) *"
@@ -138,10 +142,9 @@ def _decoded_head(file: Path) -> tuple[str, str]:
         head = source.read(size)
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16", head.decode("utf-16", "ignore")
-    # the head may end in the middle of a UTF-8 character
-    errors = "strict" if len(head) < size else "ignore"
     try:
-        return "utf-8", head.decode("utf-8", errors)
+        # the head may end in the middle of a UTF-8 character
+        return "utf-8", codecs.getincrementaldecoder("utf-8")().decode(head, final=len(head) < size)
     except UnicodeDecodeError:
         return "latin-1", head.decode("latin-1")
 

@@ -129,7 +129,7 @@ class JointSignals(NamedTuple):
 
 def is_factor(value: float, unit: float) -> bool:
     """Return True if a measured factor `value` equals the conversion factor `unit` within 25 %."""
-    # a measured factor within this tolerance counts as the conversion factor of the unit
+    # The tolerance is for noise of the velocities; conversion factors of different units differ by much more.
     return 0.8 < value / unit < 1.25
 
 
@@ -137,7 +137,8 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
     """Find frozen signals: a constant q while qd shows motion, a constant qd while q changes, or repeated values."""
     from scipy.integrate import cumulative_trapezoid
 
-    # [rad, m] motion of 0.05 in one of q and qd proves that the other one, if constant, is frozen
+    # [rad, m] If q or the integral of qd changes by more than `motion`, the joint moves, and the other signal is frozen
+    # if its value is constant.
     t, q, qd, motion = signals.trajectory.t, signals.q, signals.qd, 0.05
     if np.ptp(qd) == 0 and np.ptp(q) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
@@ -162,9 +163,13 @@ def find_dropouts(signals: JointSignals) -> str | None:
         if rows.size:
             first = rows[0]
             size = values[first] - values[max(first - 1, 0)]
-            what = "falls to 0" if values[first] == 0 else f"deviates from its neighbours by {size:.4g}"
+            what = (
+                "falls to 0"
+                if values[first] == 0
+                else f"deviates from its neighbours by {size:.4g} for a moment"
+            )
             times = listed_times(signals.trajectory.t[rows])
-            return f"{name} that {what} for a moment, in {counted(len(rows), 'sample')}, at t = {times}"
+            return f"{name} that {what}, in {counted(len(rows), 'sample')}, at t = {times}"
     return None
 
 

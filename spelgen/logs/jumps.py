@@ -43,7 +43,7 @@ def is_lost(values: np.ndarray) -> np.ndarray:
     lost = np.zeros(len(values), bool)
     logged = np.flatnonzero(values)
     if not logged.size or logged[-1] - logged[0] == len(logged) - 1:
-        return lost  # zeros occur only at the ends, at which the arm may have been at rest
+        return lost  # All zeros are at the ends of the signal, where the arm may have been at rest.
     steps = np.abs(np.diff(values[logged]))
     # a continuous signal that passes through 0 has samples close to 0 before and after
     nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))
@@ -62,6 +62,18 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         return outliers
     steps = np.diff(values)
     sizes = np.abs(steps)
+    logged = np.flatnonzero(values)
+    # positions do not jump to 0 before the first or after the last sample; torques and velocities may
+    for end, rows in (
+        (logged[:1], slice(0, logged[:1].sum())),
+        (logged[-1:], slice(logged[-1:].sum() + 1, None)),
+    ):
+        if (
+            smooth
+            and len(logged) > TUNING.jump_window
+            and np.abs(values[end]).max() > TUNING.jump * _usual(sizes)
+        ):
+            outliers[rows] = True
     is_jump = sizes > TUNING.jump * _usual(sizes)
     # a signal in which more than 5 % of the steps are large is noisy: its large steps are no outliers
     if not is_jump.any() or is_jump.mean() > 0.05:
@@ -127,10 +139,10 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
-    positions: number of leading columns that are positions. A block of k equal rows consists of repeats if the arm
-    moved meanwhile: then the step at its end is as large as k steps of the motion that follows. Equal rows of an arm at
-    rest are no repeats, with one exception: if the rows during motion occur m times each, the logger writes each row m
-    times, and only every m-th of the rows at rest is kept.
+    A block of k equal rows consists of repeats if the arm moved during the block: the step at the end of the block is
+    then as large as k steps of the following motion. Equal rows of an arm at rest are no repeats, with one exception:
+    if each row during motion occurs m times, the logger writes each row m times, and of the rows at rest only every
+    m-th one is no repeat. positions: number of leading columns that are positions.
     """
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
     lengths = np.diff(np.append(starts, len(columns)))

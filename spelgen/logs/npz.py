@@ -112,7 +112,8 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
         # an array may have two dimensions only if the layout refers to its elements, such as q[0], and not to itself
         if shape[:1] != samples or len(shape) > 1 + (name not in layout.columns):
             expected = f"a value for each of the {samples[0] if samples else 0} times"
-            raise arrays.error(name, f"an array of shape {shape}", expected)
+            do = "resample it to these times"
+            raise arrays.error(name, f"an array of shape {shape}", expected, do)
     return layout, pa.table({name: arrays.column(name) for name in columns})
 
 

@@ -12,7 +12,7 @@ from spelgen.logs.jumps import centred, is_outlier, is_stale, jump_count, repeat
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import TUNING
-from spelgen.logs.values import foreign_rows
+from spelgen.logs.values import foreign_rows, is_split
 from spelgen.settings.log_mapping import LogMapping
 
 Repaired = tuple[np.ndarray, tuple[str, ...]]
@@ -23,8 +23,8 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     """Return the trajectory of the rows `data` (T, C) in SI units, whose columns the layout describes.
 
     First wrapped angles and overflowed registers are unwrapped, and repeated rows are removed; with the setting
-    'dropouts: dropped' lost rows and outliers are removed, too. Velocities that were not logged are then computed by
-    differentiation, and torques are shifted by the mapping's delay. repairs: messages about earlier changes of rows.
+    'dropouts: dropped' lost rows and outliers are removed, too. Then the signals are shifted by the mapping's delays,
+    and velocities that were not logged are computed by differentiation. repairs: messages about changed rows.
     """
     mapping = layout.mapping
     signals = mapping.signals(layout.joints)
@@ -34,14 +34,15 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     if mapping.dropouts == "dropped":
         data, dropped = _without_outliers(data, signals)
         repairs += dropped
+    data = _without_delays(data, signals, mapping)
     t, *columns = np.split(data, [1 + len(layout.joints) * k for k in range(len(mapping.quantities))], axis=1)
     t, logged = t[:, 0], dict(zip(mapping.quantities, columns, strict=True))
     q = logged["q"]
     qd = logged.get("qd", np.zeros_like(q))
     if "qd" not in logged:
         for rows in _pieces(t):
-            qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # central differences
-    tau = earlier(t, logged.get("tau", np.zeros((len(t), 0))), mapping.torque_delay)
+            qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # qd is the central difference of q
+    tau = logged.get("tau", np.zeros((len(t), 0)))
     return Trajectory(
         t, q, qd, tau, name, layout.file, layout.accepted, logged.get("u"), repairs, layout.remarks + wraps, mapping
     )  # fmt: skip
@@ -121,6 +122,24 @@ def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> R
     return data[~outliers], (message,)
 
 
+def _without_delays(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> np.ndarray:
+    """Return rows (T, C) in which the signals are shifted back by their delays in the mapping.
+
+    Rows near the ends of a gap-free piece, for which a delayed signal was not logged, are removed.
+    """
+    delays = np.array([mapping.delay(*signal) for signal in signals])
+    if not delays.any():
+        return data
+    t, moved = data[:, 0], data.copy()
+    for column in np.flatnonzero(delays):
+        moved[:, [1 + column]] = earlier(t, data[:, [1 + column]], delays[column])
+    kept = np.zeros(len(t), bool)
+    for rows in _pieces(t):
+        first, last = t[rows][0] - delays.min(initial=0.0), t[rows][-1] - delays.max(initial=0.0)
+        kept[rows] = (t[rows] >= first - TUNING.shortest_step) & (t[rows] <= last + TUNING.shortest_step)
+    return moved[kept]
+
+
 def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau".
 
@@ -139,7 +158,7 @@ def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, 
     if quantity == "tau":
         stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
         return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
-    from scipy.integrate import cumulative_trapezoid  # takes long to import
+    from scipy.integrate import cumulative_trapezoid  # imported only if needed, since the import takes long
 
     # if q or qd is frozen, the integral of qd drifts from q; a drift of more than 0.05 rad or m is evidence
     return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)
@@ -157,12 +176,15 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
 
     Rows are sorted by time if this makes the positions smoother. Of several rows with equal times the first is kept; if
     the resolution of the clock is too low for the rows, evenly spaced times are reconstructed instead. Rows of another
-    topic or publisher are removed.
+    topic or publisher are removed, and signals in separate rows are joined.
 
     data: (T, C) values in SI units. rows: (T,) row numbers in the file, for errors. Raises LogError for a clock that
     restarts, and for times that cannot be reconstructed.
     """
     repairs: tuple[str, ...] = ()
+    if is_split(data):
+        data, repairs = _joined_rows(data, layout)
+        rows = np.arange(len(data))
     foreign = foreign_rows(data, len(layout.joints))
     if foreign.any():
         data, rows = data[~foreign], np.asarray(rows)[~foreign]
@@ -193,6 +215,37 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
         data = data[~is_repeat]
         repairs += (f"{repeats} rows with the time of the row before were left out",)
     return data, repairs
+
+
+def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:
+    """Return the rows (T, C) of the rarest signal, with all other signals at their times, and a message.
+
+    If these rows are complete, the others are left out. Otherwise the other signals are interpolated between their own
+    samples; rows beyond the first or last sample of a signal, or within a gap of it, are left out.
+    """
+    finite = np.isfinite(data)
+    base = finite[:, 1 + int(finite[:, 1:].sum(axis=0).argmin())]
+    complete = finite.all(axis=1)
+    if complete.sum() > 0.9 * base.sum():
+        message = f"{counted(int((~complete).sum()), 'row')} without all signals left out: signals have different rates"
+        return data[complete], (message,)
+    data = data[np.argsort(data[:, 0], kind="stable")]
+    finite = np.isfinite(data)
+    base = finite[:, 1 + int(finite[:, 1:].sum(axis=0).argmin())]
+    joined, mapping = data[base], layout.mapping
+    times = joined[:, 0]
+    for k, signal in enumerate(mapping.signals(layout.joints), start=1):
+        rows = finite[:, k]
+        t, values = data[rows, 0], data[rows, k]
+        period = abs(mapping.scale(*signal)) * (mapping.word("period", *signal) or 0.0)
+        if period:  # an angle between two samples before and after a wrap is not between their values
+            values = unwrapped(values, period)
+        joined[:, k] = np.interp(times, t, values, left=np.nan, right=np.nan)
+        after = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
+        gaps = (t[after] - t[after - 1] > TUNING.gap * np.median(np.diff(t))) & ~np.isin(times, t)
+        joined[gaps, k] = np.nan
+    message = "signals in separate rows or messages: interpolated at the times of the rarest one"
+    return joined[np.isfinite(joined).all(axis=1)], (message,)
 
 
 def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:

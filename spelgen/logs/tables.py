@@ -18,7 +18,7 @@ from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
 UNITS_KEY = b"units"  # key in the metadata of a Parquet file under which it declares its units
-UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # checks of units
+UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # codes of the checks of units
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # declaration of units in files that spelgen wrote
 
 # types of the errors that Arrow, NumPy and zipfile raise for damaged files

@@ -70,7 +70,7 @@ class Trajectory:
                 raise self.error(f"an array of shape {shape}", expected, column=column)
         for column in columns:
             values, largest = self.column(column), TUNING.latest if column == "t" else TUNING.largest_value
-            possible = np.abs(values) < largest  # False for NaN
+            possible = np.abs(values) < largest  # NaN is not possible: comparisons with NaN are False
             if not possible.all():
                 row = int(np.argwhere(~possible)[0, 0])
                 is_finite = np.isfinite(values[row]).all()
@@ -260,7 +260,7 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
     # the first row has the command that was held at the earliest delayed time
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
-    previous = np.concatenate([u[:1], u[:-1]])  # the command held until each sample
+    previous = np.concatenate([u[:1], u[:-1]])  # the command that acts until each sample
     # [s] The first command is assumed to have been held for a long time before the recording.
     corners = np.concatenate([t[:1] - 1e3, t])
     integral = np.zeros((len(t) + 1, u.shape[1]))

@@ -50,6 +50,8 @@ class SignalCheckTuning:
     # [1] Number of samples over which the changes of q and of the integral of qd are compared. Between neighbouring
     # samples the quantisation step of q may be larger than the change of q.
     increments: int = 10
+    # [s] Delay of velocities relative to positions from which it is reported; filters of drives have shorter ones.
+    longest_lag: float = 0.03
     # [s] Smallest plausible median time between samples: no arm is sampled above 10 kHz.
     fastest_step: float = 1e-4
     # [s] Largest plausible median time between samples: no arm is sampled below 2 Hz.

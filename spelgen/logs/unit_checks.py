@@ -16,7 +16,7 @@ import numpy as np
 from spelgen.logs.joint_signals import Advice, JointSignals
 from spelgen.logs.jumps import held_samples
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.logs.tuning import SIGNALS, shows_accelerations
+from spelgen.logs.tuning import SIGNALS, TUNING, shows_accelerations
 from spelgen.settings.log_mapping import SCALES, TIMES
 
 TURNS = 4 * np.pi  # [rad] largest range of a joint with limits: a larger range of q shows another unit
@@ -137,8 +137,16 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     # times in a wrong unit also make dq/dt wrong; the check of times reports this cause
     if signals.step > SIGNALS.slowest_step:
         return None
-    if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
+    if np.isnan(correlation):
         return None
+    if correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance:
+        lag = _velocity_lag(signals)
+        if abs(lag) < SIGNALS.longest_lag:
+            return None
+        order = "later" if lag > 0 else "earlier"
+        return Advice(
+            f"qd that is {1e3 * abs(lag):.3g} ms {order} than dq/dt", keys={"velocity": "differentiated"}
+        )
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
         # The increments are too few for advice: two samples always have a correlation of 1 or -1.
@@ -157,6 +165,44 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         columns = {"q": mapping.column("qd", signals.joint), "qd": mapping.column("q", signals.joint)}
         return Advice(f"{message}; q is the derivative of qd", {"columns": columns})
     return message
+
+
+def _velocity_lag(signals: JointSignals) -> float:
+    """Return the delay [s] of a joint's velocity relative to dq/dt, by least squares; 0 if it is not visible.
+
+    The integral of a delayed velocity differs from q by minus the delay times the velocity, and by a slow drift.
+    """
+    from scipy.integrate import cumulative_trapezoid
+
+    piece = max(split_at_gaps(signals.trajectory), key=len)
+    t, q, qd = piece.t, piece.q[:, signals.number], piece.qd[:, signals.number]
+    if signals.trajectory.mapping.velocity == "differentiated" or len(t) < 100:
+        return 0.0
+    drift = np.stack([np.ones_like(t), t, t**2], axis=1)
+    columns = np.stack([qd, q - cumulative_trapezoid(qd, t, initial=0)], axis=1)
+    speed, difference = (columns - drift @ np.linalg.lstsq(drift, columns, rcond=None)[0]).T
+    power = float(speed @ speed)
+    lag = float(speed @ difference) / power if power else 0.0
+    residual = difference - lag * speed
+    # integrated noise drifts, too: the lag must explain most of the difference
+    return lag if residual @ residual < 0.25 * difference @ difference else 0.0
+
+
+def find_copied(signals: JointSignals) -> str | None:
+    """Find torques that are proportional to the torque of another joint without any noise: one column is a copy."""
+    trajectory, k = signals.trajectory, signals.number
+    if not trajectory.tau.size or np.ptp(trajectory.tau[:, k]) == 0 or len(signals.q) < TUNING.jump_window:
+        return None
+    centred = trajectory.tau - trajectory.tau.mean(axis=0)
+    lengths = np.linalg.norm(centred, axis=0)
+    correlations = np.abs(centred[:, k] @ centred) / np.where(lengths > 0, lengths[k] * lengths, np.inf)
+    correlations[k] = 0.0
+    # noise of two sensors of 18 bits would lower the correlation by 1e-11
+    copies = np.flatnonzero(correlations > 1 - 1e-12)
+    if not copies.size:
+        return None
+    other = signals.joints[copies[0]]
+    return f"tau that is proportional to the torque of joint {other!r}, without noise: one column is a copy"
 
 
 def find_held(signals: JointSignals) -> str | None:

@@ -1,5 +1,6 @@
 """Conversion of logged columns to numbers in SI units, with the URDF's signs."""
 
+import re
 from collections.abc import Sequence
 from itertools import starmap
 from typing import TypeAlias
@@ -14,6 +15,8 @@ from spelgen.logs.tables import Layout, list_element
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import TIMES
 
+NUMBER = r"[+-]?\d+(?:[.,]\d*)?(?:[eE][+-]?\d+)?"
+
 Rows: TypeAlias = "Sequence[int] | np.ndarray"
 Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 
@@ -21,7 +24,8 @@ Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows: Rows) -> np.ndarray:
     """Return the columns of a layout as numbers (T, C) in SI units.
 
-    Rows of another topic or publisher (see `foreign_rows`) contain NaN. Raises LogError, with row and column, for
+    Rows of another topic or publisher (see `foreign_rows`) and rows of a log whose signals are in separate rows (see
+    `is_split`) contain NaN. Raises LogError, with row and column, for
     values that are not numbers, and for values beyond the range of any arm.
 
     Args:
@@ -48,8 +52,10 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
     largest = np.array([TUNING.latest, *[TUNING.largest_value] * len(signals)])
     foreign = foreign_rows(data, len(layout.joints))
-    bad = ~(np.abs(data) < largest)  # NaN included
-    if not foreign.all():
+    bad = ~(np.abs(data) < largest)  # NaN is bad, too: a comparison with NaN is False
+    if is_split(data):
+        bad[:, 1:] &= ~np.isnan(data[:, 1:])
+    elif not foreign.all():
         bad &= ~foreign[:, None]
     if bad.any():
         first, k = np.argwhere(bad)[0]
@@ -59,8 +65,6 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         if not np.isfinite(value):
             got, expected = f"no finite number ({count} gap", "a number"
             do = "remove those rows; a gap in t is understood"
-            if foreign.all():
-                do = "no row has all quantities: log them together, or resample them to the same times"
         raise layout.row_error(f"{got}, this is the first)", rows[first], layout.columns[k], expected, do)
     return data
 
@@ -72,6 +76,15 @@ def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
     """
     empty = np.isnan(data[:, 1 + joints :])
     return np.asarray(empty.all(axis=1))
+
+
+def is_split(data: np.ndarray) -> bool:
+    """Return True if signals of a log (T, 1 + C) are in separate rows: at most half of the rows have the rarest signal.
+
+    Topics of different rates, or joints in different messages, have such rows.
+    """
+    rarest = int(np.isfinite(data[:, 1:]).sum(axis=0).min(initial=len(data)))
+    return TUNING.jump_window <= rarest <= len(data) / 2
 
 
 def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
@@ -95,6 +108,10 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
     """
     name = layout.columns[0]
     times = _column(table, name)
+    if pa.types.is_string(times.type) or pa.types.is_large_string(times.type):
+        nanoseconds = _nanoseconds(times)
+        if nanoseconds is not None:
+            return nanoseconds, TIMES["ns"]
     if not pa.types.is_temporal(times.type):
         return times, TIMES[layout.mapping.units.t]
     counted: pa.DataType = pa.timestamp("ns")
@@ -109,6 +126,40 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
             f"dates beyond what nanoseconds count ({times.type})", file=layout.file, element=f"column {name}",
             expected="years from 1678 to 2262", do="check the unit of the stamps",
         ) from error  # fmt: skip
+
+
+def _nanoseconds(texts: Column) -> pa.Array | None:
+    """Return times [ns] from texts of a clock ("10:00:00.123", also with a date) or with a unit ("10 ms").
+
+    Times of day that start again at midnight continue. Returns None for other texts.
+    """
+    texts = pa.compute.utf8_trim_whitespace(pa.compute.replace_substring(texts.cast(pa.string()), "µ", "u"))
+    first = next((x for x in texts.slice(0, 1).to_pylist() if x), "")
+    if re.fullmatch(rf"{NUMBER} ?({'|'.join(TIMES)})", first):
+        parts = pa.compute.extract_regex(texts, rf"^(?P<number>{NUMBER}) ?(?P<unit>[mun]?s)$")
+        numbers, units = (pa.compute.struct_field(parts, name) for name in ("number", "unit"))
+        factors = [TIMES.get(unit, np.nan) for unit in units.to_pylist()]
+        return pa.array(_numbers(numbers) * factors / TIMES["ns"])
+    clock = r"^(?P<date>\d{4}-\d\d-\d\d[T ])?(?:(?P<h>\d+):)?(?P<m>\d+):(?P<s>\d+(?:[.,]\d*)?)$"
+    if not re.match(clock, first):
+        return None
+    parts = pa.compute.extract_regex(texts, clock)
+    hours, minutes, seconds = (_numbers(pa.compute.struct_field(parts, name)) for name in "hms")
+    times = 3600 * np.nan_to_num(hours) + 60 * minutes + seconds
+    dates = pa.compute.struct_field(parts, "date").to_numpy(zero_copy_only=False)
+    if dates[0]:
+        days = np.array([x[:10] if x else "NaT" for x in dates], dtype="datetime64[D]")
+        times = times + 86400 * days.astype(float)
+    else:
+        times = times + 86400 * np.cumsum(np.diff(times, prepend=times[:1]) < -43200)
+    return pa.array(times / TIMES["ns"])
+
+
+def _numbers(texts: Column) -> np.ndarray:
+    """Return the numbers in texts (T,), with a decimal point or comma; NaN for an empty text or null."""
+    texts = pa.compute.replace_substring(texts, ",", ".")
+    texts = pa.compute.if_else(pa.compute.equal(texts, ""), None, texts)
+    return np.asarray(texts.cast(pa.float64()).to_numpy(zero_copy_only=False))
 
 
 def _column(table: pa.Table, name: str) -> Column:
@@ -146,7 +197,12 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
         for index, text in enumerate(texts):
             if text and not is_number(text):
-                raise layout.row_error(repr(text[:60]), rows[index], name, "a number") from error
+                do = "remove that row"
+                if text.strip() == name:
+                    do += ", the header of a second file; joined recordings need a column 'trajectory'"
+                elif re.match(NUMBER, text):
+                    do = "write numbers only, and the unit as 'units' under 'logs' in the robot's YAML"
+                raise layout.row_error(repr(text[:60]), rows[index], name, "a number", do) from error
         got = f"values of type {values.type}"
         raise LogError(got, file=layout.file, element=f"column {name}", expected="numbers") from error
 

@@ -62,7 +62,7 @@ def inspection_page(
 def identification_page(identification: Identification, arm: Arm) -> str:
     """Return the page about an identification: base parameters with intervals, the arm, and the torque residual."""
     record: Content = identification.to_dict()
-    # The page shows the JSON form, which is the public interface.
+    # The page is made from the content of the JSON output, so that both agree.
     words = [parameter["determined"] for parameter in record["base_parameters"]]
     never = [name for name, visibility in record["identifiability"].items() if visibility == "never"]
     return render_page(
@@ -84,7 +84,7 @@ def identification_page(identification: Identification, arm: Arm) -> str:
 def motion_page(excitation: Excitation, arm: Arm) -> str:
     """Return the page about a proposed motion of `arm`, including the approach to its first position."""
     motion = excitation.approach.then(excitation.motion)
-    # The motion has twice the points of a chart, because the animation uses the same arrays.
+    # The motion has up to twice the points of a chart's line, because the animation uses the same arrays.
     step = -(-len(motion.t) // (2 * TUNING.points))  # rounded up
     t, q, qd = (x[::step] for x in (motion.t, motion.q, motion.qd))
     drawn = AnimatedMotion("motion", "approach and motion", t.round(3), q.round(4))

@@ -24,7 +24,10 @@ from spelgen.templates import json_data
 
 @dataclass(frozen=True)
 class Cell:
-    """Cell of the table of M. style: zero, constant or varying. joints: indices of the joints it depends on."""
+    """Cell of the table of M, for one entry of M.
+
+    style: zero, constant or varying. joints: indices of the joints on whose positions the entry depends.
+    """
 
     style: str
     text: str
@@ -50,7 +53,11 @@ class AnimatedMotion:
 
 @dataclass(frozen=True)
 class AnimatedArm:
-    """The animated picture of an arm. data: JSON for the script. motions: their labels. tubes: see ``Scene``."""
+    """The animated picture of an arm.
+
+    data: JSON for the script. motions: labels of the motions to choose from. tubes: sentence about links without
+    meshes, which are drawn as tubes.
+    """
 
     data: Markup
     motions: tuple[str, ...]

@@ -156,7 +156,7 @@ class Band:
         return np.concatenate([_floats(self.low), _floats(self.high)])
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the SVG path of the outline, clipped to the axis; values that are not finite count as infinite."""
+        """Return the SVG path of the outline, clipped to the axis; NaN is drawn as infinity."""
         # A diverged prediction may have an infinite upper quantile and a finite lower quantile.
         low, high = (np.nan_to_num(_floats(y), nan=np.inf) for y in (self.low, self.high))
         # The outline follows the lower curve, then the upper curve backwards.
@@ -281,7 +281,11 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
 
 
 def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Return ticks (K,) and labels at powers of ten; if fewer than three fit, also at 2 and 5 times, else `_steps`."""
+    """Return ticks (K,) and labels of a logarithmic axis at powers of ten.
+
+    If there are fewer than three, 2 and 5 times powers of ten are added; if there are still fewer than three, the ticks
+    are chosen as on a linear axis (`_steps`).
+    """
     # The tolerance includes a power of ten at the end of the axis despite rounding.
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
     powers = range(first, last + 1, max(1, (last - first) // 5 + 1))

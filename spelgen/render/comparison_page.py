@@ -25,7 +25,10 @@ STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 
 @dataclass(frozen=True)
 class SimulatedCurves:
-    """Curves of a simulated arm: of the first run of each preset only, as curves of several seeds would overlap."""
+    """Charts of a simulated arm: validation losses, predictions, and entries of M.
+
+    They show only the first run of each preset, as lines of several seeds would overlap.
+    """
 
     losses: Chart
     prediction: list[Panel]
@@ -55,7 +58,7 @@ def write_comparison(study: Study, sections: Sequence[ArmResults]) -> Path:
 
 
 def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -> SimulatedCurves:
-    """Return the curves of one arm. truth: URDF of the simulated arm."""
+    """Return the charts of one simulated arm. truth: URDF of the simulated arm."""
     first: dict[str, SimulatedFigures] = {}
     for result in section.results:
         if result.simulated is not None:

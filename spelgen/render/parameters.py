@@ -80,7 +80,7 @@ def base_table(
     parameters = identified["base_parameters"]
     names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
     nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
-    # A URDF has no friction and drive parameters of this form, and may have no inertials: these cells are empty.
+    # A URDF has no parameters of this friction model and of drives, and may have no inertials: their cells are empty.
     nominal[base.bodies :] = np.nan
     if not arm.chain.inertials_complete:
         nominal[:] = np.nan
@@ -97,7 +97,8 @@ def base_table(
             "squares has no column for"
         )
     elif isinstance(model, RigidBodyDynamics):
-        # For every friction model the first columns are bodies and armatures, which the trained model has too.
+        # For every friction model the first columns of the regressor belong to inertial parameters and armatures,
+        # which the trained model has, too.
         common = np.concatenate([body_parameters(model).ravel(), model.armature.detach().numpy()])
         learned = base.combination[:, : len(common)] @ common
         for k in range(base.bodies, len(names)):
@@ -176,7 +177,8 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
     columns = {"joint": list(model.joint_names)}
     note = "Viscous and Coulomb friction are fitted to the model's friction law."
     if posterior is not None:
-        # The posterior has intervals. Without a posterior, the table has the nearest friction model, without intervals.
+        # The posterior has friction parameters with intervals. Without a posterior, the friction of the model is
+        # approximated by viscous and Coulomb friction, without intervals.
         columns |= posterior.drive_columns
         note += " Intervals are of 95 %."
     else:
@@ -202,7 +204,8 @@ def _with_units(values: Sequence[float] | np.ndarray, units: Sequence[str]) -> l
 def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]) -> Listing:
     """Return the table of the learned constants of M, with the entries of M that contain each constant."""
     count = len(mass.raw_constants)
-    # dM / d constant (constants, n, n) does not depend on q, because M is linear in its functions and constants.
+    # M is a linear combination of learned functions of q and of learned constants, so dM / d constant,
+    # (constants, n, n), does not depend on q.
     functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
     # M for a unit vector of constants is the basis matrix of that constant.
     zeros = torch.zeros(functions, count, dtype=torch.float64)

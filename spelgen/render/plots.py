@@ -53,9 +53,9 @@ class Panel:
 class JointRow:
     """A row of charts, one per joint.
 
-    axis: label of the y axis. quantity: position, velocity or torque, for the unit of the y axis; "": no unit.
-    columns: label, values (T, n) and style of each curve. height: height of a chart [pixels], without the numbers of
-    the time axis.
+    axis: label of the y axis. quantity: position, velocity or torque, for the unit of the y axis; "": no unit. columns:
+    label, values (T, n) and CSS class of each curve; the chart of joint k shows column k of the values. height: height
+    of a chart [pixels], without the numbers of the time axis.
     """
 
     title: str
@@ -74,7 +74,7 @@ def stacks(
         t: Times, (T,) [s].
         rows: The charts of a column, from top to bottom.
         joints: Names and units of the joints.
-        motion: See `line_chart`.
+        motion: Name of the animated motion with the same time axis.
     """
     panels = []
     for k, joint in enumerate(joints):
@@ -149,7 +149,7 @@ def trajectory_panels(
         predictions: Name of a line -> prediction; all predictions are of the same motion.
         styles: Name of a line -> CSS class.
         joints: Names and units of the joints.
-        motion: See `line_chart`.
+        motion: Name of the animated motion with the same time axis.
     """
     measured = next(iter(predictions.values()))
     # A replayed log of position servos has no velocities.

@@ -68,7 +68,10 @@ def report_data(folder: Path | str) -> Content:
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
-    """Return the page about a run as HTML; the same run gives the same text. robot: see ``write_report``."""
+    """Return the page about a run as HTML; the same run gives the same text.
+
+    robot: URDF with its meshes, for the picture of the arm; default: the URDF in the run folder.
+    """
     folder = Path(folder)
     if not RunFolder(folder).path.is_dir():
         expected = "a folder with spec.json"

@@ -24,7 +24,7 @@ from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import MODEL, counted, share
-from spelgen.listing import number
+from spelgen.listing import duration, number
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.charts import TUNING
 from spelgen.runtime.residual_terms import ResidualDynamics
@@ -112,7 +112,7 @@ def head_numbers(run: Run) -> list[tuple[str, str]]:
     elif run.model is not None:
         numbers.append((f"{used_parameter_count(run.model):,}", "trained parameters"))
     for last in run.metrics[-1:]:
-        numbers.append((_duration(last["seconds"]), f"of training, {last['step']:,} steps"))
+        numbers.append((duration(last["seconds"]), f"of training, {last['step']:,} steps"))
     return numbers
 
 
@@ -156,7 +156,7 @@ def training_facts(run: Run, record: Record) -> dict[str, str]:
     if run.metrics:
         last, best = run.metrics[-1], best_epoch(run.metrics)
         origin = f"epoch {best}" if best else "the start: no epoch was better"
-        facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
+        facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         if record.options.get("solver", "rk4") == "rk4":
             facts["integrator"] = f"rk4, {counted(last['substeps'], 'step')} between samples"
@@ -177,14 +177,6 @@ def settings(record: Record) -> dict[str, str]:
 def _names(trajectories: Sequence[str]) -> str:
     count = counted(len(trajectories), "trajectory")
     return f"{count}: {shortened(trajectories, 5)}" if trajectories else "none"
-
-
-def _duration(seconds: float) -> str:
-    # Times have at most three digits, since training times vary by more than that.
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    minutes = seconds / 60
-    return f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
 
 
 def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str]:

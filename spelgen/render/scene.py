@@ -111,7 +111,11 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
-    """Return the links of the chain of `joints` and all links fixed to or carried by the chain, parents first."""
+    """Return the names of the drawn links, parents first.
+
+    Drawn are the links from the root to each of the `joints`, all links that move with the joints, and links that are
+    fixed to another drawn link.
+    """
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
     carried: set[str] = set()
     visible = [robot.root]

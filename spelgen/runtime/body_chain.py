@@ -13,7 +13,10 @@ from spelgen.runtime.rows import Joint, Link, vector
 
 
 class ChainConfiguration(NamedTuple):
-    """Configuration cache of a ``BodyChain``: quantities at q of four mass points per body."""
+    """Configuration cache of a ``BodyChain``: quantities at q, in the base frame.
+
+    Each body is represented by four point masses.
+    """
 
     place: Tensor  # positions [m] times square roots of the masses, (..., 3, bodies, 4)
     mass: Tensor  # square roots of the masses, (..., 1, bodies, 4)
@@ -21,7 +24,9 @@ class ChainConfiguration(NamedTuple):
     # Derivatives of the points' coordinates, times square roots of the masses, with respect to the
     # displacement of each body's own joint, (..., bodies, 12 bodies): 3 coordinates of 4 points per body.
     jacobian: Tensor
-    weight: Tensor  # -gravity times square roots of the masses, (..., 12 bodies)
+    # Upward acceleration that is equivalent to gravity, times square roots of the masses, for each
+    # coordinate of each point, (..., 12 bodies).
+    weight: Tensor
 
 
 class BodyChain(nn.Module):
@@ -51,8 +56,8 @@ class BodyChain(nn.Module):
         # The displacements of all bodies are ratios q + offset; ratios: (bodies, n), offset: (bodies,).
         self.ratios = nn.Buffer(vector(ratio).unsqueeze(-1) * torch.eye(n)[list(joint)])
         self.offset, self.turns = nn.Buffer(vector(offset)), nn.Buffer(turns)
-        # Rodrigues' formula for the 4 x 4 transform of a joint, whose generator is the matrix `rate`: a
-        # rotation by x is 1 + sin(x) rate + (1 - cos(x)) rate^2, a translation by x is 1 + x rate.
+        # Rodrigues' formula for the 4 x 4 transform of a joint, with the identity matrix I and the generator
+        # `rate`: a rotation by x is I + sin(x) rate + (1 - cos(x)) rate^2, a translation is I + x rate.
         start, rate = torch.eye(4).double().repeat(count, 1, 1), torch.zeros(count, 4, 4).double()
         start[:, :3] = torch.tensor(placement, dtype=torch.float64)
         rate[:, 1, 0], rate[:, 0, 1], rate[:, 2, 3] = turns, -turns, 1 - turns
@@ -136,7 +141,7 @@ class BodyChain(nn.Module):
         return torch.addcmul(turned, u, cache.mass).flatten(-3) + cache.weight
 
     def kinetic_gradient(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
-        """Return d/dq of the kinetic energy, (..., n) [Nm, N], at the velocity qd, (..., n)."""
+        """Return the gradient of 1/2 qd^T M(q) qd with respect to q at constant qd, (..., n) [Nm, N]."""
         velocity, _, turning = self.motion(cache, qd)
         # Angular momentum of the points about the origin of the base, and linear momentum.
         momenta = [torch.linalg.cross(cache.place, velocity, dim=-3), cache.mass * velocity]
@@ -166,9 +171,10 @@ def chain_of_links(joints: Sequence[Joint], links: Sequence[Link], gravity: Row)
 
 
 def body_factor(parameters: Tensor) -> Tensor:
-    """Return the upper triangular matrix T of ``InertialParameters``, (..., 4, 4).
+    """Return the upper triangular matrix T, (..., 4, 4), of log-Cholesky parameters.
 
-    parameters: log-Cholesky parameters, (..., 4, 4), each at the place of its entry of T.
+    The pseudo-inertia of a body is C T T^T C^T, where C C^T is the pseudo-inertia of the given link (see
+    ``InertialParameters``). parameters: (..., 4, 4), each parameter at the place of its entry of T.
     """
     logarithms = parameters.diagonal(dim1=-2, dim2=-1)
     sizes, mass = logarithms[..., :3], logarithms[..., 3:] / 2
@@ -177,7 +183,11 @@ def body_factor(parameters: Tensor) -> Tensor:
 
 
 def pseudo_inertia(link: Link) -> Tensor:
-    """Return [[S, m c], [(m c)^T, m]], (4, 4), in the joint's frame, with S = tr(I)/2 1 - I + m c c^T."""
+    """Return the pseudo-inertia [[S, m c], [(m c)^T, m]] of a link in the joint's frame, (4, 4).
+
+    m: mass; c: center of mass; I: inertia tensor about c. S = tr(I)/2 1 - I + m c c^T has the second
+    moments of mass.
+    """
     xx, xy, xz, yy, yz, zz = link.inertia
     inertia = torch.tensor([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=torch.float64)
     center = torch.tensor([*link.center_of_mass, 1.0], dtype=torch.float64)
@@ -211,5 +221,8 @@ class InertialParameters(nn.Module):
         self.raw = nn.Parameter(torch.zeros(len(links), 10, dtype=torch.float64))
 
     def forward(self) -> Tensor:
-        """Return C T of each body, (bodies, 4, 4): four point masses with the body's inertia, as columns."""
+        """Return four point masses with the inertia of each body, the columns of C T, (bodies, 4, 4).
+
+        A column is (position, 1) * sqrt(mass).
+        """
         return self.factors @ body_factor(torch.unflatten(self.raw @ self.triangle, -1, (4, 4)))

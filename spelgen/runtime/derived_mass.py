@@ -1,8 +1,8 @@
 """Mass matrices M(q) from functions and constants: M = sum_j f_j(q) B_j + sum_k c_k A_k + armature.
 
 The matrices B_j and A_k are derived from the structure of the arm, with the minimum number of functions
-and constants. Other classes have a constant M, or an M^-1(q) over three axes per joint without any
-structure.
+and constants (``DerivedMass``). M of ``ConstantMass`` does not depend on q. ``DenseMass`` uses no
+structure: all entries of M are functions of the positions of all joints.
 """
 
 import math
@@ -45,7 +45,8 @@ class LinearMass(nn.Module):
             self.function_scale = nn.Buffer(vector(f.scale for f in functions))
         self.raw_constants = nn.Parameter(vector(x.initial / x.scale for x in constants))
         self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
-        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # log(ratio to nominal)
+        # Logarithm of armature / nominal armature.
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))
 
     def armature(self) -> Tensor:
         """Return the rotor inertia on the joint side, part of the diagonal of M, (n,) [kg m^2, kg]."""
@@ -71,7 +72,10 @@ class ConstantMass(LinearMass):
         return self.entries(*self.constants().unbind()) + torch.diag(self.armature())
 
     def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return M, (..., n, n), and the encoding, (..., 2 n), which gives zero derivatives their shape."""
+        """Return M, (..., n, n), and the encoding, (..., 2 n).
+
+        The encoding is in place of intermediate values: the derivatives, which are zero, have its shape.
+        """
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Tensor) -> Tensor:
@@ -87,12 +91,12 @@ class ConstantMass(LinearMass):
 class DerivedMass(LinearMass):
     """A mass matrix linear in learned functions: M(q) = ``entries(*functions, *constants)`` + armature.
 
-    The result is positive definite for all q and all parameters. C is the nominal mean of M. M is
-    replaced by M' = C + t (M - C) if M - margin C is not positive definite, where t is the largest of
-    1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin, and |X| is an upper bound of the spectral norm of
-    L^-1 X L^-T, with C = L L^T. Since t is piecewise constant, the derivatives of M' are t times the
-    derivatives of M. C has the same zeros and linear relations between entries as M, so M' has them,
-    too.
+    The result is positive definite for all q and all parameters. C is the nominal mean of M. If
+    M - margin C is not positive definite, M is replaced by M' = C + t (M - C). The factor t is the
+    largest of 1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin. The norm |X| is an upper bound of the
+    spectral norm of L^-1 X L^-T, with C = L L^T. Since t is piecewise constant, the derivatives of M'
+    are t times the derivatives of M. The zeros of M and the linear relations between entries of M are
+    valid for C, and therefore for M', too.
     """
 
     def __init__(
@@ -113,9 +117,9 @@ class DerivedMass(LinearMass):
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # Factors on the entries of M - C: the Frobenius norm of the product is |M - C| / (1 - margin).
-        # It is an upper bound of the spectral norm, since the smallest eigenvalue of C with a diagonal
-        # scaled to one is `eigenvalue`.
+        # Entries of X = M - C are multiplied by `unit`; the Frobenius norm of the product is
+        # |X| / (1 - margin). |X| bounds the spectral norm of L^-1 X L^-T: D = diag(C)^(-1/2) scales the
+        # diagonal of C to one, and `eigenvalue` is the smallest eigenvalue of D C D.
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
@@ -134,7 +138,7 @@ class DerivedMass(LinearMass):
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
-        """Return M'(q), (..., n, n), and the intermediates of the network and t, for derivatives."""
+        """Return M'(q), (..., n, n), and for derivatives the intermediate values of the network and t."""
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
         fraction = self.fraction(mass.detach())
@@ -157,7 +161,7 @@ class DerivedMass(LinearMass):
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
     def jvp(self, rate: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return dM/dt, (..., n, n), for this rate of the encoding."""
+        """Return dM/dt, (..., n, n), for `rate`, the time derivative of the encoding, (..., 2 n)."""
         network, fraction = intermediates
         rows = fraction.unsqueeze(-1) * self.network.jvp(network, rate)
         return rows.reshape(*rows.shape[:-1], *self.center.shape)
@@ -166,8 +170,8 @@ class DerivedMass(LinearMass):
 class DenseIntermediates(NamedTuple):
     """Intermediate values of ``DenseMass.forward`` for the derivatives of M.
 
-    M is (U^-1 A)^T diag(1 / e) U^-1 A, with a lower triangular U, e > 0, and constant A, see
-    ``DenseMass``.
+    M is (U^-1 A)^T diag(1 / e) U^-1 A. A network gives the lower triangular U and e > 0; A is constant
+    (see ``DenseMass``).
     """
 
     network: Intermediates
@@ -177,10 +181,10 @@ class DenseIntermediates(NamedTuple):
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
-    """Return lower triangular C, (3 n, 3 n), with C C^T the nominal mean of M^-1 over three axes per joint.
+    """Return lower triangular C, (3 n, 3 n), with C C^T the nominal inverse mass matrix of ``DenseMass``.
 
-    ``mean`` is the lower triangle of the nominal mean of M without armature. A joint moves along z; the
-    inertia about x and y is assumed to be equal to the inertia about z.
+    ``mean`` is the lower triangle of the nominal mean of M without armature, for the z axes of the
+    joints. For the x and y axes of a joint, the diagonal entry of its z axis is used.
     """
     n = len(joints)
     mass = torch.zeros(n, n, dtype=torch.float64)
@@ -194,12 +198,13 @@ def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
 
 
 class DenseMass(nn.Module):
-    """A mass matrix M(q), (..., n, n), from its inverse over three axes per joint: C U diag(e) U^T C^T.
+    """A mass matrix M(q), (..., n, n), that is a block of a larger matrix with three axes per joint.
 
-    C is the Cholesky factor of the nominal mean of M^-1. A network gives U, which is lower triangular
-    with ones on the diagonal, and e > 0: a Cholesky factorisation without square roots. Joints move
-    along their z axes only, so M is the z block of the inverted matrix: (U^-1 A)^T diag(1 / e) U^-1 A,
-    where A has the z columns of C^-1.
+    The inverse of the larger matrix, (..., 3 n, 3 n), is C U diag(e) U^T C^T. C is a constant, the
+    Cholesky factor of the nominal inverse. A network gives U, which is lower triangular with ones on the
+    diagonal, and e > 0: a Cholesky factorisation without square roots. Joints rotate about or move along
+    their z axes only, so M is the block of the z axes: (U^-1 A)^T diag(1 / e) U^-1 A, where A has the z
+    columns of C^-1.
     """
 
     def __init__(self, joints: Sequence[Joint], *, mean: Rows, network: MaskedNetwork) -> None:
@@ -221,13 +226,13 @@ class DenseMass(nn.Module):
         return self.network.prepare(torch.diag(0 * self.initial + 1), self.initial)
 
     def inverse(self, encoded: Tensor, layers: Layers) -> Tensor:
-        """Return M^-1 over all three axes of every joint, (..., 3 n, 3 n)."""
+        """Return the inverse of the larger matrix with three axes per joint, (..., 3 n, 3 n)."""
         factor, scale = self._factor(self.network.forward(encoded, layers)[0])
         lower = self.nominal @ (factor + torch.eye(self.size).to(factor))
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return U and e of M^-1 = C U diag(e) U^T C^T from the outputs of the network.
+        """Return U and e, see ``DenseMass``, from the outputs of the network.
 
         U, (..., 3 n, 3 n), is returned without its diagonal of ones; e is (..., 3 n).
         """
@@ -249,8 +254,8 @@ class DenseMass(nn.Module):
         """Return M(q), (..., n, n), and the intermediates of its derivatives."""
         raw, intermediates = self.network.forward(encoded, layers)
         factor, scale = self._factor(raw)
-        # Triangular systems are solved in place of inverting M^-1, because the condition number of M^-1
-        # is the square of the condition number of its factor.
+        # Triangular systems with U are solved, and the larger matrix is not inverted: its condition
+        # number is the square of the condition number of its factor.
         moved = self._unit_solved(factor, self.moving)
         mass = moved.mT @ (moved / scale.unsqueeze(-1))
         return mass, DenseIntermediates(intermediates, factor, moved, scale)
@@ -269,7 +274,7 @@ class DenseMass(nn.Module):
         return self.network.vjp(intermediates.network, cotangent)
 
     def jvp(self, rate: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), for this rate of the encoding."""
+        """Return dM/dt, (..., n, n), for `rate`, the time derivative of the encoding, (..., 2 n)."""
         _, factor, moved, scale = intermediates
         pushed = self.network.jvp(intermediates.network, rate)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)

@@ -39,8 +39,8 @@ class FrictionConstants(NamedTuple):
         """Return the magnitude of dry friction, (..., n) [Nm, N], under a gravity torque (..., n)."""
         speed = qd.abs() / self.stribeck_velocity
         rounding = self.stribeck_rounding
-        # (1 + x / 8)^-8 approximates exp(-x). With the rounding r, x = (1 + r) v^2 / (v + r) is
-        # approximately v^2 for large r and v for small r.
+        # (1 + x / 8)^-8 approximates exp(-x). With v = |qd| / stribeck_velocity and the rounding r,
+        # x = (1 + r) v^2 / (v + r) is approximately v^2 for large r and v for small r.
         slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
         slow = slow.square().square().square()  # Squaring three times takes half the time of ** 8.
         # The load is a smooth approximation of |gravity torque|.
@@ -100,8 +100,8 @@ class FrictionLaws(nn.Module):
     an oscillating load.
     """
 
-    # Name, group and unit of each parameter, and the constant at parameter zero, in units of typical
-    # friction and typical speed.
+    # For each parameter: its name, group and unit, and the initial value of its constant, for which the
+    # parameter is zero. The initial value is in units of typical friction and typical speed.
     parameter_groups: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "effects", "Nm, N", 1.0),
@@ -169,7 +169,8 @@ class SlidingFriction(FrictionLaws):
         self.memoryless.fill_(1.0)
         self.raw_coulomb_smoothing_velocity = nn.Parameter(torch.zeros_like(self.speed))
         del self.raw_bristle_fractions
-        self.register_buffer("raw_bristle_fractions", self.reach)  # (n, 0), since there are no bristles
+        # `reach` is empty, (n, 0), since there are no bristles.
+        self.register_buffer("raw_bristle_fractions", self.reach)
 
     def prepare(self) -> FrictionConstants:
         """Return the constants in SI units."""

@@ -13,10 +13,10 @@ from spelgen.runtime.rows import vector
 
 
 class MotorInputs(nn.Module):
-    """A constant input matrix G, (n, n): joint torques, the rows, per input of each motor, the columns.
+    """A constant input matrix G, (n, n): entry (i, j) is the torque of joint i per input of motor j.
 
-    A joint without a motor is passive. trained: True for entries of G that are trained, as rows; None:
-    no entry. A trained entry keeps its sign.
+    A joint without a motor is passive. gains: rows of G. trained: rows of a mask, True for entries of G
+    that are trained; None: all entries are constant. The sign of an entry is never trained.
     """
 
     parameter_groups = (("raw_gains", "gains", "1"),)
@@ -54,7 +54,10 @@ class MotorInputs(nn.Module):
         return applied(self.gains(), tau)
 
     def torque(self, force: Tensor) -> Tensor:
-        """Return the inputs, (..., n), that give this force; at a passive joint, the force itself."""
+        """Return the inputs tau, (..., n), for which G tau is this force, (..., n) [Nm, N].
+
+        The result for a passive joint is the force at this joint.
+        """
         matrix = self.gains() + torch.diag(self.passive)
         tau: Tensor = torch.linalg.solve(matrix, force.unsqueeze(-1))
         return tau.squeeze(-1)

@@ -96,17 +96,9 @@ class NetworkDynamics(PortHamiltonian):
             cache.encoded, qd, cache.parameters["friction"], torch.eye(self.n).to(qd)
         )
 
-    def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """Return d/dt of the state (q, p), (..., 2 n), or (q, p, tau) with constant tau, (..., 3 n)."""
-        # ODE solvers integrate one vector, so a constant input is appended to the state, with rate
-        # zero.
-        q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
-        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
-        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
-
 
 class DenseInputDynamics(NetworkDynamics):
-    """A model of networks with a diagonal G(q).
+    """A model of networks with a diagonal input matrix G(q).
 
     The network of G has three outputs per joint, one per axis. Only the output of the z axis, about
     or along which the joint moves, is used.
@@ -180,7 +172,7 @@ class JointFriction(NetworkFriction):
 
     def prepare(self) -> JointFrictionParameters:
         """Return the parameter cache."""
-        # Below the smoothing velocity dry friction decreases to zero; initially it is 3 % of the
+        # Dry friction decreases to zero below the smoothing velocity, whose initial value is 3 % of the
         # typical speed.
         smoothing = self.speed**2 * (0.001**2 + (0.03 * self.raw_smoothing.exp()) ** 2)
         start = torch.full_like(self.speed, -2.0)
@@ -190,7 +182,7 @@ class JointFriction(NetworkFriction):
     def forward(
         self, encoded: Tensor, qd: Tensor, parameters: JointFrictionParameters, right: Tensor
     ) -> Tensor:
-        """Return D(q, qd) right, (..., n, k)."""
+        """Return the product of D(q, qd) and the matrix ``right``, (..., n, k)."""
         layers, viscous, smoothing = parameters
         smooth_speed = torch.sqrt(qd * qd + smoothing)
         inputs = torch.cat([encoded, qd, qd / smooth_speed], dim=-1)
@@ -201,9 +193,10 @@ class JointFriction(NetworkFriction):
 
 
 class DenseFriction(NetworkFriction):
-    """A dense, positive semi-definite D(q, qd) = L L^T, where L has ``axes`` rows per joint.
+    """A dense, positive semi-definite D(q, qd) = L L^T, where L has a row for each axis of a joint.
 
-    A joint moves only along its last axis, so only the rows of the last axes are computed.
+    ``axes`` is the number of axes per joint. A joint rotates about or moves along its last axis only, so
+    only the rows of the last axes are computed.
     """
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:
@@ -224,7 +217,7 @@ class DenseFriction(NetworkFriction):
         return self.network.prepare(output_map, (size * self.initial).flatten())
 
     def forward(self, encoded: Tensor, qd: Tensor, layers: Layers, right: Tensor) -> Tensor:
-        """Return D(q, qd) right, (..., n, k)."""
+        """Return the product of D(q, qd) and the matrix ``right``, (..., n, k)."""
         rows = self.network.forward(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
         factor = rows.reshape(*qd.shape[:-1], *self.initial.shape)
         return factor @ (factor.mT @ right)

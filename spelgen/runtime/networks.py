@@ -148,9 +148,10 @@ class MaskedNetwork(nn.Module):
         nn.init.zeros_(self.weights[-1])  # The initial outputs are zero.
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return masked layers of a network that computes offset + output_map y, with y from this network.
+        """Return masked layers that compute offset + output_map y from the outputs y of this network.
 
-        y has shape (..., outputs). offset: (rows,); output_map: (rows, outputs).
+        y: (..., outputs). output_map: (rows, outputs). offset: (rows,). The linear map is included in the
+        last layer.
         """
         weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
         biases = list(self.biases)

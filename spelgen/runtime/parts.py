@@ -8,14 +8,14 @@ from torch import Tensor
 
 Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
-Entries = Callable[..., Tensor]  # M, (..., n, n), from functions and constants, (...) each
+Entries = Callable[..., Tensor]  # returns M, (..., n, n), for its functions and constants, (...) each
 Layers = tuple[tuple[Tensor, Tensor], ...]  # masked weights, and biases, of each layer of a network
 # The following types are Any, because each model and each part of a model has named tuples of its own
 # for these quantities.
 Intermediates = Any  # values of a forward pass that its derivatives need
 Parameters = Any  # parameter cache: quantities that depend on trained parameters only
 Configuration = Any  # configuration cache: quantities that depend on q, for given parameters
-Position = Any  # q, (..., n), or the configuration at q
+Position = Any  # q, (..., n), or the configuration cache at q
 
 
 class Mass(Protocol):
@@ -48,7 +48,10 @@ class Inputs(Protocol):
 
 
 def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
-    """Return a symmetric matrix, (..., n, n), from rows of its lower triangle: tensors (...) or numbers."""
+    """Return a symmetric matrix, (..., n, n).
+
+    rows: rows of its lower triangle; the entries are tensors, (...), or numbers.
+    """
     n = len(rows)
     entries = [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)]
     like = next(entry for entry in entries if isinstance(entry, Tensor))

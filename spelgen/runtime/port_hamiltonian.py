@@ -12,7 +12,7 @@ from spelgen.runtime.rows import Joint
 
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     """Return the product of a matrix, (..., n, m), and a vector, (..., m)."""
-    # A single operation: for a single state, the number of operations determines the time.
+    # A single state needs one operation in place of three: the number of operations determines the time.
     if vector.dim() == 1:
         return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
@@ -21,7 +21,9 @@ def applied(matrix: Tensor, vector: Tensor) -> Tensor:
 class PortHamiltonian(nn.Module):
     """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
 
-    The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
+    The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014), with
+    momenta p, dissipation matrix D(q, qd) and input matrix G.
+
     q, qd, qdd, tau and p are (..., n), with any leading dimensions, in rad and Nm for revolute joints,
     in m and N for prismatic joints. In place of q, methods also accept the configuration cache that
     ``at`` returns: all quantities that depend on q only, computed once for several calls. inputs: the
@@ -35,6 +37,8 @@ class PortHamiltonian(nn.Module):
     lagrangian_gradient: Callable[[Position, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V, (..., n)
     nonlinear_effects: Callable[[Position, Tensor], Tensor]  # Coriolis, centrifugal and gravity torque
     friction_torque: Callable[..., Tensor]  # D(q, qd) qd, (..., n)
+    memory_rate: Callable[[Tensor, Tensor], Tensor]  # dz/dt, (..., n, K), from the friction state z and qd
+    elements = 0  # number of bristles per joint, K
 
     def __init__(self, joints: Sequence[Joint], inputs: Inputs | None = None) -> None:
         super().__init__()
@@ -135,3 +139,19 @@ class PortHamiltonian(nn.Module):
         qd = self.velocity(cache, p)
         force = self.lagrangian_gradient(cache, qd) - self.friction_torque(cache, qd, *state)
         return qd, force if tau is None else force + self.input_force(cache, qd, tau)
+
+    def forward(self, t: Tensor, state: Tensor) -> Tensor:
+        """Return d/dt of the state (q, p, z), (..., 2 n + n K), or of (q, p, z, tau) with constant tau.
+
+        A state without z, (..., 2 n), gives friction that depends on velocity.
+        """
+        n, size = self.n, self.n * self.elements
+        if state.shape[-1] < 2 * n + size:
+            size = 0
+        # ODE solvers integrate one vector, so a constant input is appended to the state, with rate
+        # zero.
+        q, p, flat, tau = state.tensor_split((n, 2 * n, 2 * n + size), dim=-1)
+        z = [flat.reshape(*flat.shape[:-1], n, -1)] if size else []
+        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), *z)
+        rates = [self.memory_rate(x, qd).flatten(-2) for x in z]
+        return torch.cat([qd, force, *rates, torch.zeros_like(tau)], dim=-1)

@@ -1,4 +1,7 @@
-"""Residual terms in addition to rigid bodies: functions of single joints, and networks of several joints."""
+"""Residual terms that are added to rigid bodies.
+
+The terms are functions of the position of one joint, and networks that depend on several positions.
+"""
 
 import math
 from collections.abc import Sequence
@@ -16,8 +19,8 @@ from spelgen.runtime.rows import Joint, vector
 
 # Number of cubic B-splines over the range of a joint.
 SPLINES = 34
-# Number of ripple harmonics per revolution of the joint. Two more are per revolution of the motor, for
-# gear teeth and motor poles.
+# Number of ripple harmonics per revolution of the joint. Two more harmonics are per revolution of the
+# motor: they represent gear teeth and motor poles.
 HARMONICS = 64
 # Bound of the magnitude of the friction factor's logarithm: the factor is between 0.1 and 10.
 LARGEST = math.log(10.0)
@@ -107,8 +110,8 @@ class ResidualTerms(nn.Module):
         self.mass, self.potential = network, potential
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
-        # 1 / |coefficient| of each function and constant in each entry of M; a very large number, which
-        # causes no bound, for the coefficient zero.
+        # 1 / |coefficient| of each function and constant in each entry of M, (functions + constants, n, n).
+        # For the coefficient zero it is a very large number, which limits no function or constant.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
         # R may reduce the armature by at most 90 %. Each term in a row of M gets an equal share: 0.9
         # divided by the largest number of terms in a row.
@@ -116,7 +119,10 @@ class ResidualTerms(nn.Module):
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
-        """Return the contribution to M, (functions + constants, n, n), of each function and constant."""
+        """Return the contribution to M, (functions + constants, n, n), of each function and constant.
+
+        sizes: values of the functions and constants, (functions + constants,).
+        """
         rows = torch.diag(sizes).unbind()
         return self.entries(*rows)
 
@@ -174,7 +180,7 @@ class ResidualTerms(nn.Module):
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, cache: ResidualConfiguration) -> Tensor:
-        """Return the residual of V, (...) [J]; the energy of each B-spline is zero at the spline's middle."""
+        """Return the residual terms of V, (...) [J]; the energy of a B-spline is zero at its middle."""
         distance = self._distances(cache.q)
         size = distance.abs()
         # Integral of a B-spline of unit spacing from its middle to the distance `size`.
@@ -189,7 +195,7 @@ class ResidualTerms(nn.Module):
         return energy
 
     def gradient(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
-        """Return d/dq of the residual of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        """Return d/dq of the residual terms of 1/2 qd^T M(q) qd - V(q), (..., n) [Nm, N]."""
         by_encoded = torch.zeros_like(cache.encoded)
         if self.mass is not None and cache.slope is not None:
             # The cotangent of R is 1/2 qd qd^T. It is propagated back through the linear map, tanh and

@@ -38,9 +38,9 @@ class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction and a torque offset.
 
     The friction state z, (..., n, K) [rad, m], has the displacements of the bristles, whose energy is
-    part of H. Without z, dry friction depends on velocity. motor_speeds: rows of C, for motors that
-    rotate at C qd; friction, z and armature then belong to the motors. None: every motor drives its
-    own joint. servo: position servos; None: inputs are torques.
+    part of H. Without z, dry friction depends on velocity. motor_speeds: rows of the matrix C, (n, n),
+    for which C qd are the motor speeds; friction, z and armature then belong to the motors. None: every
+    motor drives its own joint. servo: position servos; None: inputs are torques.
     """
 
     parameter_groups = (
@@ -70,7 +70,8 @@ class RigidBodyDynamics(PortHamiltonian):
         self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
         # 1 for an input that drives a joint, 0 for the input of a passive joint, (n,).
         self.actuated = nn.Buffer(self.input_matrix(self.nominal_armature).any(dim=0).double())
-        self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))  # log(ratio to nominal)
+        # Logarithm of armature / nominal armature.
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))
         # The offset of the measured torque is in units of typical friction.
         self.raw_offset = nn.Parameter(torch.zeros_like(self.actuated))
         # Friction compensation is in units of typical friction / typical speed. This is a buffer, not a
@@ -135,7 +136,10 @@ class RigidBodyDynamics(PortHamiltonian):
         return RigidConfiguration(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
 
     def potential_energy(self, q: Tensor | RigidConfiguration, z: Tensor | None = None) -> Tensor:
-        """Return V(q) and the elastic energy of the bristles, (...) [J]; V is 0 at the origin of the base."""
+        """Return the sum of V(q) and the elastic energy of the bristles, (...) [J].
+
+        V is zero for a mass at the origin of the base frame.
+        """
         cache: RigidConfiguration = self.at(q)
         energy = (cache.chain.place.flatten(-3) * cache.chain.weight).sum(dim=-1)
         return energy if z is None else energy + cache.prepared.friction.stored_energy(z)
@@ -156,13 +160,16 @@ class RigidBodyDynamics(PortHamiltonian):
         return applied(cache.chain.jacobian, self.chain.accelerations(cache.chain, qd)) @ self.chain.ratios
 
     def _at_motors(self, cache: RigidConfiguration, qd: Tensor) -> tuple[Tensor, Tensor]:
-        """Return velocities and gravity torques of the motors, C qd and C^-T g, each (..., n)."""
+        """Return motor velocities C qd and gravity torques at the motors, C^-T dV/dq, each (..., n)."""
         if self.motors is None or self.loads is None:
             return qd, cache.gravity
         return qd @ self.motors.mT, cache.gravity @ self.loads
 
     def friction_torque(self, q: Tensor | RigidConfiguration, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: z, or None if it is unknown."""
+        """Return the friction torque C^T f, (..., n) [Nm, N], of the motors' friction f at the speeds C qd.
+
+        state: friction state z, or None if it is unknown.
+        """
         cache: RigidConfiguration = self.at(q, qd)
         torque = cache.varied * cache.prepared.friction.torque(*self._at_motors(cache, qd), *state)
         return torque if self.motors is None else torque @ self.motors
@@ -197,24 +204,12 @@ class RigidBodyDynamics(PortHamiltonian):
         return qd * (qd.sign() * z < self.friction.reach)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return z, (..., n, K), exactly, after a joint displacement without reversals, (..., n)."""
+        """Return the friction state, (..., n, K), after a joint displacement, (..., n) [rad, m].
+
+        The result is exact for a displacement without reversals.
+        """
         moved = z + self._motor(displacement).unsqueeze(-1)
         return moved.clamp(-self.friction.reach, self.friction.reach)
-
-    def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """Return d/dt of the state (q, p, z), (..., 2 n + n K), or of (q, p, z, tau) with constant tau.
-
-        A state without z, (..., 2 n), gives friction that depends on velocity.
-        """
-        n, size = self.n, self.n * self.elements
-        if state.shape[-1] < 2 * n + size:
-            size = 0
-        q, p, flat, tau = state.tensor_split((n, 2 * n, 2 * n + size), dim=-1)
-        z = flat.reshape(*flat.shape[:-1], n, -1) if size else None
-        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
-        if z is not None:
-            flat = self.memory_rate(z, qd).flatten(-2)
-        return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
 
     def input_force(self, cache: RigidConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
         """Return the generalized force G (tau - b) + k qd, (..., n) [Nm, N].

@@ -62,8 +62,8 @@ class Link(NamedTuple):
     inertia: Tensor6  # about the center of mass [kg m^2]
     rotation: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     ratio: float = 1.0
-    offset: float = 0.0  # [rad, m]
-    joint_type: Literal["revolute", "prismatic"] | None = None  # None: type of `joint`
+    offset: float = 0.0  # displacement of the link at q = 0 [rad, m]
+    joint_type: Literal["revolute", "prismatic"] | None = None  # None: the type of the joint `joint`
 
 
 class Function(NamedTuple):
@@ -75,7 +75,7 @@ class Function(NamedTuple):
 
 
 class Constant(NamedTuple):
-    """A trained constant. initial: initial value; scale: unit of the trained parameter."""
+    """A trained constant, scale * parameter, with its initial value."""
 
     initial: float
     scale: float

@@ -18,7 +18,7 @@ Optimizer = Literal["adamw", "lbfgs"]
 Adaptation = Literal["load", "friction", "unit"]
 Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
-Substeps = Annotated[Count, Field(le=1000)]  # a bound on the duration of a fit
+Substeps = Annotated[Count, Field(le=1000)]  # a bound, because the time of a fit is proportional to it
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,9 @@ class WindowFitDefaults:
 
 
 DEFAULTS = WindowFitDefaults()
-UNLESS = {  # option: (option that it depends on, its required value, its excluded value)
+# Options that apply only with certain values of another option: name -> (other option, value that it must have, value
+# that it must not have).
+UNLESS = {
     "batch": ("optimizer", "adamw", "lbfgs"),
     "learning_rate": ("optimizer", "adamw", "lbfgs"),
     "substeps": ("solver", "rk4", "dopri5"),
@@ -66,8 +68,8 @@ class GaussianPrior(Group):
         shared_friction: Common factor of all friction of all joints.
         friction_compensation: Friction compensation of a drive, divided by typical friction per typical speed, if the
             logs show any.
-        degrees_of_freedom: Weight of the initial standard deviations, as a number of parameters; and degrees of freedom
-            of the distribution of each body (Student's t).
+        degrees_of_freedom: Number with two uses: weight of the initial standard deviation in the estimate of a standard
+            deviation, as an equivalent number of parameters; degrees of freedom of the Student-t prior of each body.
     """
 
     bodies: Positive = 0.75
@@ -101,7 +103,7 @@ class FitConfig(Group):
     @classmethod
     def _refuse_foreign(cls, options: object) -> object:
         for name in options if isinstance(options, Mapping) else ():
-            # An option of another objective exists: the message names its objectives and not a similar option.
+            # An unknown name may be an option of another objective: the message then names the objectives that have it.
             if name not in cls.model_fields:
                 owners = OWNERS.get(name)
                 if owners is None:
@@ -153,8 +155,8 @@ class TorqueFit(FitConfig):
 
     Attributes:
         prior: Prior of the parameters of rigid-body models.
-        adapt: Parameters of a fitted model that are updated: of a `load` at the tip (last body; M and V of networks),
-            of `friction` and torque offsets, or of another `unit` of the same arm.
+        adapt: Parameters of a fitted model to update. `load`: the last body, with a load at the tip (in models of
+            networks: M and V); `friction`: friction and torque offsets; `unit`: all, for another unit of the same arm.
         evaluations: Largest number of evaluations of the loss.
         weight_decay: Factor of half the sum of squared weights.
         urdf_weight: Factor of the squared difference from the URDF's M and gravity; 0: no regularization.
@@ -177,7 +179,7 @@ class OnWindows(FitConfig):
     Attributes:
         window: Samples per window.
         stride: Samples from the start of one window to the start of the next.
-        momentum_steps: Training steps on the weak form of the equations.
+        momentum_steps: Training steps of the momentum fit, on the weak form of the equations of motion.
         optimizer: AdamW on batches, or L-BFGS on all windows; default: lbfgs for at most 1,024 windows, else adamw.
         batch: Windows per step of AdamW; default: 256.
         learning_rate: Largest learning rate of AdamW; default: 0.001.
@@ -225,10 +227,10 @@ class MomentumFit(OnWindows):
 
 
 class Rollout(OnWindows):
-    """Fit of predicted windows in up to three stages (SPEL, Algorithm 1, without the PD penalty).
+    """Fit of simulated to measured states in windows of logs (SPEL, Algorithm 1, without the PD penalty).
 
-    The stages are a torque fit of rigid bodies (see `TorqueFit`), a momentum fit (see `MomentumFit`), and the fit of
-    predicted windows.
+    It has up to three stages: a torque fit of rigid bodies (see `TorqueFit`), a momentum fit (see `MomentumFit`), and
+    the fit of rollouts, which are simulated windows.
 
     Attributes:
         torque_first: Whether the torque fit is made.
@@ -249,7 +251,7 @@ class Rollout(OnWindows):
 
 
 class ServoFit(FitConfig):
-    """Fit of position servos, friction and gravity to positions measured under commands (see `fitting.servo`)."""
+    """Fit of servo, friction and gravity parameters to logged positions under commands (see `fitting.servo`)."""
 
     objective: ClassVar[Objective] = "servo"
 
@@ -283,7 +285,7 @@ def fit_config(
     for name, (condition, _, excluded) in UNLESS.items():
         if options.get(condition, settings.get(condition)) == excluded:
             settings.pop(name, None)
-        # An option of the caller takes precedence over a setting that excludes it: `batch` implies AdamW, for example.
+        # An option of the caller overrides a setting that excludes it: `batch` overrides `optimizer: lbfgs`.
         elif name in options and condition not in options and settings.get(condition) == excluded:
             settings.pop(condition)
     config = validated(config_type, settings | options)

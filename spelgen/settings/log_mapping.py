@@ -33,13 +33,14 @@ ONLY = {  # joint type: units that such a joint cannot have
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", *LENGTHS, *SPEEDS} - {"mm", "mm/s"},
 }
 
-LONGEST_DELAY = 1.0  # [s] largest magnitude of `torque_delay`
+LONGEST_DELAY = 1.0  # [s] largest magnitude of a delay
+Delay = Annotated[Number, Field(ge=-LONGEST_DELAY, le=LONGEST_DELAY)]
 
 Accepted = Literal[
     "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",
     "velocity-is-no-derivative", "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "motion-order",
-    "joint-sense", "joint-order", "joint-unit", "joint-zero", "gravity", "gravity-compensated", "torque-clipped",
-    "normalised",
+    "joint-sense", "joint-order", "joint-unit", "joint-zero", "joint-delay", "gravity", "gravity-compensated",
+    "torque-clipped", "torque-copied", "normalised",
 ]  # fmt: skip
 """Codes of errors of `spelgen logs` that a user can accept."""
 
@@ -116,7 +117,9 @@ class LogUnits(JointUnits):
 
 
 class JointWords(Group):
-    """Period, or sign bit, of the register words of one joint, in logged units; default: plain numbers, no words.
+    """Decoding of register values of one joint, in logged units; default: values are plain numbers.
+
+    The value is the period after which logged values wrap around, or the value of the sign bit.
 
     Attributes:
         q: Position.
@@ -129,6 +132,20 @@ class JointWords(Group):
     qd: Positive | None = None
     tau: Positive | None = None
     u: Positive | None = None
+
+
+class JointDelays(Group):
+    """Delays of the logged values of one joint relative to the other signals [s]; negative if they are early.
+
+    Attributes:
+        q: Position.
+        qd: Velocity.
+        tau: Torque, in addition to `torque_delay`.
+    """
+
+    q: Delay = 0.0
+    qd: Delay = 0.0
+    tau: Delay = 0.0
 
 
 class MotorCalibration(Group):
@@ -173,6 +190,7 @@ class JointLog(Group):
         period: Interval after which logged values wrap around, e.g. 65536 counts of a 16-bit register or 360 degrees;
             default: one turn for the positions of joints without limits.
         sign_bit: Value of the sign bit, if logged values are sign and magnitude: with 32768, 32768 + x means -x.
+        delay: Delays of the logged values, for a joint that is logged later than the others.
     """
 
     name: str | None = None
@@ -186,6 +204,7 @@ class JointLog(Group):
     torque_offset: Number = 0.0
     period: JointWords = JointWords()
     sign_bit: JointWords = JointWords()
+    delay: JointDelays = JointDelays()
 
     @model_validator(mode="after")
     def _moves(self) -> JointLog:
@@ -221,7 +240,7 @@ class LogMapping(Group):
     units: LogUnits = LogUnits()
     input: Literal["torque", "position"] = "torque"
     velocity: Literal["logged", "differentiated"] = "logged"
-    torque_delay: Annotated[Number, Field(ge=-LONGEST_DELAY, le=LONGEST_DELAY)] = 0.0
+    torque_delay: Delay = 0.0
     joints: dict[str, JointLog] = Field(default={})
     accept: tuple[Accepted, ...] = ()
     dropouts: Literal["kept", "dropped"] = "kept"
@@ -290,7 +309,7 @@ class LogMapping(Group):
     def in_si(self) -> LogMapping:
         """Return the mapping for a file in SI units with default names of columns.
 
-        From this mapping it has `input`, `accept`, and a period of one turn for each joint with a period.
+        `input` and `accept` are copied. The positions of a joint with a period get the period of one turn.
         """
         # Positions of joints without limits may be in any interval of one turn, also in files that spelgen writes.
         turning = [name for name in self.joints if self.word("period", "q", name)]
@@ -332,6 +351,11 @@ class LogMapping(Group):
         if quantity == "tau":
             return logged.torque_offset
         return logged.offset if quantity in ("q", "u") else 0.0
+
+    def delay(self, quantity: str, joint: str) -> float:
+        """Return the delay of the logged values of a quantity of a joint relative to the other signals [s]."""
+        delay: float = self.joint(joint).delay.model_dump().get(quantity, 0.0)
+        return delay + self.torque_delay * (quantity == "tau")
 
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
         """Return the errors of the mapping for these joints: absent keys, and units that the joint type excludes."""

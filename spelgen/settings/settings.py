@@ -88,7 +88,7 @@ class MotorCoupling(Group):
 
 
 class Unusable:
-    """Placeholder for a group of settings with errors; it raises these errors when an attribute is read."""
+    """Placeholder for a group of settings that has errors: reading an attribute raises the errors."""
 
     def __init__(self, errors: Sequence[SpelgenError]) -> None:
         self.errors = tuple(errors)
@@ -161,7 +161,7 @@ class Settings(Group):
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """One warning per error in a group that only one step uses; the step raises the error."""
+        """One warning per error in a group that a single command uses, such as `training`; it raises the error."""
         unusable = [group for _, group in self if isinstance(group, Unusable)]
         errors = [error for group in unusable for error in group.errors]
         return tuple(Diagnostic("warning", "unusable-settings", "settings", None, str(x)) for x in errors)
@@ -221,7 +221,15 @@ def load_mapping(path: Path | str, joints: Collection[str]) -> LogMapping:
     Raises SettingsError as `load_settings` does, also for joints that are not among `joints`.
     """
     document = read_document(Path(path))
-    mapping = validated(LogMapping, document.value(), document)
+    content = document.value()
+    groups = Settings.model_fields.keys() - LogMapping.model_fields
+    if isinstance(content, dict) and "logs" in content and content.keys() <= groups | {"joints"}:
+        raise SettingsError(
+            "settings of a robot", file=document.path, line=document.line(("logs",)),
+            expected="the keys of a mapping, as in the group logs of these settings",
+            do="write these keys into a file of their own; without --mapping, the settings beside the URDF are used",
+        )  # fmt: skip
+    mapping = validated(LogMapping, content, document)
     _require_joints(((("joints", name), name) for name in mapping.joints), joints, document)
     return mapping
 

@@ -9,6 +9,8 @@ from spelgen.settings.log_mapping import LONGEST_DELAY
 from spelgen.settings.values import Count, Group, NonNegative, Number, Positive, Whole
 
 PREPROCESSING = {"cutoff", "decimation", "gap", "torque_delay"}
+OF_LOGS = PREPROCESSING | {"validation_fraction", "seed"}
+"""Keys about the logs; the other keys are options of fits."""
 
 
 class TrainingSettings(Group):
@@ -19,7 +21,7 @@ class TrainingSettings(Group):
             only, servo for arms with position servos. If it is set, options of other objectives are errors.
         cutoff: Cutoff frequency of the zero-phase low-pass filter on q, qd and tau; 0: no filter; default: 8 Hz, and
             no filter for windows of logs at 50 Hz or less [Hz].
-        decimation: Samples from one sample of a window to the next; default: the largest number that the filter allows.
+        decimation: A window contains every n-th sample of a log; default: the largest n that the filter allows.
         gap: A recording is split at time steps longer than this number of median steps.
         torque_delay: Delay of the logged torques relative to the positions; default: estimated in a torque fit [s].
         validation_fraction: Fraction of the training trajectories for the validation loss.
@@ -63,7 +65,7 @@ class TrainingSettings(Group):
 
     @property
     def options(self) -> dict[str, object]:
-        """The options of fits, of any objective, that are not None."""
+        """The fit options that are not None, of all objectives: name -> value."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property
@@ -99,7 +101,7 @@ class ComparisonSettings(Group):
 
     Attributes:
         first: Duration of the initial part of each training motion that is used; default: the whole motion [s].
-        steps: Smallest number of training steps on predicted windows.
+        steps: Minimum number of training steps of the rollout fit.
         momentum_steps: Number of training steps on the weak form of the equations, before the steps on predicted
             windows.
         weight_decay: Weight decay of all presets; default: as in `training`.

@@ -1,4 +1,7 @@
-"""Read YAML with the line of each value, and check it key by key; unsafe or ambiguous constructs are errors."""
+"""Read YAML files, validate each key, and report errors with their lines.
+
+Unsafe or ambiguous constructs are errors, too.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -54,7 +57,7 @@ class YamlDocument:
 
 
 def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | None:
-    """Return the nodes of a key and of its value in a mapping, or the node of a list item twice.
+    """Return (key node, value node) for a key of a mapping, or (item node, item node) for an item of a list.
 
     The result is None if the key or the item does not exist. key: key, or index of a list item from 0.
     """

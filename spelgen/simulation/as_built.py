@@ -38,7 +38,7 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
         raise SpelgenError(
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
-    # Called only for its check: the error of a missing inertial contains the path of the user's file.
+    # Links without inertials are an error before files are written, so that it names the user's URDF.
     arm_dynamics(arm.chain, arm.settings)
     settings = _settings(arm, seed)
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
@@ -183,7 +183,8 @@ def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np
 def _make_consistent(tensor: etree._Element) -> None:
     """Make an inertia tensor satisfy the triangle inequality: clip its negative second moments of mass.
 
-    The second moments are S = trace(I)/2 1 - I; a body has S >= 0 (Wensing, Kim, Slotine, IEEE RA-L 3:60, 2018).
+    The second moments are S = trace(I) / 2 * identity - I; a body has S >= 0 (Wensing, Kim, Slotine, IEEE RA-L 3:60,
+    2018).
     """
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     pseudo = pseudo_inertia(np.array([1.0, 0, 0, 0, *(float(tensor.get(name, "0")) for name in names)]))

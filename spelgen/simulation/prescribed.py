@@ -126,6 +126,6 @@ def friction_along(friction: DriveFriction, arm: Chain, motion: Motion, preslidi
         return friction(motion.qd)
     scale = np.array([1.0 if kind == "revolute" else 0.1 for kind in arm.joint_types])
     elements = np.geomspace(presliding / AS_BUILT.presliding_span, presliding, AS_BUILT.elements)
-    breakaway = scale[:, None] * elements  # (n, K)
+    breakaway = scale[:, None] * elements  # (n, K), for K friction elements per joint
     deflection = bristles_along(motion.q, BristleReach(breakaway, friction.speeds))  # (T, n, K)
     return friction.torque(motion.qd, (deflection / breakaway).mean(axis=-1))

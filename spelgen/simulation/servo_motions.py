@@ -23,7 +23,11 @@ def servo_motions(
 ) -> SimulatedLogs:
     """Return trajectories under random commands; the same settings give the same logs.
 
-    `random_inputs` documents the arguments and errors.
+    Args:
+        arm: The arm.
+        settings: `simulation` and `joints` are used.
+        drives: Not used: each servo moves its own joint.
+        progress: Called with (trajectories done, all) after each trajectory.
     """
     protocol = settings.simulation
     lowest, highest = initial_range(arm, settings)

@@ -125,7 +125,7 @@ def simulate(
 
 
 def _controlled(settings: Settings) -> Settings:
-    """Return the settings; if they set no protocol and no inputs, with the protocol of a controlled arm.
+    """Return the settings. If they set neither a protocol nor inputs, the protocol of the result is "tracking".
 
     Under random torques that are not tuned for the arm, the arm would fall.
     """

@@ -54,8 +54,14 @@ def track(
 
     Each recording has its own gains, and its own phases or initial position. The last `test_fraction` of each recording
     is for testing. A log contains encoder positions after a zero-phase low-pass filter, velocities by central
-    differences of the filtered positions, and motor torques. `random_inputs` documents the arguments and errors;
-    `settings.tracking` is used in addition.
+    differences of the filtered positions, and motor torques. Raises ArmError without inertials, SettingsError for a
+    joint without a range, and RunError if the motion cannot be integrated.
+
+    Args:
+        arm: The arm.
+        settings: `simulation`, `tracking` and `joints` are used.
+        drives: Input matrix and couplings of motors; None: each motor moves its own joint.
+        progress: Called with (trajectories done, all) after each trajectory.
     """
     protocol = settings.simulation
     friction = make_friction(arm, settings, drives and drives.speeds)

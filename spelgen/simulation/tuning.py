@@ -24,7 +24,7 @@ class SimulationTuning:
     # [Hz] Default rate of the controllers, approximate: it is rounded to a divisor of the sample rate.
     control_rate: float = 125.0
 
-    # Arms under position servos.
+    # Constants of simulated arms under position servos.
 
     # [s] Largest integrator step of an arm under position servos.
     servo_step: float = 1e-3
@@ -69,7 +69,7 @@ class AsBuiltTuning:
     acceleration: float = 2.0
     # Number of random positions at which torques and M are computed to scale friction and armature.
     positions: int = 50
-    # Fraction of the joint ranges from which these positions are drawn.
+    # Fraction of the joint ranges from which the random `positions` are drawn.
     range_fraction: float = 0.7
     # Largest breakaway displacement [rad] of the friction elements of a gear.
     presliding: float = 0.03

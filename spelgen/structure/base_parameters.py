@@ -42,7 +42,7 @@ class BaseParameter:
 @lru_cache(maxsize=16)
 def base_parameter_count(arm: Chain) -> int:
     """Return the rank of the inverse-dynamics regressor, which is the number of base parameters."""
-    points = 7  # This number is sufficient for most arms of up to seven joints.
+    points = 7  # Seven random positions determine the rank for most arms of up to seven joints.
     while True:
         rows = regressor_rows(arm, points + 2)
         rank = field.rank(rows)
@@ -52,7 +52,8 @@ def base_parameter_count(arm: Chain) -> int:
         points *= 2
 
 
-@lru_cache(maxsize=16)  # Least squares, checks of logs and closed forms use the same arm.
+# The result is cached: least squares, checks of logs and closed forms need it for the same arm.
+@lru_cache(maxsize=16)
 def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     """Return the base parameters of ``arm``, in the order of the bodies from the root."""
     indices = [INERTIAL_PARAMETERS.index(name) for name in BASE_ORDER]
@@ -61,7 +62,7 @@ def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     for row in _reduced_rows(arm, order):
         pairs = zip(order, row, strict=True)
         weights = tuple((index, Fraction(int(x.p), int(x.q))) for index, x in pairs if x)
-        # The pivot of a row of the reduced echelon form is 1.
+        # The first element of a row is the pivot. It is 1, so that the combination needs no normalisation.
         first, _ = weights[0]
         name = parameter_name(first) + "R" * (len(weights) > 1)
         result.append(BaseParameter(name, first, weights, _value(arm, weights)))
@@ -110,10 +111,10 @@ def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
         positions.append(Position((1 - t * t) / norm, 2 * t / norm, value))
     units = list(np.eye(parameters, dtype=int).astype(object))
     elements = coefficients(arm, positions, units, rational)
-    # The recursion returns an integer 0, without columns, for an entry that is always zero.
+    # For an entry that is always zero the recursion returns the integer 0, which is expanded to a row of zeros.
     return np.stack([np.broadcast_to(element, parameters) for element in elements])
 
 
 def rational(number: Fraction) -> fmpq:
-    """Return the fraction as a rational number of FLINT, whose arithmetic is faster."""
+    """Return the fraction as a rational number of FLINT, for which arithmetic is faster than for `Fraction`."""
     return fmpq(number.numerator, number.denominator)

@@ -116,13 +116,13 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
     chosen = np.zeros((0, len(spans.varying)), dtype=np.uint64)
     tried: set[int] = set()
     for joints in _joint_sets(spans):
-        outside = field.row_basis(spans.outside(joints))
-        kernel = field.null_space(outside)
+        outside = spans.outside(joints)
+        kernel = field.null_space(outside)[:, np.argsort(spans.order)]
+        bound = [spans.order[pivot] for pivot in field.pivots(outside)]
         # Number of functionals of this set of joints that are linearly independent of the functionals chosen so far.
-        missing = 0
-        if len(kernel):
-            missing = field.rank(np.concatenate([chosen, kernel])) - len(chosen)
-        candidates = _candidates(spans, joints, outside, tried)
+        on_changes = field.product(kernel, spans.varying.T)
+        missing = field.rank(np.concatenate([chosen, on_changes])) - len(chosen)
+        candidates = _candidates(spans, joints, kernel, bound, tried)
         while missing:
             pairs = next(candidates)
             weights = np.array([w for w, _ in pairs], dtype=np.uint64).reshape(-1, len(spans.keys))
@@ -150,15 +150,16 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
 
 
 def _candidates(
-    spans: Spans, joints: frozenset[int], outside: np.ndarray, tried: set[int]
+    spans: Spans, joints: frozenset[int], kernel: np.ndarray, bound: list[int], tried: set[int]
 ) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
     """Yield functionals that depend on ``joints`` only: single entries of M, then the sparsest sums of entries.
 
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the functionals may depend on.
-        outside: echelon basis of the m-dimensional span of the changes of M caused by all other joints, (m, dim U), as
-            coordinates in the basis `spans.varying` of U, the span of all changes of M.
+        kernel: basis of the functionals that vanish on the changes of M caused by all other joints, (m, entries).
+        bound: indices of the entries of M at the pivots of the echelon basis of these changes. Each row of `kernel` is
+            1 at one entry without a pivot, and zero at the others.
         tried: indices of the entries that were candidates for a set of joints before; they are skipped. This function
             adds its candidates.
     """
@@ -168,13 +169,6 @@ def _candidates(
             tried.add(index)
             singles.append(_single(spans, index))
     yield singles
-    order = spans.order
-    # The product of two echelon forms is an echelon form: no further row reduction is needed.
-    rows = spans.changes_of(outside)[:, order]
-    bound = [order[pivot] for pivot in field.pivots(rows)]
-    reduced = field.null_space(rows)
-    kernel = np.zeros_like(reduced)
-    kernel[:, order] = reduced
     free = np.setdiff1d(np.arange(len(spans.keys)), bound).tolist()
     samples = spans.float_changes(frozenset(range(spans.n)) - joints)
     coefficients = _solved(samples[:, bound], samples[:, free])
@@ -200,7 +194,8 @@ def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the least-squares solution X (k, p) of A X = B, with A = matrix (S, k) and B = right (S, p)."""
     width = matrix.shape[1]
-    # The triangular factor of the QR decomposition of [A, B] has the same normal equations and far fewer rows.
+    # With the triangular factor of the QR decomposition of [A, B], the normal equations and the solution are the same,
+    # but there are far fewer rows.
     factor = np.asarray(np.linalg.qr(np.concatenate([matrix, right], axis=1), mode="r"))
     return np.asarray(np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0])
 

@@ -41,19 +41,14 @@ class Residues:
         return Residues(_folded(_P - self.values))
 
     def __sub__(self, operand: Residues | int) -> Residues:
-        if isinstance(operand, int) and operand == 0:
-            return self
-        return Residues(_folded(self.values + (_P - _values(operand))))
+        return self + -operand
 
     def __rsub__(self, operand: int) -> Residues:
         return -self + operand
 
     def __mul__(self, operand: Residues | int) -> Residues | int:
-        if isinstance(operand, int):
-            if operand in (0, 1):
-                return self if operand else 0
-            if operand == 2:
-                return Residues(_folded(self.values + self.values))
+        if isinstance(operand, int) and operand in (0, 1):
+            return self if operand else 0
         return Residues(_product(self.values, _values(operand)))
 
     __rmul__ = __mul__

@@ -98,7 +98,7 @@ def working_range(coordinate: Coordinate) -> tuple[float, float]:
     lower, upper = coordinate.lower, coordinate.upper
     is_revolute = coordinate.joint_type == "revolute"
     # Huge or equal limits are not usable: exporters write +-1e16, or equal limits, for a joint without limits.
-    if coordinate.continuous or lower is None or upper is None or not 0 < upper - lower < 1e3:
+    if lower is None or upper is None or not 0 < upper - lower < 1e3:
         half_range = pi if is_revolute else 0.5
         return -half_range, half_range
     if is_revolute:
@@ -222,8 +222,8 @@ def _rounded(values: np.ndarray, digits: int = 6, zero_below: float = 1e-12) -> 
 def _round(value: float, digits: int = 6, zero_below: float = 1e-12) -> float:
     """Return a value rounded to ``digits`` significant digits, so that it is equal on every machine.
 
-    Magnitudes up to ``zero_below`` become 0. For scales ``zero_below`` is 0, because scales are divisors, and are small
-    for an arm of 1e-12 kg.
+    Magnitudes up to ``zero_below`` become 0. Scales are rounded with ``zero_below`` = 0, because scales are divisors:
+    they must not become 0, even for an arm of 1e-12 kg.
     """
     if abs(value) <= zero_below:
         return 0.0
@@ -237,7 +237,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
     rows, columns = np.triu_indices(3)
     tensor[..., rows, columns] = tensor[..., columns, rows] = values[..., 4:]
     pseudo = np.zeros((*values.shape[:-1], 4, 4))
-    # The second moments of mass S from the inertia tensor I = tr(S) 1 - S.
+    # I = tr(S) 1 - S is the inertia tensor for second moments of mass S. Solved for S, it is S = tr(I)/2 1 - I.
     pseudo[..., :3, :3] = _trace(tensor) / 2 * np.eye(3) - tensor
     pseudo[..., :3, 3] = pseudo[..., 3, :3] = values[..., 1:4]
     pseudo[..., 3, 3] = values[..., 0]
@@ -268,9 +268,9 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # [1] Fraction of the largest eigenvalue to which smaller eigenvalues of J are raised. They are raised only if the
-    # smallest one is below fraction^2 times the largest one, because J of a slender body is consistent although its
-    # smallest eigenvalue is small.
+    # [1] If J is inconsistent, eigenvalues of J are raised to this fraction of the largest eigenvalue. J counts as
+    # inconsistent if its smallest eigenvalue is below fraction^2 times the largest one: the bound is that low, because
+    # a slender body has a small eigenvalue, and is consistent.
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)

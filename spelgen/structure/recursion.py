@@ -9,7 +9,7 @@ of its frame.
 
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
-from itertools import combinations, combinations_with_replacement
+from itertools import combinations_with_replacement
 from math import cos, lcm, sin, tan
 from typing import Any, NamedTuple
 
@@ -22,7 +22,6 @@ Number = Callable[[Fraction], Element]
 """Conversion of the exact constants of an arm to elements of the ring."""
 
 Vector = tuple[Element, ...]
-Terms = tuple[tuple[int, Element], ...]
 
 TENSOR = tuple(combinations_with_replacement(range(3), 2))
 """Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
@@ -61,12 +60,11 @@ class _Inertia(NamedTuple):
 class _Pose(NamedTuple):
     """The pose of a joint's frame in its parent body, or the motion of a joint.
 
-    The representation is sparse: each row of the rotation, and the translation, is a sequence of pairs (index, element)
-    of the nonzero elements. The elements 1 and -1 are Python integers.
+    rotation: rows of the matrix. The elements 0, 1 and -1 of rotation and translation are Python integers.
     """
 
-    rotation: tuple[Terms, ...]
-    translation: Terms
+    rotation: tuple[Vector, ...]
+    translation: Vector
 
 
 _Wrench = tuple[Vector, Vector]
@@ -93,7 +91,7 @@ def energies(
     """
     motions = _motions(arm, positions, number)
     poses = [
-        _Pose(tuple(_terms(row, number) for row in body.rotation), _terms(body.translation, number))
+        _Pose(tuple(_vector(row, number) for row in body.rotation), _vector(body.translation, number))
         for body in arm.bodies
     ]
     composites = [_Inertia(ten[0], tuple(ten[1:4]), tuple(ten[4:10])) for ten in inertias]
@@ -119,7 +117,7 @@ def energies(
         else:
             composites[body.parent] = _sum(composites[body.parent], moved)
     # V = -g . sum_b m_b c_b: the first moment of the composite inertia at the root is this sum.
-    gravity = _terms(arm.gravity, number)
+    gravity = _vector(arm.gravity, number)
     return Energies(mass, -_dot(gravity, total.moment))
 
 
@@ -148,14 +146,14 @@ def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[
                 slide = number(body.multiplier) * slide
             if body.offset:
                 slide = slide + number(Fraction(str(body.offset)))
-            motions.append(_Pose((((0, 1),), ((1, 1),), ((2, 1),)), ((2, slide),)))
+            motions.append(_Pose(((1, 0, 0), (0, 1, 0), (0, 0, 1)), (0, 0, slide)))
         else:
             factor = int(body.multiplier * bases[body.coordinate])
             c, s = _multiple_angle(position.cos, position.sin, factor)
             if body.offset:
                 c0, s0 = map(number, circle_point(body.offset))
                 c, s = c0 * c - s0 * s, s0 * c + c0 * s
-            motions.append(_Pose((((0, c), (1, -s)), ((0, s), (1, c)), ((2, 1),)), ()))
+            motions.append(_Pose(((c, -s, 0), (s, c, 0), (0, 0, 1)), (0, 0, 0)))
     return motions
 
 
@@ -169,9 +167,9 @@ def circle_point(angle: float) -> tuple[Fraction, Fraction]:
 
 
 def base_denominators(arm: Chain) -> list[int]:
-    """Return an integer d per coordinate q.
+    """Return for each coordinate q the smallest integer d for which all its joint angles are multiples of q / d.
 
-    The angle of each revolute joint with this coordinate, mimic joints included, is an integer multiple of q / d, up to
+    The angle of each revolute joint with this coordinate, mimic joints included, is an integer multiple of q / d plus
     a constant.
     """
     denominators = [1] * len(arm.coordinates)
@@ -233,9 +231,9 @@ def _moved_inertia(motion: _Pose, inertia: _Inertia) -> _Inertia:
 
     motion: rotation about z, or translation along z, of the joint at its current position.
     """
-    if motion.translation:
+    s, c, _ = motion.rotation[1]
+    if isinstance(c, int):  # the motion is a translation, whose rotation consists of integers
         return _translated(motion.translation, inertia)
-    (_, s), (_, c) = motion.rotation[1]
     hx, hy, hz = inertia.moment
     xx, xy, xz, yy, yz, zz = inertia.tensor
     # sin^2 is replaced by 1 - cos^2 here: otherwise polynomials would contain both and need a reduction.
@@ -250,7 +248,6 @@ def _moved_inertia(motion: _Pose, inertia: _Inertia) -> _Inertia:
 def _posed_inertia(pose: _Pose, inertia: _Inertia) -> _Inertia:
     xx, xy, xz, yy, yz, zz = inertia.tensor
     columns = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-    # Rows of R are multiplied one at a time: they are sparse, because most axes of arms are at right angles.
     half = [[_dot(row, column) for column in columns] for row in pose.rotation]
     tensor = tuple(_dot(pose.rotation[j], half[i]) for i, j in TENSOR)
     return _translated(pose.translation, _Inertia(inertia.mass, _turned(pose, inertia.moment), tensor))
@@ -258,55 +255,34 @@ def _posed_inertia(pose: _Pose, inertia: _Inertia) -> _Inertia:
 
 def _posed_wrench(pose: _Pose, wrench: _Wrench) -> _Wrench:
     force, moment = (_turned(pose, vector) for vector in wrench)
-    lever: list[Element] = list(moment)
-    for axis, length in pose.translation:
-        following, last = (axis + 1) % 3, (axis + 2) % 3
-        lever[following] = lever[following] - length * force[last]
-        lever[last] = lever[last] + length * force[following]
-    return force, tuple(lever)
+    (x, y, z), (fx, fy, fz), (mx, my, mz) = pose.translation, force, moment
+    return force, (mx + y * fz - z * fy, my - x * fz + z * fx, mz + x * fy - y * fx)
 
 
 def _turned(pose: _Pose, vector: Vector) -> Vector:
     return tuple(_dot(row, vector) for row in pose.rotation)
 
 
-def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
+def _translated(offset: Vector, inertia: _Inertia) -> _Inertia:
     """Return the inertia about an origin displaced by -p, p = ``offset``, by the parallel-axis theorem.
 
     The first moment h changes to h + m p, with the mass m.
     """
-    if not offset:
-        return inertia
-    moment: list[Element] = list(inertia.moment)
-    tensor = dict(zip(TENSOR, inertia.tensor, strict=True))
-    for axis, length in offset:
-        # With the mass m, the first moment h, p = `offset` and k = h + (h + m p), the tensor I increases by
-        # (p.k) 1 - (p k^T + k p^T) / 2. The loops add one term per nonzero component of p.
-        moment[axis] = moment[axis] + length * inertia.mass
-    for axis, length in offset:
-        double = length * (inertia.moment[axis] + moment[axis])
-        for k in range(3):
-            if k != axis:
-                tensor[k, k] = tensor[k, k] + double
-                pair = (min(axis, k), max(axis, k))
-                tensor[pair] = tensor[pair] - length * inertia.moment[k]
-    for (i, x), (j, y) in combinations(offset, 2):
-        tensor[i, j] = tensor[i, j] - x * y * inertia.mass
-    return _Inertia(inertia.mass, tuple(moment), tuple(tensor.values()))
+    (x, y, z), mass, (hx, hy, hz) = offset, inertia.mass, inertia.moment
+    xx, xy, xz, yy, yz, zz = inertia.tensor
+    moment = (hx + x * mass, hy + y * mass, hz + z * mass)
+    # With k = h + (h + m p), the tensor I increases by (p.k) 1 - (p k^T + k p^T) / 2.
+    dx, dy, dz = (p * (old + new) for p, old, new in zip(offset, inertia.moment, moment, strict=True))
+    xy = xy - x * hy - y * hx - x * y * mass
+    xz = xz - x * hz - z * hx - x * z * mass
+    yz = yz - y * hz - z * hy - y * z * mass
+    return _Inertia(mass, moment, (xx + dy + dz, xy, xz, yy + dx + dz, yz, zz + dx + dy))
 
 
-def _terms(row: Sequence[Fraction], number: Number) -> Terms:
-    # The numbers 1 and -1 remain integers, so that `_dot` can add or subtract in place of a multiplication.
-    return tuple((i, int(x) if abs(x) == 1 else number(x)) for i, x in enumerate(row) if x)
+def _vector(values: Sequence[Fraction], number: Number) -> Vector:
+    # 0, 1 and -1 remain integers, which need no multiplication.
+    return tuple(int(x) if x in (0, 1, -1) else number(x) for x in values)
 
 
-def _dot(terms: Terms, vector: Sequence[Element]) -> Element:
-    total: Element = 0
-    for index, coefficient in terms:
-        value = vector[index]
-        if not isinstance(coefficient, int) or abs(coefficient) != 1:
-            value = coefficient * value
-        elif coefficient < 0:
-            value = -value
-        total = total + value
-    return total
+def _dot(row: Vector, vector: Sequence[Element]) -> Element:
+    return sum(x * y for x, y in zip(row, vector, strict=True) if not (isinstance(x, int) and x == 0))

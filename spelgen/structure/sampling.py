@@ -159,9 +159,9 @@ class Spans:
     def change_bases(self) -> list[np.ndarray]:
         """Echelon basis, for each joint k, of T_k, the span of the changes of M if only joint k moves.
 
-        Each basis is (dim T_k, entries).
+        Each basis is (dim T_k, entries), with the entries in the order ``order``.
         """
-        return list(map(field.row_basis, self.changes))
+        return [field.row_basis(change[:, self.order]) for change in self.changes]
 
     @cached_property
     def order(self) -> list[int]:
@@ -170,12 +170,8 @@ class Spans:
 
     @cached_property
     def varying(self) -> np.ndarray:
-        """Basis of U, the span of all changes of M, (dim U, entries).
-
-        With its columns in the order ``order`` it is an echelon form.
-        """
-        echelon = field.row_basis(np.concatenate(self.change_bases)[:, self.order])
-        return echelon[:, np.argsort(self.order)]
+        """Basis of U, the span of all changes of M, (dim U, entries)."""
+        return field.row_basis(np.concatenate(self.change_bases))[:, np.argsort(self.order)]
 
     @cached_property
     def floats(self) -> np.ndarray:
@@ -191,56 +187,28 @@ class Spans:
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
 
     def outside(self, joints: frozenset[int]) -> np.ndarray:
-        """Return m rows, (m, dim U), that span the changes of M with the positions of joints not in ``joints``.
+        """Return an echelon basis of the changes of M with the positions of joints not in ``joints``, (m, entries).
 
-        The rows are coordinates in the basis `varying` of U, the span of all changes of M.
+        The entries of M are in the order ``order``.
         """
         first, last = min(joints), max(joints)
         # The joints before `first` and after `last` have cached echelon forms, which saves most of the time.
-        between = [self._coordinates[k] for k in range(first, last) if k not in joints]
-        return np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]])
-
-    def changes_of(self, coordinates: np.ndarray) -> np.ndarray:
-        """Return m changes of the entries of M, (m, entries).
-
-        coordinates: of the changes in the basis `varying` of U, (m, dim U).
-        """
-        free = np.ones(len(self.keys), dtype=bool)
-        free[self._pivots] = False
-        changes = np.zeros((len(coordinates), len(self.keys)), dtype=np.uint64)
-        changes[:, self._pivots] = coordinates
-        changes[:, free] = field.product(coordinates, self.varying[:, free])
-        return changes
-
-    @cached_property
-    def _pivots(self) -> list[int]:
-        """Indices of the pivot entries of M: the changes of these entries are the coordinates in `varying`."""
-        return [self.order[pivot] for pivot in field.pivots(self.varying[:, self.order])]
-
-    @cached_property
-    def _coordinates(self) -> list[np.ndarray]:
-        """Basis, for each joint k, of the changes of M with joint k, as coordinates in `varying`, (dim T_k, dim U)."""
-        return [basis[:, self._pivots] for basis in self.change_bases]
+        between = [self.change_bases[k] for k in range(first, last) if k not in joints]
+        return field.row_basis(np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]]))
 
     @cached_property
     def _nearer_root(self) -> list[np.ndarray]:
-        """Basis, for each joint, of the changes of M caused by joints nearer the root.
-
-        Each basis has m rows of coordinates in `varying`, (m, dim U).
-        """
-        return _sums(self._coordinates)
+        """Echelon basis, for each joint, of the changes of M caused by joints nearer the root, (m, entries)."""
+        return _sums(self.change_bases)
 
     @cached_property
     def _nearer_tip(self) -> list[np.ndarray]:
-        """Basis, for each joint, of the changes of M caused by joints nearer the tip.
-
-        Each basis has m rows of coordinates in `varying`, (m, dim U).
-        """
-        return _sums(self._coordinates[::-1])[::-1]
+        """Echelon basis, for each joint, of the changes of M caused by joints nearer the tip, (m, entries)."""
+        return _sums(self.change_bases[::-1])[::-1]
 
 
 def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return a list of echelon bases, (m, dim U) each; element k spans the sum of the spans of ``bases[:k]``."""
+    """Return a list of echelon bases, (m, entries) each; element k spans the sum of the spans of ``bases[:k]``."""
 
     def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
         return field.row_basis(np.concatenate([rows, basis]))

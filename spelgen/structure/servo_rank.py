@@ -53,12 +53,14 @@ def servo_rank(arm: Chain) -> ServoRank:
     _, null = _row_and_null_space(system / norms)
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
-    # [1] Smaller differences are rounding errors; the errors of null vectors are about a thousand times the errors of
-    # the matrix.
+    # [1] Relative changes of two parameters that differ by less are equal. Rounding errors of null vectors are about a
+    # thousand times larger than the rounding errors of the matrix.
     equal, kp = 1e-6, changes[:, :1]
-    same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal  # (n, n)
+    # (n, n): True for two joints whose kp change by the same factor in the whole null space.
+    same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal
     groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in same)
-    differs = np.abs(changes - kp).max(axis=-1) > equal  # (n, K)
+    # (n, number of PARAMETERS): True for a parameter of a joint that does not change by the factor of the joint's kp.
+    differs = np.abs(changes - kp).max(axis=-1) > equal
     undetermined = [(PARAMETERS[k], joint) for k, joint in np.argwhere(differs.T).tolist()]
     return ServoRank(tuple(groups), tuple(undetermined))
 

@@ -18,7 +18,7 @@ from lxml import etree
 
 from spelgen.labels import counted
 from spelgen.urdf import mesh_child
-from spelgen.urdf.document import urdf_bytes
+from spelgen.urdf.document import read_document
 
 Mesh = tuple[np.ndarray, np.ndarray]
 COUNTS = {"box": 3, "cylinder": 2, "sphere": 1, "mesh": 3}
@@ -73,10 +73,9 @@ def link_shapes(
         links: Names of the links whose shapes are returned.
         faces: Largest number of triangles of all meshes together; meshes with more triangles are simplified.
     """
-    root = etree.fromstring(urdf_bytes(urdf), etree.XMLParser(resolve_entities=False, no_network=True))
     shapes: list[LinkShape] = []
     unread: dict[str, tuple[str, ...]] = {}
-    for link in root.iterfind("link"):
+    for link in read_document(urdf).root.iterfind("link"):
         name = link.get("name", "")
         for each in link.iterfind(element) if name in links else ():
             # Shapes are needed for drawings only: an invalid shape is listed as unread, and the others are returned.

@@ -86,7 +86,10 @@ def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
 
 
 def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
-    """Yield one diagnostic that lists, per kind of limit, the moving joints without it; they count as unlimited."""
+    """Yield one diagnostic: for each kind of limit, the moving joints for which it is absent.
+
+    Such joints count as unlimited.
+    """
     lacking = {
         "position": [x.name for x in joints if x.type != "continuous" and None in (x.lower, x.upper)],
         "velocity": [x.name for x in joints if x.velocity is None],

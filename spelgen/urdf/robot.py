@@ -130,12 +130,12 @@ class Robot:
 
     @cached_property
     def joint_above(self) -> dict[str, UrdfJoint]:
-        """For each link except the root, the joint of which the link is the child, by the name of the link."""
+        """The joint above each link except the root, by the name of the link, which is the child of the joint."""
         return {joint.child: joint for joint in self.joints}
 
     @cached_property
     def joints_below(self) -> dict[str, tuple[UrdfJoint, ...]]:
-        """For each link, the joints of which the link is the parent, by the name of the link."""
+        """The joints below each link, by the name of the link, which is the parent of these joints."""
         # Links without such joints have an empty entry, so that no caller needs a default.
         below: dict[str, tuple[UrdfJoint, ...]] = {link.name: () for link in self.links}
         for joint in self.joints:

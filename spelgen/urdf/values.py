@@ -61,8 +61,8 @@ class Notes:
 class Element:
     """An element of a URDF with checked access to its attributes.
 
-    notes: errors and warnings about the element are added to these. xml: None if the element is absent; it then has no
-    attributes. where: name of the element in messages.
+    notes: the list to which errors and warnings about the element are added. xml: None if the element is absent; it
+    then has no attributes. where: name of the element in messages.
     """
 
     notes: Notes

@@ -75,7 +75,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
 
 
 def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
-    """Return the parameters in which all joints have a dead zone, and all parameters are fitted (`active`).
+    """Return the parameters with a dead zone at every joint, and with all parameters marked as fitted (`active`).
 
     Half the dead zone is set to ``fraction`` times the static error, dry friction / kp. Coulomb friction is reduced by
     the same fraction, so that the static error remains about the same (exactly, if there is only Coulomb friction).
@@ -86,7 +86,7 @@ def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) 
     with torch.no_grad():
         dry = sliding_friction(model.friction, rollouts.motion.qd, rollouts.load.gravity)
     joints[row(DEAD_ZONE)] = fraction * dry / model.servo.kp().detach()
-    # the parameter is the logarithm of Coulomb friction
+    # The parameter is the logarithm of Coulomb friction, so the logarithm of the factor 1 - fraction is added.
     joints[row(COULOMB)] += torch.tensor(1 - fraction).log()
     return replace(x, joints=joints, active=torch.ones_like(x.active))
 

@@ -1,6 +1,7 @@
 """Least-squares fits to windows: the initial guess of a servo fit, and the baseline of linear second-order servos.
 
-The initial guess is the linear least-squares solution for the command error u - q. At a joint with a position servo,
+The initial guess is the linear least-squares solution for the command error u - q, the commanded minus the measured
+position. At a joint with a position servo,
 kp (u - q) = kd qd + M qdd + gravity + friction. The command error is therefore linear in the ratios of the parameters
 to kp. The gravity torque is computed with the URDF's masses: its coefficient is 1 / kp.
 """
@@ -65,7 +66,7 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
             torque of the bodies, and 1.
         errors: (W, K, n), command errors [rad, m] at the K intervals of each of W windows.
     """
-    matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, M, 5)
+    matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, W K, 5)
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
     # The driver gelsd is used, because torch's default driver chooses its pivots differently in each run.
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution

@@ -94,7 +94,7 @@ class ParameterMap:
 
     def named(self, joints: Tensor) -> dict[str, Tensor]:
         """Return P sets of joint parameters (P, p, n) as tensors by name, each (P, 1, n) or (P, 1, n, K)."""
-        columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)  # (P, 1, n, K)
+        columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)  # (P, 1, n, K) per parameter
         named = {}
         for (name, tensor), column in zip(self.tensors.items(), columns, strict=True):
             named[name] = column.reshape(*column.shape[:2], *tensor.shape)

@@ -88,7 +88,7 @@ class ServoProblem:
         return self.of(self.rollouts, self.noise, self.residual(x))
 
     def refined(self, steps: int, difference_step: float) -> ServoProblem:
-        """Return the problem with other integration steps per sample interval and another finite-difference step."""
+        """Return the problem with a new number of integration steps per sample interval and finite-difference step."""
         windows = replace(self.rollouts.windows, steps=steps)
         return replace(
             self, rollouts=replace(self.rollouts, windows=windows, difference_step=difference_step)
@@ -146,7 +146,9 @@ class ServoProblem:
             # the errors of a joint depend only on the parameters of this joint and on shared parameters
             jacobian = torch.cat([of_joints[..., joint], of_shared[..., joint]]).transpose(0, 1)
             rows = torch.cat([torch.arange(p) * n + joint, p * n + torch.arange(r)])
-            weighted = jacobian * weights[:, None, :, joint]  # (W, p + r, K')
+            weighted = (
+                jacobian * weights[:, None, :, joint]
+            )  # (W, p + r, K'): p parameters of the joint, r shared ones
             curvature[:, rows[:, None], rows] += weighted @ jacobian.mT
             descent[:, rows] -= (weighted @ errors[..., joint].unsqueeze(-1)).squeeze(-1)
         return NormalEquations(curvature, descent)

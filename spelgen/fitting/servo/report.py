@@ -107,9 +107,9 @@ def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
 def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
     """Return booleans (m,): whether the logs distinguish each of m parameters from all other parameters.
 
-    The test is an upper bound of the variance inflation factor. For example, the derivatives of the errors with respect
-    to a dead zone and to dry friction are proportional at joints without gravity load, so that a linear approximation
-    cannot distinguish the two.
+    A parameter is distinguished if an upper bound of its variance inflation factor is small. For example, a linear
+    approximation cannot distinguish a dead zone from dry friction at joints without gravity load, since the derivatives
+    of the errors with respect to both are proportional.
 
     Args:
         blocks: normal equations of B blocks, (B, k, k) and (B, k).
@@ -155,7 +155,8 @@ def ratios_with_deviations(
     qd, gravity = rollouts.motion.qd, rollouts.load.gravity
     values = evaluate_with(rollouts.model, tensors, lambda model: ratios(model, qd, gravity))
     p, n = parameters.prior_mean.joints.shape
-    # covariance of each joint's parameters and of the delay, which is the last parameter: (p + 1, p + 1, n)
+    # `blocks` (p + 1, p + 1, n) is, for each joint, the covariance of its p parameters and of the delay, which is the
+    # last of all parameters.
     index = torch.cat([torch.arange(p * n).view(p, n), torch.full((1, n), len(solution.covariance) - 1)])
     blocks = solution.covariance[index.unsqueeze(1), index.unsqueeze(0)]
     result = {}

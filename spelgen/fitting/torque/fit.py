@@ -102,12 +102,12 @@ def fit_torque(
     """Set the parameters of a model of rigid bodies to their MAP estimate.
 
     Args:
-        model: model whose current parameters are the prior mean. Before a fit of all parameters, nominal friction that
-            exceeds the standard deviation of a drive's logged torque is reduced to it.
+        model: model whose current parameters are the prior mean. Before a fit of all parameters, the nominal friction
+            of each drive is limited to the standard deviation of the drive's logged torque.
         samples: samples with torques as logged, (T, n) [Nm, N].
         prior: initial standard deviations of the prior; None: default.
-        adapt: group of parameters to estimate (see `TorqueFit`); the prior mean is then their current values. Residual
-            terms, and the prior widths of a load, are then fixed. None: estimate all parameters.
+        adapt: group of parameters to estimate (see `TorqueFit`). The fit of a group does not change residual terms,
+            and the fit of a load keeps the given prior widths. None: estimate all parameters.
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.of(samples, TUNING.decimation)

@@ -77,11 +77,11 @@ class TorqueJacobian:
         inputs = model.inputs
         self._gain_rows = inputs.gain_rows if isinstance(inputs, MotorInputs) else torch.zeros(0).long()
         self._motors = motors_of(model)
-        self._affects = self._motors != 0  # (n, n): whether a drive affects a joint's torque
+        self._affects = self._motors != 0  # (n, n), entry (i, j): whether drive i affects joint j
         self._affected = self._affected_joints()
         self._colours = _colour(self._affects.double().mT @ self._affects.double() > 0)
-        # Regressors do not depend on x, so they are computed once. Blocks of samples limit the memory of the copies in
-        # `_compressed_jacobian`.
+        # Regressors do not depend on x, so they are computed once. The samples are divided into blocks to limit the
+        # memory, since `_compressed_jacobian` copies the parameters for each sample of a block.
         self._blocks = [self._with_regressors(block) for block in samples.blocks(TUNING.block)]
 
     @cached_property
@@ -109,8 +109,8 @@ class TorqueJacobian:
     def logged_scale(self, x: torch.Tensor) -> torch.Tensor:
         """Return initial gain / current gain per joint, (n,) [1]; 1 for fixed gains.
 
-        Joint torques times this factor have the scale of the logged torques, converted to joint torques by the initial
-        gains.
+        The measured joint torque is proportional to the current gain. Multiplied by this factor, the torque has the
+        initial gain, and does not depend on the fitted gains.
         """
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 
@@ -120,7 +120,8 @@ class TorqueJacobian:
         parameters: one set of parameters by name, or a batch (...) of sets.
         """
         ones = torch.ones(self.model.n).double()
-        for name in self.rigid.names("gains"):  # logarithms of the gains, joint torque / logged torque
+        # A gain is joint torque / logged torque; the parameters are the logarithms of the gains.
+        for name in self.rigid.names("gains"):
             change = parameters[name] - self.rigid.initial[name]
             return ones.expand(*change.shape[:-1], -1).index_copy(-1, self._gain_rows, (-change).exp())
         return ones
@@ -228,7 +229,8 @@ class TorqueJacobian:
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
         for name in self.rigid.names(*LOGARITHMIC_GROUPS):
-            # log(c + c step) = log c + log1p(step): equal to log c + step to first order, and a straight line in c
+            # The parameter is log c. A step s > 0 changes c along a straight line: log(c + c s) = log c + log1p(s),
+            # which equals log c + s to first order.
             parameters[name] = (
                 parameters[name]
                 - change[name]
@@ -299,19 +301,18 @@ class TorqueJacobian:
     def _compressed_jacobian(
         self, parameters: NamedTensors, block: _RegressorBlock
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-        """Return the residual of the logged torque, and the Jacobian of the modelled torque, compressed over joints.
+        """Return the residual of the logged torque, and minus its Jacobian, compressed over joints.
 
         Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive may
         have the same colour. Each parameter then affects at most one joint of a colour, so that the gradient of the sum
-        of the torques of one colour contains the Jacobian rows of all its joints. One reverse pass per colour (mostly
-        one) replaces n passes. Each sample has its own copy of the parameters, so that a pass computes the gradients of
-        all samples. A gradient of several outputs at once (`is_grads_batched`) would import torch's symbolic shapes,
-        which takes half a second.
+        of the torques of one colour contains the Jacobian rows of all its joints. One reverse pass per colour (most
+        arms have one colour) replaces n passes. Each sample has its own copy of the parameters, so that a pass computes
+        the gradients of all samples.
 
         Returns:
-            Residual, (T, n) [Nm, N]. Minus the derivatives of the residual with respect to the K' parameters that are
-                not of bodies, (T, K') per colour. Minus the derivatives with respect to the gravity torque on each
-                drive, (T, n) per colour.
+            Residual, (T, n) [Nm, N]. Two lists with a matrix per colour: minus the derivatives with respect to the K'
+                parameters that are not of bodies, (T, K'), and with respect to the gravity torques on the drives, (T,
+                n).
         """
         copies = {}
         for name, tensor in parameters.items():
@@ -324,6 +325,8 @@ class TorqueJacobian:
             residual = self._torque_residual(per_sample, block, load)[0] * self._logged_scale(per_sample)
         parameter_columns, load_columns, colours = [], [], torch.tensor(self._colours)
         for colour in range(max(self._colours) + 1):
+            # A gradient of all colours at once (`is_grads_batched`) would import torch's symbolic shapes, which takes
+            # half a second.
             total = -residual[:, colours == colour].sum()
             gradients = gradient(total, [load, *copies.values()], retain_graph=True, materialize_grads=True)
             load_columns.append(gradients[0])

@@ -39,14 +39,14 @@ class JointFunction:
     """A residual term of one joint, as a linear model of P = L + W weights on T samples.
 
     In the model, the term has a parameter with W entries for the joint, for example spline coefficients, in units of
-    `scale`. The linear model has L more weights: coefficients of trends, which add to all entries (for example a
-    straight line over all splines). The first L weights are of the trends, the other W of the single entries.
+    `scale`. The linear model has L more weights, the coefficients of trends. A trend adds to all entries, for example a
+    straight line over all spline coefficients. The first L weights are of the trends, the other W of single entries.
 
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
     features: (T, P) columns after orthogonalization; equal to the columns if the term is a friction factor.
-    direction: (n,) joint torques per torque of the term.
-    trends: (W, L) entries of each trend.
+    direction: (n,) joint torques per unit torque of the term, since a coupled drive acts on several joints.
+    trends: (W, L) changes of the entries per unit weight of each trend.
     groups: (P,) index of the group of each weight; a group has one prior precision.
     friction: (T,) friction torque with the current factor, if the term is a friction factor: the weights then give the
         logarithm of the factor, and columns @ weights is the torque linearized at the current factor. None: the term is
@@ -92,7 +92,8 @@ class JointFunction:
         if self.friction is None:
             return features @ weights
         friction = self.friction[rows]
-        # The columns are splines times friction, so the log factor is 0 / 0 at zero friction: replace it by zero.
+        # The columns of a friction factor are splines times friction, so the log factor is columns @ weights divided by
+        # friction. At zero friction the quotient 0 / 0 is replaced by zero.
         log_factor = (features @ weights.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT)) / friction
         return friction * log_factor.nan_to_num().expm1()
 
@@ -126,7 +127,10 @@ class ProjectedTerms(NamedTuple):
     candidates: tuple[JointFunction, ...]
 
     def write(self, model: ArmModel, torque_residual: torch.Tensor) -> None:
-        """Set the residual terms of the model to the eliminated weights for a torque residual (T, n)."""
+        """Set the residual terms of the model to the ridge solution of their weights.
+
+        torque_residual: residual (T, n) [Nm, N] of the model without the eliminated terms.
+        """
         weights = {joint: terms.weights(torque_residual[:, joint]) for joint, terms in self.terms.items()}
         for candidate in self.candidates:
             joint, count = candidate.joint, candidate.columns.shape[1]
@@ -148,7 +152,7 @@ def refit_terms(
 
     Args:
         model: model with residual terms.
-        samples: samples with the torque residual of the model and its current terms.
+        samples: samples with the torque residual of the model, whose current residual terms are included.
         projection: projection onto the rigid-body and friction model.
         selected: terms to refit.
         correlation_length: (n,) number of samples per independent error.

@@ -154,11 +154,15 @@ def least_squares_residual(
 
 
 def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
-    """Return the pseudo-inverse (K, K) of a curvature (K, K); the rank is decided after scaling to a unit diagonal."""
+    """Return the pseudo-inverse (K, K) of a curvature matrix (K, K).
+
+    Small eigenvalues are treated as zero. The matrix is scaled to a unit diagonal before, since the parameters have
+    different units.
+    """
     length = curvature.diagonal().sqrt()
     scale = torch.where(length > 0, 1 / length, 0.0)
     scale = scale * scale[:, None]
-    # Eigenvalues below the rounding errors of the sums of products are treated as zero.
+    # The curvature is a sum over samples: eigenvalues below the rounding errors of this sum are treated as zero.
     inverse: torch.Tensor = torch.linalg.pinv(curvature * scale, rtol=1e-10, hermitian=True)
     return inverse * scale
 
@@ -200,7 +204,7 @@ def bayesian_ridge(
         correlation_length: number of samples per independent error, by which the log likelihood is divided.
     """
     gram, moment, square = products[:-1, :-1], products[:-1, -1], float(products[-1, -1])
-    member = F.one_hot(groups.long()).double()  # (P, G)
+    member = F.one_hot(groups.long()).double()  # (P, G): 1 if a weight is in a group
     excited = gram.diagonal() > 0
     # `size` is the number k of weights of each group, `variance` is 1 / alpha.
     size, variance = member.sum(dim=0), square / count

@@ -48,7 +48,7 @@ def fit_networks(
     """
     count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
-    # The errors of a joint of constant torque would have an infinite weight.
+    # Without this lower bound, the errors of a joint of constant torque would have an infinite weight.
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def summands() -> Iterator[torch.Tensor]:
@@ -101,14 +101,15 @@ def select_networks(
 
     Args:
         model: model with residual terms; weights of accepted networks are written to it.
-        samples: samples with the torque residual of the model and its current terms.
+        samples: samples with the torque residual of the model, whose current residual terms are included.
         correlation_length: number of samples per independent error.
     """
     # The time of L-BFGS is proportional to the number of samples, and successive samples are correlated, so that a
     # subset suffices.
     step = -(-len(samples.q) // SELECTION.network_samples)
     subset = ResidualSamples(*(column[::step] for column in samples))
-    # The target is the torque that the sum of all residual terms should have, single-joint terms included.
+    # The target is the torque that all residual terms together should explain: the torque residual of the model plus
+    # the torque of the current single-joint terms.
     with torch.no_grad():
         current = residual_torque(model, *subset[:3])
     subset = subset._replace(torque_residual=subset.torque_residual + current)

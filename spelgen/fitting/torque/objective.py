@@ -41,7 +41,11 @@ FITTED = {
 
 
 class TorqueObjective(Objective):
-    """Objective of a fit to torques: `begin` runs the whole fit, in seconds to minutes, before a run folder exists."""
+    """Objective of a fit to torques.
+
+    `begin` runs the whole fit, which takes seconds to minutes, so that no checkpoints are needed. A run folder is
+    written after the fit has succeeded.
+    """
 
     name: ClassVar[str] = "torque"
     config: TorqueFit
@@ -115,7 +119,10 @@ def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
 
 
 def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:
-    """Return the delay of the torques relative to the positions in the logs, from the regressor of a model."""
+    """Return the delay of the torques relative to the positions in the logs, or a coupling of motors that explains it.
+
+    With the delay, a least-squares fit of inertial and friction parameters has the smallest torque residual.
+    """
     with torch.no_grad():
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
     drives = Drives(inputs, motors_of(model).numpy())

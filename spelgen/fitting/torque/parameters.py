@@ -1,9 +1,9 @@
 """Parameters of rigid bodies, drives and friction, which a fit to torques estimates, as one vector x (K,).
 
 The prior of x is Gaussian; the mean is x before the fit. Inertial parameters of different links are independent.
-Nominal friction and armatures are derived from the effort limits of the drives, and their errors have a common factor
-(torques before or after the gear, gears of one manufacturer). The standard deviation of this common factor is therefore
-larger than the standard deviation of the deviations of single joints.
+Nominal friction and armatures are derived from the effort limits of the drives. Their errors are similar at all joints,
+for example if all limits are torques before the gear. The prior of a parameter is therefore a common factor of all
+joints times a factor of the single joint, and the common factor has the larger standard deviation.
 """
 
 from __future__ import annotations
@@ -132,9 +132,10 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
 
     The torque is linear in the inertial parameters, but not in the log-Cholesky parameters. The linear model of a
     Gauss-Newton step is therefore exact along this line, but not along a straight line in the log-Cholesky parameters.
-    The pseudo-inertia is C S C^T with S = T T^T and T = T(raw). To first order the step changes T by X = dT/draw step,
-    and S by T (T^-1 X + (T^-1 X)^T) T^T. This change is added to S. It is reduced by a factor if S would not remain
-    positive definite.
+
+    The pseudo-inertia of a body is C S C^T, with a constant C and S = T T^T, where T is the upper triangular matrix
+    `body_factor(raw)`. To first order, the step changes T by X, and S by T (T^-1 X + (T^-1 X)^T) T^T. This change is
+    added to S; if S would not remain positive definite, a fraction of the change is added.
 
     Args:
         raw: (B, 10) log-Cholesky parameters of B bodies.
@@ -165,7 +166,10 @@ def upper_cholesky(matrix: torch.Tensor) -> torch.Tensor:
 
 
 def log_cholesky_parameters(factor: torch.Tensor) -> torch.Tensor:
-    """Return the log-Cholesky parameters (B, 10) of factors (B, 4, 4): the inverse of `body_factor`."""
+    """Return the log-Cholesky parameters (B, 10) whose upper triangular matrices are `factor` (B, 4, 4).
+
+    This function is the inverse of `body_factor`.
+    """
     scale = factor.diagonal(dim1=-2, dim2=-1)
     radii, mass = scale[:, :3].log(), scale[:, 3:].log()
     logarithms = torch.cat([radii - mass, 2 * mass], dim=-1)

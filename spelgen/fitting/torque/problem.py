@@ -204,7 +204,7 @@ class TorqueProblem:
         return self.of_all_parameters(torch.linalg.inv(curvature))
 
     def of_all_parameters(self, free_covariance: torch.Tensor) -> torch.Tensor:
-        """Return the covariance (K, K) of all K parameters, which is zero for fixed parameters.
+        """Return a covariance of free parameters as a covariance (K, K) of all parameters, zero for fixed ones.
 
         free_covariance: covariance of the k free parameters, (k, k).
         """
@@ -308,8 +308,8 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     The torque error is the sum of filtered white noise, correlated over 0.06 s, and of the model's error, correlated
     over tenths of a second to seconds. The integrated correlation time of the sum is estimated from the residual.
     Fitted parameters reduce the correlation of the residual, which is therefore corrected first
-    (`RigidProjection.errors`). The result is the weighted mean of this estimate and its prior mean, with the numbers of
-    independent errors as weights.
+    (`RigidProjection.errors`). The result is the weighted mean of the estimated correlation time and its prior mean
+    `TUNING.correlation_time`, with the numbers of independent errors as weights.
 
     The correlation time is estimated once, after the choice of the friction model, since the errors of a wrong friction
     model last longer. Updates in the outer iterations would be unstable: a joint with a long correlation time has a
@@ -320,7 +320,7 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # The result is the weighted mean of the estimate and the prior mean, with numbers of independent errors as weights.
+    # `weight` is the number of independent errors of the segments divided by the weight of the prior mean.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

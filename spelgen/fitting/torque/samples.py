@@ -46,7 +46,7 @@ class TorqueSamples:
 
     @classmethod
     def of(cls, trajectories: Iterable[DynamicsSamples], decimation: int = 1) -> TorqueSamples:
-        """Return every `decimation`-th sample of each trajectory."""
+        """Return the concatenation of all trajectories, with every `decimation`-th sample of each."""
         decimated, count, interval = [], 0, 0.0
         names: dict[str, int] = {}
         recordings = []

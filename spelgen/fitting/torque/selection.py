@@ -85,7 +85,7 @@ def select_functions(
 
     Args:
         model: model with residual terms.
-        samples: samples with the torque residual of the model and its current terms.
+        samples: samples with the torque residual of the model, whose current residual terms are included.
         projection: projection onto the rigid-body and friction model.
         selected: terms that were selected before, which are no candidates.
         correlation_length: (n,) number of samples per independent error.
@@ -109,8 +109,9 @@ def select_functions(
 
 
 def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Return the largest plausible standard deviation (n,) [Nm, N] of a term's torque, by the name of its parameter.
+    """Return the largest plausible standard deviations (n,) [Nm, N] of the torques of residual terms.
 
+    The result is a dict whose keys are the names of the terms' parameters.
     The bounds apply to terms that are selected on one or two recordings. Springs and gas cylinders balance a load, so
     the bound of a smooth torque is zero for joints without gravity load.
 
@@ -163,9 +164,8 @@ def _best(
         if reduction_within is not None and after[within].sum() < before[within].sum():
             accepted = SelectedTerm(candidate.parameter, candidate.joint, reduction_within)
             best_within = _better(best_within, accepted)
-    # A candidate that passes the tests on all held-out samples, positions outside the fitted range included, is
-    # preferred: there even the torque of a spring has extrapolation errors, but other functions of position have larger
-    # errors.
+    # A candidate that passes the tests on all held-out samples is preferred: its errors are also small at positions
+    # outside the fitted range, where most functions of position have large errors.
     return best or best_within
 
 
@@ -249,5 +249,6 @@ def significant_reduction(
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:
         return None
     mean = float(g.mean())
-    reduction = 2 * mean / (1 + mean)  # (b - a) / b for the mean of g = (b - a) / (b + a)
+    # The relative reduction (before - after) / before is computed from the mean of g.
+    reduction = 2 * mean / (1 + mean)
     return reduction if reduction > SELECTION.min_reduction else None

@@ -39,8 +39,8 @@ def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
     estimate = alternate(problem, state)
     if problem.adapt is not None or estimate.problem.prior.plausible or problem.compensated.all():
         return estimate
-    # So large a correction of the masses is implausible: more likely the drives compensate friction, and the masses
-    # absorbed the compensation. Refit with compensation at all joints.
+    # The fitted masses differ implausibly from the URDF (`ParameterPrior.plausible`). More likely the drives compensate
+    # friction, and the masses absorbed the compensation: refit with compensation at all joints.
     problem = replace(problem, compensated=torch.ones_like(problem.compensated))
     compensated = alternate(*_annealed_fit(problem, estimate.state.steps))
     return compensated if compensated.problem.prior.plausible else estimate
@@ -141,7 +141,9 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     """
     rigid = estimate.problem.jacobian.rigid
     index = rigid.unflatten(torch.arange(len(estimate.state.x)))
-    effects = torch.stack([index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1)  # (n, effects)
+    effects = torch.stack(
+        [index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1
+    )  # (n, effects): indices in x
     plain = _without(estimate, effects.flatten())
     # penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974)
     rejected = _rejected(log_likelihood_ratio(estimate, plain) - 2)
@@ -181,7 +183,7 @@ def fraction_occam_factor(estimate: TorqueEstimate) -> torch.Tensor:
     """
     rigid = estimate.problem.jacobian.rigid
     (name,) = rigid.names("fractions")
-    fractions = rigid.unflatten(torch.arange(len(estimate.state.x)))[name]  # (n, elements)
+    fractions = rigid.unflatten(torch.arange(len(estimate.state.x)))[name]  # (n, elements): indices in x
     block = fractions.unsqueeze(-1), fractions.unsqueeze(-2)
     prior: torch.Tensor = torch.linalg.inv(estimate.problem.prior.precision)[block]
     return prior.logdet() - estimate.covariance[block].logdet()

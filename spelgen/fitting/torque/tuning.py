@@ -92,11 +92,11 @@ class TorqueTuning:
     # motion is then unreliable.
     weak_acceleration: float = 2.0
     # [1] Prior standard deviations of an adapted fit, for each value of the option `adapt`; the prior mean is the
-    # source fit. load: the mass is known to a factor of twenty. With a width of 10 in place of 3, a fit to half a
-    # second of motion of a UR10e has an error of 27 times the variance of the torque. friction: temperature changes
-    # the common factor of all joints by tens of per cent, the deviations of single joints by less (Bittencourt and
-    # Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: units of one arm model also differ in mass, by a
-    # few per cent.
+    # source fit. load: the mass is known to a factor of twenty. With the standard deviation 10, the mean squared torque
+    # error after a fit to half a second of motion of a UR10e is 27 times the variance of the torque. friction:
+    # temperature changes the common factor of all joints by tens of per cent, the factors of single joints by less
+    # (Bittencourt and Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: arms of one model also differ in
+    # mass, by a few per cent.
     priors: Mapping[Adaptation, GaussianPrior] = field(
         default_factory=lambda: {
             "load": GaussianPrior(bodies=3.0),

@@ -1,0 +1,108 @@
+"""Delays of single joints, copied torques, wrongly stated units: each is named with the line that mends it."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_log_geometry import arm, excitation, mended, recorded, told  # noqa: F401  (a fixture)
+
+from spelgen.arm.configured_arm import load_arm
+from spelgen.log_checks.check_logs import check_logs
+from spelgen.logs.read import write_logs
+from spelgen.settings.log_mapping import LogMapping
+
+
+def delayed(log, k, delay, motion, torque):
+    def late(values):
+        values = values.copy()
+        values[:, k] = np.interp(log.t - delay, log.t, values[:, k])
+        return values
+
+    q, qd = (late(log.q), late(log.qd)) if motion else (log.q, log.qd)
+    return replace(log, q=q, qd=qd, tau=late(log.tau) if torque else log.tau)
+
+
+@pytest.mark.parametrize(("motion", "torque"), [(True, False), (False, True), (True, True)])
+def test_the_delay_of_one_joint_is_named_and_mended(arm, motion, torque, tmp_path):  # noqa: F811
+    rng = np.random.default_rng(len(arm.chain.name) + 2 * motion + torque)
+    # the first two joints: the delay of a light link may be invisible
+    k, delay = int(rng.integers(2)), float(rng.uniform(0.06, 0.14) * rng.choice([1, -1]))
+    log = recorded(arm, int(rng.integers(1000)), excitation, noise=0.01)
+    wrong = delayed(log, k, delay, motion, torque)
+    error = told(arm, wrong)
+    assert "--accept joint-delay" in error and f"joint {arm.chain.joint_names[k]!r}" in error
+    assert ("later" if delay > 0 else "earlier") in error
+    write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
+    again, (read,) = mended(arm, error, tmp_path / "log.csv")
+    inner = (read.t > 0.2) & (read.t < log.t[-1] - 0.2)
+    for name in ("q", "qd"):
+        expected = np.stack([np.interp(read.t, log.t, x) for x in getattr(log, name).T], axis=1)
+        # within 15 ms of motion
+        bound = 0.015 * np.abs(np.gradient(expected, read.t, axis=0)).max(axis=0) + 1e-6
+        assert (np.abs(getattr(read, name) - expected)[inner].max(axis=0) <= bound).all()
+    assert check_logs([read], again).errors == ()
+
+
+def test_torques_of_all_joints_that_are_late_have_one_line(arm):  # noqa: F811
+    log = recorded(arm, 12)
+    late = np.stack([np.interp(log.t - 0.09, log.t, x) for x in log.tau.T], axis=1)
+    error = told(arm, replace(log, tau=late))
+    assert "'torque_delay: 0.0" in error and "all joints" in error and "delay: {" not in error
+
+
+def test_a_copied_torque_is_an_error(arm):  # noqa: F811
+    rng = np.random.default_rng(len(arm.chain.name))
+    k, other = rng.choice(len(arm.chain.joint_names), 2, replace=False)
+    log = recorded(arm, 11)
+    tau = log.tau.copy()
+    tau[:, k] = 1.7 * log.tau[:, other]
+    error = told(arm, replace(log, tau=tau))
+    assert "--accept torque-copied" in error
+    assert repr(arm.chain.joint_names[k]) in error and repr(arm.chain.joint_names[other]) in error
+
+
+@pytest.mark.parametrize(
+    ("stated", "logged"), [("deg", "rad"), ("turns", "rad"), ("turns", "deg"), ("rad", "deg")]
+)
+def test_a_unit_that_the_mapping_states_wrongly_is_named(arm, stated, logged):  # noqa: F811
+    sizes = {"rad": 1.0, "deg": np.pi / 180, "turns": 2 * np.pi}
+    factor = np.where(np.array(arm.chain.joint_types) == "revolute", sizes[stated] / sizes[logged], 1.0)
+    entries = {}
+    for name, joint_type in zip(arm.chain.joint_names, arm.chain.joint_types, strict=True):
+        if joint_type == "revolute":
+            entries[name] = {"units": {"q": stated, "qd": f"{stated}/s"}}
+    mapping = LogMapping.model_validate({"joints": entries})
+    log = replace(recorded(arm, 13), mapping=mapping)
+    error = told(arm, replace(log, q=log.q * factor, qd=log.qd * factor), mapping)
+    assert "--accept joint-unit" in error and f"q: {logged}, qd: {logged}/s" in error
+
+
+def test_torques_in_ticks_are_named_although_inertia_dominates(robots):
+    """Gravity is a small part of the torque: the ratio of the gravity of a fit to the URDF's shows the unit."""
+    small = load_arm(robots / "two_link.urdf")
+    log = recorded(small, 1, noise=0.01)
+    error = told(small, replace(log, tau=log.tau * 1000 / 30))
+    gains = list(map(float, re.findall(r"gain: ([\d.e-]+)", error)))
+    np.testing.assert_allclose(np.log(gains), np.log(0.03), atol=np.log(1.6))
+
+
+@pytest.mark.parametrize("late", ["q", "qd"])
+def test_velocities_that_are_later_or_earlier_than_positions_are_named(arm, late):  # noqa: F811
+    log, k = recorded(arm, 14), 1
+    values = getattr(log, late).copy()
+    values[:, k] = np.interp(log.t - 0.07, log.t, values[:, k])
+    error = told(arm, replace(log, **{late: values}))
+    size, order = re.search(r"qd that is ([\d.]+) ms (later|earlier) than dq/dt", error).groups()
+    assert abs(float(size) - 70) < 10 and order == ("later" if late == "qd" else "earlier")
+    assert "write 'velocity: differentiated'" in error and repr(arm.chain.joint_names[k]) in error
+
+
+@pytest.mark.parametrize(("stated", "logged"), [("mm", "m"), ("m", "mm")])
+def test_a_wrong_unit_of_a_prismatic_joint_is_named(robots, stated, logged):
+    rpr = load_arm(robots / "rpr.urdf")
+    log, size = recorded(rpr, 3, noise=0.01), {"m": 1.0, "mm": 1e-3}
+    factor = np.array([1.0, size[stated] / size[logged], 1.0])
+    mapping = LogMapping.model_validate({"joints": {"joint2": {"units": {"q": stated, "qd": f"{stated}/s"}}}})
+    error = told(rpr, replace(log, q=log.q * factor, qd=log.qd * factor, mapping=mapping), mapping)
+    assert f"'joints: {{joint2: {{units: {{q: {logged}, qd: {logged}/s}}}}}}'" in error
