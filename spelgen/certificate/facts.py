@@ -188,9 +188,10 @@ def _diagonal_reason(axes: Axes, joint: int) -> Reason:
 
 
 def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason for a constant or zero entry of the last joint, if its body is dynamically balanced.
+    """Return the reason why an entry in the last row of M is constant or zero, if the last body is dynamically balanced.
 
-    Such an entry is Izz of the body times the cosine of the angle between the axes of the two joints.
+    The entry of the last joint and an earlier joint is then Izz of the last body times the cosine of the angle between
+    the axes of both joints. Return None if the body is not balanced or the entry is in another row.
     """
     last, earlier = len(axes.prismatic) - 1, entry.column
     if not axes.balanced or entry.row != last:

@@ -30,9 +30,9 @@ def call(callee: str, *positional: object, **named: object) -> Call:
 
 
 def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
-    """Return the text ``start`` followed by ``value``.
+    """Return the text ``start`` followed by the source text of ``value``.
 
-    The result is one line if the line with ``reserved`` more characters is not too long, otherwise several lines.
+    The result is one line if this text and ``reserved`` further characters fit into a line, otherwise several lines.
     """
     text = start + flat(value)
     if indent + len(text) + reserved < WIDTH or not _items(value) or _alike(value):

@@ -24,8 +24,8 @@ class EvaluationTuning:
     explained_for_contacts: float = 0.99
     # [1] Fraction of the torque variance that a model must explain for feed-forward control.
     explained_for_feed_forward: float = 0.95
-    # [1] Fraction of the torque variance that a model must explain for gravity compensation: on most logs gravity
-    # and friction explain about this fraction.
+    # [1] Fraction of the torque variance that a model must explain for gravity compensation. On most logs gravity and
+    # friction explain about this fraction, so a model that explains less lacks one of them.
     explained_for_gravity: float = 0.8
     # [1] Largest relative prediction error (RMS error / RMS change of q and qd over the horizon) for which the
     # assessment recommends simulation.

@@ -115,7 +115,10 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
 
 
 def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return expressions in q and qd, (n, 1) each, for the symbols of the residual terms; qd: None if not needed."""
+    """Return the values of the residual terms, as expressions in q and qd, by the names of their symbols.
+
+    q, qd: symbols, (n, 1) each. qd: None if only quantities are needed that do not depend on velocity.
+    """
     residuals = model.residuals
     values: dict[str, ca.MX] = {}
     encoded = ca.vertcat(ca.cos(q), ca.sin(q), q)

@@ -156,7 +156,10 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
 
 
 def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> Values:
-    """Return the torch model's outputs of an entry point by name, (states, ...), for inputs (states, n)."""
+    """Return the outputs of one entry point, computed by the torch model, as arrays (states, ...) by output name.
+
+    name: name of the entry point. inputs: arrays (states, n) by input name.
+    """
     entry = ENTRY_POINTS[name]
     arguments: list[Tensor] = []
     for key in entry.inputs:

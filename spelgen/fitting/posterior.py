@@ -251,7 +251,10 @@ class Posterior:
 
     @cached_property
     def _constants(self) -> Propagated:
-        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with their derivatives df/dx R."""
+        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance.
+
+        The square root is the derivative with respect to the parameters x, times R, with R R^T the covariance of x.
+        """
         return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
 
     def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:

@@ -125,9 +125,9 @@ def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ())
 
 
 def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[HypothesisFit, ...]:
-    """Return the best fit and all fits of about the same cost; () if the best is not significantly better.
+    """Return the best fit and all fits of about the same cost; () if none is significantly better than `unchanged`.
 
-    unchanged: fit of the unchanged log, with which the best fit is compared.
+    unchanged: fit of the log as recorded. fits: fits of the log with other signs, orders, offsets or gravity.
     """
     best = min(fit.cost for fit in fits)
     if best > unchanged.cost - GEOMETRY.needed:

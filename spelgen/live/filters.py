@@ -216,7 +216,10 @@ class PayloadEstimate:
         self.samples = self.per_sample = 0
 
     def start(self, block: Block) -> None:
-        """Process the remaining rows of the previous block, and prepare the rows of this block."""
+        """Begin an update of the filters with the measurements of `block`, which `step` distributes over samples.
+
+        Rows of the previous block that are not processed yet are processed first.
+        """
         for _ in self.rows:
             pass
         if block.moving.any():

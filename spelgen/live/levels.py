@@ -92,8 +92,9 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
 def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
     """Return a new model of the same kind as the model of a fit, fitted to other logs from the initial parameters.
 
-    A subset of the samples suffices to estimate the error on further logs. If the fit has no residual terms, none are
-    selected here. Raises LogError for too little motion.
+    The new model is used to estimate the error on held-out logs. For that purpose a subset of the samples suffices, at
+    most ``max_samples``. Residual terms are selected only if the model of the fit has some. Raises LogError for too
+    little motion.
     """
     model = assemble(required_spec(fit.model)).double()
     if residual_terms(without_idle_residuals(fit.model)) is None:

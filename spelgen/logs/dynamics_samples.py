@@ -57,12 +57,12 @@ def dynamics_samples(
 
     Trajectories whose sample rate is too low for accelerations are omitted.
 
-    Each gap-free piece is resampled to 100 Hz; the sample rate of a log must be at least 24 Hz, see `resampled`. The
-    zero-phase low-pass of ``preprocessing``, by default with a cutoff of 8 Hz, is applied to q, qd and tau at the
-    higher of both sample rates, and the transients of the filter at both ends are removed. qdd is the central
-    difference of the filtered qd.
+    Each gap-free piece is filtered and resampled to 100 Hz; the sample rate of a log must be at least 24 Hz, see
+    `resampled`. Logs below 100 Hz are resampled first, faster logs are filtered first. The filter is the zero-phase
+    low-pass of ``preprocessing``, by default with a cutoff of 8 Hz, for q, qd and tau. Its transients at both ends are
+    removed. qdd is the central difference of the filtered qd.
 
-    pauses: True: return all samples from the first to the last motion, including standstill. reach: break-away
+    pauses: whether samples at standstill between the first and the last motion are returned, too. reach: break-away
     displacements of the bristles whose states z are computed and filtered like tau; see ``bristles_along``.
     """
     samples = []

@@ -18,8 +18,8 @@ class ChainConfiguration(NamedTuple):
     Each body is represented by four point masses.
     """
 
-    place: Tensor  # positions [m] times square roots of the masses, (..., 3, bodies, 4)
-    mass: Tensor  # square roots of the masses, (..., 1, bodies, 4)
+    place: Tensor  # positions [m] of the points times the square roots of their masses, (..., 3, bodies, 4)
+    mass: Tensor  # square roots of the masses of the four points of each body, (..., 1, bodies, 4)
     axes: Tensor  # twist of a body per rate of its own joint, (..., 6, bodies)
     # Derivatives of the points' coordinates, times square roots of the masses, with respect to the
     # displacement of each body's own joint, (..., bodies, 12 bodies): 3 coordinates of 4 points per body.

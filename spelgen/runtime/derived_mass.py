@@ -19,9 +19,9 @@ from spelgen.runtime.rows import Constant, Function, Joint, vector
 
 
 class LinearMass(nn.Module):
-    """Base class of mass matrices M that are linear in functions of q and in constants.
+    """Base class of mass matrices whose entries are linear combinations of functions of q and of constants.
 
-    It has the trained constants and the armature (rotor inertia).
+    The base class has the trained constants and the armature (rotor inertia); derived classes have the functions.
     """
 
     parameter_groups = (
@@ -112,7 +112,8 @@ class DerivedMass(LinearMass):
         super().__init__(joints, entries, constants=constants, functions=functions)
         self.network = network
         center = self._by_outputs()[-1].detach()
-        # `center` is C, the nominal mean of M; M - `smallest` must be positive definite.
+        # `center` is C, the nominal mean of M. If M - `smallest` is not positive definite, `forward` returns
+        # a matrix between C and M.
         self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size

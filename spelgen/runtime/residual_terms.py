@@ -257,7 +257,7 @@ class ResidualDynamics(RigidBodyDynamics):
         return cache._replace(mass=cache.mass + residual.mass, varied=residual.friction, residual=residual)
 
     def potential_energy(self, q: Tensor | RigidConfiguration, z: Tensor | None = None) -> Tensor:
-        """Return V(q) and the elastic energy of the bristles, (...) [J]."""
+        """Return the sum of V(q) and the elastic energy of the bristles, (...) [J]."""
         cache: RigidConfiguration = self.at(q)
         energy = super().potential_energy(cache, z)
         return energy if self.residuals is None else energy + self.residuals.energy(cache.residual)

@@ -68,8 +68,8 @@ class GaussianPrior(Group):
         shared_friction: Common factor of all friction of all joints.
         friction_compensation: Friction compensation of a drive, divided by typical friction per typical speed, if the
             logs show any.
-        degrees_of_freedom: Number with two uses: weight of the initial standard deviation in the estimate of a standard
-            deviation, as an equivalent number of parameters; degrees of freedom of the Student-t prior of each body.
+        degrees_of_freedom: Degrees of freedom of the Student-t prior of each body. When a standard deviation is
+            estimated, this number is also the weight of its initial value, as a number of parameters.
     """
 
     bodies: Positive = 0.75

@@ -46,13 +46,13 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
     For 47 arms of `benchmarks/truth.py`, the 95 % intervals contain 97 % of the base parameters and 95 % of g(q). The
     intervals of the posterior covariance contain only 93 % and 89 %.
 
-    The residual of a held-out block belongs to the fit without it to first order in the parameters: residual + J step,
-    with the Newton step for the removal of the block.
+    The residual of a held-out block is the residual of a fit without the block, to first order in the parameters:
+    residual - J step, with the Newton step for the removal of the block.
     """
     problem, x, free = estimate.problem, estimate.state.x, estimate.problem.free
     model, change = problem.jacobian.model, problem.jacobian.theta_jacobian(x)
-    # The noise is converted from the initial to the current motor gains: the Jacobians below are made from the fitted
-    # model, so that its current gains are their initial gains, and their factor `logged_scale` is 1.
+    # The noise belongs to torques at the initial motor gains. The Jacobians below are made from the fitted model and
+    # belong to torques at the fitted gains, so the noise is converted to the fitted gains.
     noise = problem.noise / problem.jacobian.logged_scale(x)
     blocks = contiguous_blocks(problem.jacobian.samples)
     products = torch.stack([_products(TorqueJacobian(model, block), x) for block in blocks])
@@ -66,7 +66,7 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
         # covariance neglects differences between motions.
         covariance = larger_covariance(of_blocks, covariance) * student_scale(len(blocks)) ** 2
     without_block = torch.zeros(len(blocks), len(x)).double().masked_scatter(free, steps) @ change.mT
-    # the residual after a step, residual - J step, is [J, residual] @ [-step, 1]
+    # The residual after a step is [J, residual] @ [-step, 1].
     combination = append_target(-without_block, torch.ones(len(blocks)).double())
     held_out = torch.einsum("bk,bjkl,bl->bj", combination, products, combination)
     return Jackknife(problem.of_all_parameters(covariance), held_out)
