@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from importlib.util import find_spec
+from types import ModuleType
 from typing import Any, TypeVar
 
 from spelgen.errors import RunError
@@ -61,7 +62,7 @@ def run_tasks(
 
 
 @contextmanager
-def _ray(jobs: int, address: str | None) -> Iterator[Any]:
+def _ray(jobs: int, address: str | None) -> Iterator[ModuleType]:
     """Start Ray on this machine, or connect to a cluster, within a context. Yield the module `ray`."""
     if find_spec("ray") is None:
         do = "pip install 'spelgen[parallel]', or --jobs 1"

@@ -261,7 +261,7 @@ def with_unit_error(urdf, mass, center, path):
     ids=["right", "masses in mg", "centres in mm"],
 )
 def test_a_fit_is_not_behind_least_squares_for_any_urdf(emitted, robots, tmp_path, mass, center, replaced):
-    """Inertials in other units: a fit that would be behind starts again from ridge regression, and says so."""
+    """Inertials in other units: a fit that would be behind starts again from ridge regression, and reports it."""
     true = emitted["rpr"][0].Model()
     urdf = with_unit_error(robots / "rpr.urdf", mass, center, tmp_path / "rpr.urdf")
     logs, test = [recorded(true, 20.0, 0.02, seed=1)], recorded(true, 10.0, 0.0, seed=9)

@@ -138,8 +138,8 @@ class PredictorTuning:
     # [1] Allowed change of a prediction if the number of steps is doubled, divided by the error of the dynamics. With
     # this value reported figures change by a thousandth.
     tolerance: float = 5e-2
-    # [1] The allowed change is `tolerance` times the relative error of the prediction (RMS error / RMS motion), or times
-    # this value if the error is smaller.
+    # [1] The allowed change is `tolerance` times the relative error of the prediction (RMS error / RMS motion), or
+    # times this value if the error is smaller.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16

@@ -76,8 +76,8 @@ def hold_velocity(windows: Windows) -> States:
 def urdf_values(arm: EvaluatedArm) -> list[Predictor]:
     """Return the baselines with the URDF's inertial parameters: rigid bodies, and rigid bodies with drives.
 
-    The second baseline is omitted if the settings beside the URDF specify neither rotors nor friction. If Pinocchio is absent or cannot
-    read the URDF, the list is empty and a note is added to ``arm.notes``.
+    The second baseline is omitted if the settings of the URDF specify neither rotors nor friction. If Pinocchio is
+    absent or cannot read the URDF, the list is empty and a note is added to ``arm.notes``.
     """
     if arm.urdf is None:
         arm.notes.append(_missing("robot.urdf", "no arm is known"))

@@ -188,7 +188,7 @@ def _diagonal_reason(axes: Axes, joint: int) -> Reason:
 
 
 def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason why an entry in the last row of M is constant or zero, if the last body is dynamically balanced.
+    """Return the reason why an entry in the last row of M is constant or zero, if the last body is balanced.
 
     The entry of the last joint and an earlier joint is then Izz of the last body times the cosine of the angle between
     the axes of both joints. Return None if the body is not balanced or the entry is in another row.

@@ -41,7 +41,7 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 
-class Comparison(NamedTuple):
+class RegressionComparison(NamedTuple):
     """Held-out errors of a torque fit and of ridge regression, see `Regression`.
 
     fit, regression: mean squared error of held-out blocks divided by the variance of the torque, mean over joints.
@@ -77,7 +77,7 @@ class TorqueSolution:
     correlation_time: np.ndarray
     held_out_nmse: np.ndarray
     selected_terms: tuple[SelectedTerm, ...]
-    comparison: Comparison | None
+    comparison: RegressionComparison | None
 
 
 class _StagedFit(NamedTuple):
@@ -160,7 +160,7 @@ def _not_behind_regression(
     prior: GaussianPrior,
     fitted: _StagedFit,
     initial: dict[str, torch.Tensor],
-) -> tuple[_StagedFit, Comparison]:
+) -> tuple[_StagedFit, RegressionComparison]:
     """Return the given fit, or a fit from the values of ridge regression if this predicts held-out torques better.
 
     initial: state_dict of the model before the fit. The parameters of the returned fit are written to the model.
@@ -172,7 +172,7 @@ def _not_behind_regression(
     other = torch.from_numpy(regression.held_out) + negligible
 
     def behind(fit: _StagedFit) -> bool:
-        """Return whether the regression is better than a fit by more than chance (p = 0.01 of Student's t)."""
+        """Return True if the regression is significantly better than the fit (Student's t test, p = 0.01)."""
         if len(blocks) == 1:
             return False
         standard_errors = float(stdtrit(len(blocks) - 1, 0.99))
@@ -190,7 +190,7 @@ def _not_behind_regression(
         if restarted.held_out.sum() < fitted.held_out.sum():
             best, replaced = restarted, nmse(fitted.held_out)
         model.load_state_dict(best.parameters)
-    return best, Comparison(nmse(best.held_out), nmse(other), behind(best), replaced)
+    return best, RegressionComparison(nmse(best.held_out), nmse(other), behind(best), replaced)
 
 
 def _run_stages(

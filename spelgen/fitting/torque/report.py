@@ -13,7 +13,7 @@ from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.fitting.posterior import Posterior
-from spelgen.fitting.torque.fit import Comparison, TorqueSolution
+from spelgen.fitting.torque.fit import RegressionComparison, TorqueSolution
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.runtime.motors import MotorInputs
@@ -110,7 +110,7 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
 
 
 def _few_data(
-    samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray, comparison: Comparison | None
+    samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray, comparison: RegressionComparison | None
 ) -> Diagnostic:
     """Return the warning that the logs have too little motion for the parameters of some joints.
 
@@ -129,7 +129,7 @@ def _few_data(
     )
 
 
-def _behind_regression(comparison: Comparison) -> Iterator[Diagnostic]:
+def _behind_regression(comparison: RegressionComparison) -> Iterator[Diagnostic]:
     """Yield a warning if ridge regression predicted held-out torques better than the fit from the URDF's values."""
     regression = f"ridge regression (nMSE {comparison.regression:.2g})"
     if comparison.replaced is not None:
