@@ -2,31 +2,40 @@
 
 import gc
 import os
+import sys
 from pathlib import Path
 
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch and numpy when they are first imported
+# Byte code is cached even if the environment disables the cache: otherwise each of the processes that tests start would
+# compile all imported packages, which takes as long as the imports (pip installs them without byte code).
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 ROOT = Path(__file__).parents[1]
 
 # The files that take longest. Workers of pytest-xdist take whole files in this order, so the longest start first.
 LONGEST_FILES = (
+    "test_log_geometry",
     "test_docs",
-    "test_export_onnx",
     "test_torque_fit",
+    "test_export_onnx",
     "test_workflow",
     "test_servo",
-    "test_training",
     "test_types",
+    "test_live_c",
     "test_comparison",
     "test_coupled_motors",
     "test_contracts",
     "test_evaluation",
+    "test_training",
+    "test_mapping_kept",
     "test_export_torch",
-    "test_advice",
-    "test_run_folder",
-    "test_export_c",
+    "test_check_logs",
+    "test_fit",
+    "test_cli",
+    "test_reference_arms",
 )
 
 

@@ -118,7 +118,7 @@ def test_network_outputs_depend_only_on_their_own_joints(robot, tmp_path):
         assert changed.tolist() == expected
 
 
-@pytest.mark.parametrize("robot", ["two_link", "rpr", "ur10e"])
+@pytest.mark.parametrize("robot", ["rpr", "ur10e"])
 def test_energy_is_conserved_without_input_and_dissipation(robot, tmp_path):
     """Random weights, Runge-Kutta with 1.6 ms over 2 s: relative drift of H below 1e-8."""
     model = frictionless(random_model(robot, tmp_path, seed=0))

@@ -202,11 +202,11 @@ def test_meshes(tmp_path):
 def run(robots, tmp_path_factory) -> Path:
     """A run folder of every file."""
     model = build(robots / "two_link.urdf", "closed-form")
-    found = fit(model, [motion(600)], TorqueFit(), arm=robots / "two_link.urdf")
+    found = fit(model, [motion(300)], TorqueFit(), arm=robots / "two_link.urdf")
     folder = found.save(tmp_path_factory.mktemp("run") / "run")
     line = {"epoch": 1, "step": 1, "loss": 0.5, "validation": 0.5, "best": 0.5, "seconds": 1.0}
     (folder / "metrics.jsonl").write_text(2 * (json.dumps(line) + "\n"))
-    (folder / "evaluation.json").write_text(json.dumps(evaluate(load_run(folder), [motion(120)]).to_dict()))
+    (folder / "evaluation.json").write_text(json.dumps(evaluate(load_run(folder), [motion(75)]).to_dict()))
     return folder
 
 

@@ -43,7 +43,7 @@ def folder(robots, tmp_path_factory):
     (folder / "map.yaml").write_text(MAPPING)
     model = build(folder / "rpr.urdf", "closed-form")
     random = np.random.default_rng(0)
-    q, qd, qdd = (0.4 * x for x in smooth_motion(3, 20.0, random))
+    q, qd, qdd = (0.4 * x for x in smooth_motion(3, 8.0, random))
     with torch.no_grad():
         force = model.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
     # without trained gains input and joint torque are equal

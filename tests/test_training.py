@@ -236,7 +236,7 @@ class Interrupted(TrainingProgress):
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
+@pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 8), ("lbfgs", 3)])
 def test_a_resumed_training_equals_an_uninterrupted_one(
     module, logs, tmp_path, monkeypatch, optimizer, steps
 ):

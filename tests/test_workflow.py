@@ -13,7 +13,7 @@ from spelgen.cli.main import app
 from spelgen.fitting.run_folder import RunFolder
 
 OWN = ("two_link", "rpr", "scara", "six_dof", "panda", "ur10e")
-OTHERS = ("drm_2link", "interbotix_px100", "dobot_mg400", "franka_fr3")
+OTHERS = ("drm_2link", "interbotix_px100", "dobot_mg400")
 pytestmark = pytest.mark.usefixtures("short_torque_fits")
 SHORT = {"trajectories": 2, "duration": 2.4, "sample_rate": 50.0, "test_fraction": 0.5}
 FEW_STEPS = {"epochs": 1, "momentum_steps": 5}

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.equations import MotionEquations, equations_of
-from spelgen.dynamics.protocol import RigidDynamics, is_stateful, memory_after, sliding_memory
+from spelgen.dynamics.protocol import RigidDynamics, memory_after, sliding_memory
 from spelgen.logs.trajectory import LogRows
 from spelgen.logs.windows import Windows, thinned
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
@@ -119,7 +119,7 @@ def _friction_slopes(
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
     # Negative damping (friction that decreases with velocity) is omitted from D, and so integrated explicitly.
     damping = slope.clamp(min=0)
-    if not is_stateful(dynamics):
+    if not z.shape[-1]:
         return damping, torch.zeros_like(damping)
     # The finite-difference step has the direction of motion, in which bristles deflect.
     displacement = TUNING.displacement_step * torch.where(qd < 0, -1.0, 1.0).to(qd)

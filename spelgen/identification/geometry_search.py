@@ -218,12 +218,21 @@ def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[Hypoth
     rng = np.random.default_rng(0)
     starts += [rng.permutation(len(joints)) for _ in range(6)]
     fits = {}
+    known: dict[tuple[object, ...], HypothesisFit] = {}
+
+    def fitted(hypothesis: Hypothesis) -> HypothesisFit:
+        """Return the fit of an order; it is cached, since searches from several starts visit the same orders."""
+        key = hypothesis.codes, hypothesis.motion_source.tobytes(), hypothesis.torque_source.tobytes()
+        if key not in known:
+            known[key] = problem.fit(hypothesis)
+        return known[key]
+
     # fewer starts for orders of only the motion: such logs are rare, and each order requires a new regressor
     motion, both = ("motion-order",), ("joint-order", "torque-order")
     for code, start in [*product(both, starts), *product(motion, starts[:3])]:
-        fit = problem.fit(_changed(unchanged.hypothesis, code, **dict.fromkeys(ORDERS[code], start)))
+        fit = fitted(_changed(unchanged.hypothesis, code, **dict.fromkeys(ORDERS[code], start)))
         while True:
-            best = min(map(problem.fit, _swapped(fit.hypothesis, [code])), key=_rank)
+            best = min(map(fitted, _swapped(fit.hypothesis, [code])), key=_rank)
             if best.cost > fit.cost - 1.0:
                 break
             fit = best

@@ -22,6 +22,7 @@ from spelgen.identification.drive_hints import FRICTION, OFFSETS, drive_rows
 from spelgen.identification.least_squares import block_products, varying
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.dynamics_samples import FREQUENCY
+from spelgen.runtime.body_chain import BodyChain
 
 Vector3 = tuple[float, float, float]
 
@@ -197,6 +198,7 @@ class GeometryProblem:
         self._counted: np.ndarray | None = None
         self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
+        self._chains: dict[Vector3, BodyChain] = {}  # under each direction of gravity
 
     def thinned(self, count: int) -> GeometryProblem:
         """Return the problem on at most `count` samples, evenly spaced."""
@@ -261,7 +263,8 @@ class GeometryProblem:
         key = hypothesis.motion_key
         if key not in self._equations:
             q, qd, qdd = hypothesis.signals(self.samples).motion
-            rows = drive_rows(body_chain(self.arm, hypothesis.gravity), q, qd, qdd, self.speeds)
+            chain = self._chains.get(hypothesis.gravity) or body_chain(self.arm, hypothesis.gravity)
+            rows = drive_rows(self._chains.setdefault(hypothesis.gravity, chain), q, qd, qdd, self.speeds)
             if self._has_hysteresis:
                 # the deflections of drive j act on joint i with the factor C_ji, like its other friction
                 bristles = self.samples.bent[:, None] * self.speeds.T[:, :, None]

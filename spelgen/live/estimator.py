@@ -64,6 +64,8 @@ class Estimator:
         noise levels.
         """
         self.model = torque_model(fit)
+        with torch.no_grad():
+            self.prepared = self.model.prepare()
         self.levels = noise_levels(fit) if levels is None else levels
         self.alarms_per_minute = alarms_per_minute
         self.reach = bristle_reach(self.model)
@@ -100,7 +102,7 @@ class Estimator:
         self, t: np.ndarray, q: np.ndarray, qd: np.ndarray, tau: np.ndarray
     ) -> Iterator[EstimatorState]:
         """Process samples at times t (T,), with q, qd and tau (T, n); yield the estimates after each sample."""
-        refusals, terms = balance_along(self.model, self.levels, self.intake, t, (q, qd, tau))
+        refusals, terms = balance_along(self.model, self.levels, self.intake, t, (q, qd, tau), self.prepared)
         for now, speed, refusal, at in zip(t.tolist(), qd, refusals, terms, strict=True):
             changed = at is not None and self._advance(now, speed, at, refusal)
             a, d = self.drift.x.T
@@ -157,8 +159,9 @@ class Estimator:
         z = torch.from_numpy((self.intake.low + self.intake.high) / 2)
         past = (z,) if is_stateful(self.model) else ()
         with torch.no_grad():
-            torque = self.model.inverse_dynamics(*at, *past)
-            friction = self.model.friction_torque(*at[:2], *past)
+            cache = self.model.at(*at, prepared=self.prepared)
+            torque = self.model.inverse_dynamics(cache, *at[1:], *past)
+            friction = self.model.friction_torque(cache, at[1], *past)
             # The payload is fixed to the last body, whose ten inertial parameters are the last columns of the
             # regressor.
             regressor = regressor_of(self.model.chain, *at)[..., -10:]
@@ -168,7 +171,7 @@ class Estimator:
                 decay = np.exp(-ahead / self.levels.drift.time_constant)
             a, d = self.drift.x.T
             drift = torch.from_numpy(a) * friction + torch.from_numpy(d * decay)
-            return (torque + self.model.input_torque(self.model.at(at[0]), load + drift)).numpy()
+            return (torque + self.model.input_torque(cache, load + drift)).numpy()
 
 
 def torque_model(fit: Fit) -> RigidBodyDynamics:

@@ -9,7 +9,7 @@ from spelgen.dynamics.bristles import BristleReach
 from spelgen.live.momentum import Balance, balance
 from spelgen.live.noise import NoiseLevels
 from spelgen.live.tuning import TUNING
-from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidParameters
 
 Refusal = Literal["used", "not finite", "repeated", "reversed", "jump", "saturated", "gap"]
 REFUSALS: tuple[Refusal, ...] = get_args(Refusal)
@@ -80,6 +80,7 @@ def balance_along(
     intake: Intake,
     t: np.ndarray,
     samples: Sequence[np.ndarray],
+    prepared: RigidParameters | None = None,
 ) -> tuple[list[Refusal], list[Balance | None]]:
     """Check samples; return the result of each check, and the terms of the momentum balance at each sample.
 
@@ -91,6 +92,7 @@ def balance_along(
         intake: checks of the samples; its state is updated.
         t: times, (T,) [s].
         samples: q, qd and tau, (T, n).
+        prepared: parameter cache of the model; None: the function computes it.
     """
     refusals: list[Refusal] = []
     bounds: list[tuple[np.ndarray, np.ndarray]] = []
@@ -102,7 +104,7 @@ def balance_along(
     if used:
         # All samples are computed in one call, since a call of torch takes longer than the arithmetic of one sample.
         low, high = np.array([bounds[k] for k in used]).swapaxes(0, 1)
-        columns = balance(model, levels.point, [x[used] for x in samples], (low, high))
+        columns = balance(model, levels.point, [x[used] for x in samples], (low, high), prepared)
         for k, *row in zip(used, *columns, strict=True):
             terms[k] = Balance(*row)
     return refusals, terms

@@ -17,7 +17,7 @@ from torch import Tensor
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.protocol import is_stateful
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidParameters
 
 _BLOCK = 2048  # samples computed at a time, to limit the memory
 
@@ -74,7 +74,11 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
 
 
 def balance(
-    model: RigidBodyDynamics, point: np.ndarray, samples: Sequence[np.ndarray], bounds: Sequence[np.ndarray]
+    model: RigidBodyDynamics,
+    point: np.ndarray,
+    samples: Sequence[np.ndarray],
+    bounds: Sequence[np.ndarray],
+    prepared: RigidParameters | None = None,
 ) -> Balance:
     """Return the terms of the momentum balance at samples.
 
@@ -83,17 +87,27 @@ def balance(
         point: point of the last body, in the frame of this body, whose Jacobian is returned, (3,) [m].
         samples: q, qd and tau, (T, n).
         bounds: lower and upper bound of the friction state, (T, n, K) [rad, m].
+        prepared: parameter cache of the model; None: the function computes it.
     """
     with torch.no_grad():
+        prepared = prepared or model.prepare()
         columns = [torch.from_numpy(x).split(_BLOCK) for x in (*samples, *bounds)]
-        blocks = [_terms(model, torch.from_numpy(point), *block) for block in zip(*columns, strict=True)]
+        blocks = [
+            _terms(model, prepared, torch.from_numpy(point), *block) for block in zip(*columns, strict=True)
+        ]
         return Balance(*(torch.cat(term).numpy() for term in zip(*blocks, strict=True)))
 
 
 def _terms(
-    model: RigidBodyDynamics, point: Tensor, q: Tensor, qd: Tensor, tau: Tensor, *bounds: Tensor
+    model: RigidBodyDynamics,
+    prepared: RigidParameters,
+    point: Tensor,
+    q: Tensor,
+    qd: Tensor,
+    tau: Tensor,
+    *bounds: Tensor,
 ) -> list[Tensor]:
-    at = model.at(q, qd)
+    at = model.at(q, qd, prepared=prepared)
     torque = model.input_force(at, qd, tau) + model.lagrangian_gradient(at, qd)
     if is_stateful(model):
         low, high = (model.friction_torque(at, qd, z) for z in bounds)

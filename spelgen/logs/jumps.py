@@ -109,6 +109,8 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
     lengths = np.diff(np.append(starts, len(values)))
+    if lengths.max(initial=0) <= 20:
+        return stale
     steps = np.append(np.abs(np.diff(values[starts])), np.inf)
     is_long = lengths > 20.0 * max(1.0, float(np.median(lengths)))
     is_quantised = len(np.unique(values)) < len(starts) / 2

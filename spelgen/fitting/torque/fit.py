@@ -172,7 +172,7 @@ def _not_behind_regression(
     other = torch.from_numpy(regression.held_out) + negligible
 
     def behind(fit: _StagedFit) -> bool:
-        """Return whether the regression is better than a fit by more than chance (p = 0.01 of Student's t)."""
+        """Return True if the regression is significantly better than a fit (p = 0.01 of Student's t)."""
         if len(blocks) == 1:
             return False
         standard_errors = float(stdtrit(len(blocks) - 1, 0.99))

@@ -26,7 +26,7 @@ from spelgen.settings.fits import GaussianPrior
 
 # Penalties on columns of length one; the smallest one is least squares.
 PENALTIES = np.logspace(-10, 2, 13)
-# m, h, I of a sphere of 1 kg with a radius of gyration of 0.1 m, whose centre is 0.1 m beside the joint's axis.
+# m, h, I of a sphere of 1 kg with a radius of gyration of 0.1 m, with its centre 0.1 m from the joint's axis.
 DEFAULT_BODY = (1.0, 0.1, 0.0, 0.1, 0.02, 0.0, -0.01, 0.03, 0.0, 0.02)
 
 
@@ -42,7 +42,7 @@ class Regression(NamedTuple):
 
 
 def best_regression(model: ArmModel, blocks: Sequence[TorqueSamples], torque_std: np.ndarray) -> Regression:
-    """Return the better one of two ridge regressions: Coulomb friction by velocity, or by the friction state.
+    """Return the better one of two ridge regressions: Coulomb friction from the velocity, or from the friction state.
 
     Args:
         model: model whose arm, drives and gains are used.
