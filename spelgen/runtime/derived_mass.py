@@ -21,7 +21,8 @@ from spelgen.runtime.rows import Constant, Function, Joint, vector
 class LinearMass(nn.Module):
     """Base class of mass matrices whose entries are linear combinations of functions of q and of constants.
 
-    The base class has the trained constants and the armature (rotor inertia); derived classes have the functions.
+    The base class has the trained constants and the armature (rotor inertia). Derived classes have the
+    functions.
     """
 
     parameter_groups = (
