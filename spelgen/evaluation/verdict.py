@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from spelgen.baselines.registry import FittedBaselines
 from spelgen.errors import shortened
 from spelgen.evaluation.horizons import StateErrors
 from spelgen.evaluation.measurements import Measurements, Verdict
@@ -45,7 +46,7 @@ class _Uses:
 
 def verdict(
     results: Measurements,
-    identified: Mapping[str, Any] | None = None,
+    identified: FittedBaselines | None = None,
     limits: Limits = (),
     independent: Collection[str] = (),
 ) -> Verdict:
@@ -239,7 +240,7 @@ def _slow_or_fast(results: Measurements, k: int) -> str:
 
 def _recommendations(
     results: Measurements,
-    identified: Mapping[str, Any],
+    identified: FittedBaselines,
     limits: Limits,
     independent: Collection[str],
     worst: str,
