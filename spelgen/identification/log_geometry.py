@@ -263,8 +263,9 @@ class GeometryProblem:
         key = hypothesis.motion_key
         if key not in self._equations:
             q, qd, qdd = hypothesis.signals(self.samples).motion
-            chain = self._chains.get(hypothesis.gravity) or body_chain(self.arm, hypothesis.gravity)
-            rows = drive_rows(self._chains.setdefault(hypothesis.gravity, chain), q, qd, qdd, self.speeds)
+            if hypothesis.gravity not in self._chains:
+                self._chains[hypothesis.gravity] = body_chain(self.arm, hypothesis.gravity)
+            rows = drive_rows(self._chains[hypothesis.gravity], q, qd, qdd, self.speeds)
             if self._has_hysteresis:
                 # the deflections of drive j act on joint i with the factor C_ji, like its other friction
                 bristles = self.samples.bent[:, None] * self.speeds.T[:, :, None]

@@ -15,6 +15,7 @@ from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.logs.checks import Check, Findings, run_checks
 from spelgen.logs.filtering import derivative
 from spelgen.logs.joint_signals import Advice, is_factor, mapping_line
+from spelgen.logs.parquet_files import UNLESS_NORMALISED
 from spelgen.logs.trajectory import Trajectory, delayed_commands, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
@@ -237,7 +238,7 @@ class ServoLogs:
             return
         check = UNIT if finding.keys else NORMALISED
         # the reader's general doubt about degrees of LeRobot is omitted if this error is found
-        summary.notes[:] = [x for x in summary.notes if "unless they are LeRobot's" not in x.message]
+        summary.notes[:] = [x for x in summary.notes if UNLESS_NORMALISED not in x.message]
         if check.code not in self._logs[0].accepted:
             summary.add(check, finding.message, "all joints", keys=finding.keys)
 

@@ -62,19 +62,14 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         return outliers
     steps = np.diff(values)
     sizes = np.abs(steps)
+    largest_step = TUNING.jump * _usual(sizes)
     logged = np.flatnonzero(values)
-    # positions do not jump to 0 before the first or after the last sample; torques and velocities may
-    for end, rows in (
-        (logged[:1], slice(0, logged[:1].sum())),
-        (logged[-1:], slice(logged[-1:].sum() + 1, None)),
-    ):
-        if (
-            smooth
-            and len(logged) > TUNING.jump_window
-            and np.abs(values[end]).max() > TUNING.jump * _usual(sizes)
-        ):
-            outliers[rows] = True
-    is_jump = sizes > TUNING.jump * _usual(sizes)
+    # Positions do not jump to 0 before the first or after the last logged value; torques and velocities may.
+    if smooth and len(logged) > TUNING.jump_window:
+        first, last = logged[[0, -1]]
+        outliers[:first] |= abs(values[first]) > largest_step
+        outliers[last + 1 :] |= abs(values[last]) > largest_step
+    is_jump = sizes > largest_step
     # a signal in which more than 5 % of the steps are large is noisy: its large steps are no outliers
     if not is_jump.any() or is_jump.mean() > 0.05:
         return outliers
@@ -109,10 +104,10 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
     lengths = np.diff(np.append(starts, len(values)))
-    if lengths.max(initial=0) <= 20:
+    is_long = lengths > 20.0 * max(1.0, float(np.median(lengths)))
+    if not is_long.any():
         return stale
     steps = np.append(np.abs(np.diff(values[starts])), np.inf)
-    is_long = lengths > 20.0 * max(1.0, float(np.median(lengths)))
     is_quantised = len(np.unique(values)) < len(starts) / 2
     is_long &= (steps > 4.0 * _usual(steps[:-1]) * is_quantised) & (len(starts) > 1)
     for start, length in zip(starts[is_long], lengths[is_long], strict=True):

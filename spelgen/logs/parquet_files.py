@@ -21,6 +21,8 @@ STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
 ENDING = ".pos"
 # Largest normalised position: 100, with a tolerance for rounding to single precision.
 LARGEST_NORMALISED = 100.001
+# Doubt about positions in degrees; the check of servo logs removes it if the steps of the encoders decide.
+UNLESS_NORMALISED = "unless they are LeRobot's normalised values"
 
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -98,7 +100,7 @@ def _with_scale(
     if not unstated:
         unit = mapping.unit("q", joints[0])
         doubt = (
-            f"positions within -100..100: right as {unit}, unless they are LeRobot's normalised values, which "
+            f"positions within -100..100: right as {unit}, {UNLESS_NORMALISED}, which "
             "'units: {q: normalised}' and 'calibration' under 'logs' convert"
         )
         return mapping, (doubt,) if unit == "deg" else ()

@@ -229,9 +229,8 @@ def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:
     if complete.sum() > 0.9 * base.sum():
         message = f"{counted(int((~complete).sum()), 'row')} without all signals left out: signals have different rates"
         return data[complete], (message,)
-    data = data[np.argsort(data[:, 0], kind="stable")]
-    finite = np.isfinite(data)
-    base = finite[:, 1 + int(finite[:, 1:].sum(axis=0).argmin())]
+    order = np.argsort(data[:, 0], kind="stable")
+    data, finite, base = data[order], finite[order], base[order]
     joined, mapping = data[base], layout.mapping
     times = joined[:, 0]
     for k, signal in enumerate(mapping.signals(layout.joints), start=1):

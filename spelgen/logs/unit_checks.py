@@ -174,9 +174,11 @@ def _velocity_lag(signals: JointSignals) -> float:
     """
     from scipy.integrate import cumulative_trapezoid
 
+    if signals.trajectory.mapping.velocity == "differentiated":
+        return 0.0
     piece = max(split_at_gaps(signals.trajectory), key=len)
     t, q, qd = piece.t, piece.q[:, signals.number], piece.qd[:, signals.number]
-    if signals.trajectory.mapping.velocity == "differentiated" or len(t) < 100:
+    if len(t) < 100:
         return 0.0
     drift = np.stack([np.ones_like(t), t, t**2], axis=1)
     columns = np.stack([qd, q - cumulative_trapezoid(qd, t, initial=0)], axis=1)
