@@ -83,6 +83,20 @@ def test_gain_of_torques_in_another_unit(arm, factor):
     assert "torque" not in message_of(obeyed(arm, message), path)
 
 
+@pytest.mark.parametrize("arm", ["rpr", "ur10e"], indirect=True)
+def test_gain_of_torques_in_another_unit_and_of_the_opposite_sense(arm):
+    """The log is right after the first line, or after that line and the next message's."""
+    path = logged(arm, recorded(arm, 6), tau=-0.02)
+    message = message_of(arm, path)
+    assert "of the opposite sense" in message
+    arm = obeyed(arm, message)
+    message = message_of(arm, path)
+    if message:
+        assert "torques of another unit" in message
+        arm = obeyed(arm, message)
+    assert "torque" not in message_of(arm, path)
+
+
 def test_joints_that_were_not_logged(arm):
     last = arm.chain.joint_names[-1]
     path = logged(arm, recorded(arm, 7), lambda names: [x for x in names if not x.endswith(f"_{last}")])

@@ -115,6 +115,7 @@ IMPOSSIBLE = {
     "sign": (-1.0, "torques of the opposite sense", "{gain: -1}"),
     "unit": (1e-3, "torques of another unit, 0.001 times as large", "{gain: 1000}"),
     "drives": (1e4, "torques of another unit, 1e+04 times as large", "{gain: 0.0001}"),
+    "both": (-1e-2, "torques of another unit and of the opposite sense, 0.01 times as large", "{gain: -100}"),
 }
 
 

@@ -136,6 +136,8 @@ class Remedies:
         if not (torque[motion < 0] < 0).all():
             sense = "positions and velocities of the opposite sense, and torques of the right one"
         largest = torque[np.abs(np.log(np.abs(torque))).argmax()]
+        is_reversed = largest < 0 and not {"torque-sense", "joint-sense"}.intersection(reading.codes)
+        reversed_too = " and of the opposite sense" if is_reversed else ""
         units = dict.fromkeys(self._unit(int(j), reading) for j in order if abs(motion[j]) != 1)
         delay = np.where(reading.motion_delay, reading.motion_delay, reading.torque_delay)
         shown = 1e3 * float(delay[np.abs(delay).argmax()])
@@ -150,7 +152,7 @@ class Remedies:
             "torque-sense": ((torque < 0) & (motion > 0), "torques of the opposite sense"),
             "torque-unit": (
                 np.abs(torque) != 1,
-                f"torques of another unit, {1 / largest:.3g} times as large",
+                f"torques of another unit{reversed_too}, {abs(1 / largest):.3g} times as large",
             ),
             "joint-unit": (np.abs(motion) != 1, f"positions in {' and '.join(units)}"),
             "joint-delay": (
@@ -182,8 +184,9 @@ class Remedies:
     def _is_minor(self, best: Hypothesis) -> bool:
         """Return True if the change may be due to an error of the URDF or of the arm's mounting, not of the log."""
         if best.codes == ("torque-unit",):
-            factor = np.abs(np.log(best.torque_scale / self.unchanged.torque_scale)).max()
-            return bool(factor < np.log(10.0))  # inertials of a URDF are never wrong by a factor of ten
+            factors = best.torque_scale / self.unchanged.torque_scale
+            # inertials of a URDF are never wrong by a factor of ten, or by a negative one
+            return bool((factors > 0.1).all() and (factors < 10).all())
         if best.codes == ("joint-zero",):
             return bool(np.abs(best.offset - self.unchanged.offset).max() < GEOMETRY.serious_angle)
         present = np.array(self.unchanged.gravity)

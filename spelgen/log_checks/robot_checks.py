@@ -144,23 +144,23 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
 
 
 def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) -> list[np.ndarray]:
-    """Return candidates for factors (n,) that convert torques in a wrong unit, from the magnitude of gravity.
+    """Return candidates for factors (n,) that convert torques in a wrong unit, from the gravity that they contain.
 
-    There is one candidate for each joint whose torques differ from the URDF's gravity by more than a factor of five,
-    which wrong inertials do not explain, and one with the same factor for all joints. undeclared: (n,) True for joints
-    whose torque has no unit in the mapping.
+    A factor is negative if the torques have the opposite sense as well. There is one candidate for each joint whose
+    torques differ from the URDF's gravity by more than a factor of five, which wrong inertials do not explain, and one
+    with the same factor for all joints. undeclared: (n,) True for joints whose torque has no unit in the mapping.
     """
     seen: list[float] = []
     factors = []
     for k, joint in enumerate(joints):
-        factor, correlation = joint.report.gravity.factor, joint.report.gravity.correlation or 0.0
+        factor, correlation = joint.report.gravity.factor, abs(joint.report.gravity.correlation or 0.0)
         # for a joint with little gravity the ratio is known only if the torque is nearly proportional to gravity
         share = abs(factor or 0.0) * (joint.report.gravity.relative_deviation or 0.0)
         is_known = (correlation > TUNING.seen and share > TUNING.visible) or correlation > SIGNALS.agreement
         if factor is None or not (is_known and undeclared[k]):
             continue
         seen.append(factor)
-        if not 1 / 5 < factor < 5:
+        if not 1 / 5 < abs(factor) < 5:
             single = np.ones(len(joints))
             single[k] = rounded_factor(1 / factor)
             factors.append(single)
@@ -174,10 +174,11 @@ def rounded_factor(factor: float) -> float:
 
     One digit is enough if it changes the factor by less than 10 %.
     """
-    if 1 / 1.5 < factor / 1e-3 < 1.5:
-        return 1e-3  # a tolerance of 50 %, since the factor is only as exact as the masses of the URDF
+    if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
+        # a tolerance of 50 %, since the factor is only as exact as the masses of the URDF
+        return float(np.copysign(1e-3, factor))
     one = float(f"{factor:.1g}")
-    return one if abs(one - factor) < 0.1 * factor else float(f"{factor:.2g}")
+    return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
