@@ -233,12 +233,11 @@ class GeometryProblem:
         other._equations = {self.unchanged.motion_key: (rows, block_products(rows, 1)[:, 0])}
         return other
 
-    def gravity_ratio(self, fit: HypothesisFit) -> float:
-        """Return the least-squares ratio of gravity torques, of a fit to the URDF; 0 without gravity."""
+    def gravity_torques(self, fit: HypothesisFit) -> tuple[np.ndarray, np.ndarray]:
+        """Return the gravity torques (S, n) [Nm, N] of a fit, and those of the URDF's inertial parameters."""
         weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
         columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
-        fitted, stated = columns @ fit.parameters, columns @ self.prior_mean
-        return float((fitted * stated).sum() / max(float(np.square(stated).sum()), 1e-12))
+        return columns @ fit.parameters, columns @ self.prior_mean
 
     def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
         """Return the standard deviation (S, n) [Nm, N] of the model's torques due to the parameters' covariance."""

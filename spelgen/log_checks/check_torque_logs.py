@@ -204,9 +204,11 @@ class TorqueLogs:
         names, ones = self._arm.chain.joint_names, np.ones(len(evidence))
         scalings = []
         undeclared = [self._mapping.unit("tau", name) in (None, "mNm") for name in names]
-        candidates = torque_factors(evidence, undeclared)
         coarse = problem.thinned(GEOMETRY.coarse_samples)
-        ratio = coarse.gravity_ratio(coarse.fit(coarse.unchanged))
+        fitted, stated = coarse.gravity_torques(coarse.fit(coarse.unchanged))
+        loads = stated.std(axis=0)
+        candidates = torque_factors(evidence, undeclared, loads > TUNING.loaded * loads.max())
+        ratio = float((fitted * stated).sum() / max(float(np.square(stated).sum()), 1e-12))
         if all(undeclared) and ratio > 0 and not 1 / 5 < ratio < 5:
             candidates.append(rounded_factor(1 / ratio) * ones)
         scalings += [Scaling("torque-unit", ones, factors) for factors in candidates]

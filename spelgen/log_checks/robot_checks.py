@@ -34,6 +34,9 @@ class RobotCheckTuning:
     seen: float = 0.7
     # [1] Gravity is visible if its standard deviation is at least this fraction of the torque's, in logs of a UR10e.
     visible: float = 0.2
+    # [1] Gravity of the URDF shows the unit of a joint's torque if it varies by this fraction of the variation at the
+    # joint with the largest gravity. A payload may multiply the gravity of a joint with less, such as a wrist.
+    loaded: float = 0.01
     # [1] A column of the regressor is linearly dependent on others if the norm of its residual after projection onto
     # them is below this fraction of its norm.
     dependent: float = 1e-8
@@ -143,12 +146,15 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
     return f"{limit} up to {largest:.4g} {unit}, the limit is {bound:.4g}"
 
 
-def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) -> list[np.ndarray]:
+def torque_factors(
+    joints: Sequence[JointEvidence], undeclared: Sequence[bool], loaded: Sequence[bool] | np.ndarray
+) -> list[np.ndarray]:
     """Return candidates for factors (n,) that convert torques in a wrong unit, from the gravity that they contain.
 
     A factor is negative if the torques have the opposite sense as well. There is one candidate for each joint whose
     torques differ from the URDF's gravity by more than a factor of five, which wrong inertials do not explain, and one
-    with the same factor for all joints. undeclared: (n,) True for joints whose torque has no unit in the mapping.
+    with the same factor for all joints if their median differs as much. undeclared: (n,) True for joints whose torque
+    has no unit in the mapping. loaded: (n,) True for joints that gravity loads enough.
     """
     seen: list[float] = []
     factors = []
@@ -157,15 +163,16 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
         # for a joint with little gravity the ratio is known only if the torque is nearly proportional to gravity
         share = abs(factor or 0.0) * (joint.report.gravity.relative_deviation or 0.0)
         is_known = (correlation > TUNING.seen and share > TUNING.visible) or correlation > SIGNALS.agreement
-        if factor is None or not (is_known and undeclared[k]):
+        if factor is None or not (is_known and undeclared[k] and loaded[k]):
             continue
         seen.append(factor)
         if not 1 / 5 < abs(factor) < 5:
             single = np.ones(len(joints))
             single[k] = rounded_factor(1 / factor)
             factors.append(single)
-    if factors and all(undeclared):
-        factors.append(np.full(len(joints), rounded_factor(1 / float(np.median(seen)))))
+    median = float(np.median(seen)) if seen else 1.0
+    if all(undeclared) and not 1 / 5 < abs(median) < 5:
+        factors.append(np.full(len(joints), rounded_factor(1 / median)))
     return factors
 
 
