@@ -349,7 +349,7 @@ def test_real_arms_are_believed(shared):
 
 @pytest.mark.parametrize("name", ["20_01_13_load_2600", "20_01_31_load"])
 def test_a_payload_is_not_another_unit_of_torques(shared, name):
-    """The payload's gravity at wrist 2 is 36 times that of the URDF's wrist."""
+    """The payload's gravity at wrist 2 is 36 times the gravity of the URDF's wrist."""
     folder = shared / "logs" / "ur10e"
     real = load_arm(folder / "ur10e.urdf")
     result = check_logs(read_logs([folder / f"{name}.parquet"], real), real)

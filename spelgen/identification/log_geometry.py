@@ -234,7 +234,7 @@ class GeometryProblem:
         return other
 
     def gravity_torques(self, fit: HypothesisFit) -> tuple[np.ndarray, np.ndarray]:
-        """Return the gravity torques (S, n) [Nm, N] of a fit, and those of the URDF's inertial parameters."""
+        """Return the gravity torques (S, n) [Nm, N] of a fit, and with the inertial parameters of the URDF."""
         weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
         columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
         return columns @ fit.parameters, columns @ self.prior_mean
