@@ -35,9 +35,11 @@ from truth import Case, Truth, record_log, wrong_urdf
 
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm, load_arm
+from spelgen.identification.column_faults import position_factors
 from spelgen.identification.drive_hints import DriveLog
-from spelgen.identification.geometry_search import HypothesisComparison, compare_readings, position_scalings
-from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, MotionSamples
+from spelgen.identification.geometry_search import HypothesisComparison, compare_hypotheses, kinds_of_faults
+from spelgen.identification.hypotheses import Hypothesis, MotionSamples
+from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -97,59 +99,54 @@ def samples_of(arm: Arm, logs: Sequence[Trajectory]) -> MotionSamples:
 def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
     """Return the reading that mends a fault of a kind."""
     right, n = Hypothesis.unchanged(arm), len(arm.coordinates)
-    sign, offset, order = np.ones(n), np.zeros(n), rng.permutation(n)
-    sign[rng.integers(n)] = -1.0
+    joint, present = np.eye(n)[rng.integers(n)], right.source[0]
+    order, pair = rng.permutation(n), present.copy()
+    first, second = rng.choice(n, 2, replace=False)
+    pair[[first, second]] = second, first
     turning = [k for k, x in enumerate(arm.coordinates) if x.joint_type == "revolute"]
     angle = np.pi / 2 * rng.choice([1, 2, -1])
     if kind == "zero, any angle":
         angle = rng.uniform(0.3, np.pi) * rng.choice([1, -1])
-    offset[rng.choice(turning)] = angle
-    delay = np.zeros(n)
-    delay[rng.integers(n)] = rng.uniform(0.04, 0.14) * rng.choice([1, -1])
-    units = [x for x in position_scalings(arm, right.motion_scale) if (x.motion < 7).all()]
-    pair = np.arange(n)
-    first, second = rng.choice(n, 2, replace=False)
-    pair[[first, second]] = second, first
+    offset = angle * np.eye(n)[rng.choice(turning)]
+    delay = rng.uniform(0.04, 0.14) * rng.choice([1, -1]) * joint
+    units = [x for x in position_factors(arm, right.scale[0]) if (x < 7).all()]
     direction = rng.normal(size=3)
     if rng.random() < 0.5:
         direction = np.eye(3)[rng.integers(3)] * rng.choice([1, -1])
     x, y, z = map(float, 9.81 * direction / np.linalg.norm(direction))
+    sign, ones, none = 1 - 2 * joint, np.ones(n), np.zeros(n)
     return {
-        "position": replace(right, motion_scale=sign),
-        "torque": replace(right, torque_scale=sign),
-        "position and torque": replace(right, motion_scale=sign, torque_scale=sign),
-        "order": replace(right, motion_source=order, torque_source=order),
-        "order of torques": replace(right, torque_source=order),
-        "two torques": replace(right, torque_source=pair),
+        "position": replace(right, scale=np.stack([sign, ones])),
+        "torque": replace(right, scale=np.stack([ones, sign])),
+        "position and torque": replace(right, scale=np.stack([sign, sign])),
+        "order": replace(right, source=np.stack([order, order])),
+        "order of torques": replace(right, source=np.stack([present, order])),
+        "two torques": replace(right, source=np.stack([present, pair])),
         "zero, 90 degrees": replace(right, offset=offset),
         "zero, any angle": replace(right, offset=offset),
         "gravity": replace(right, gravity=(x, y, z)),
-        "unit of angles": replace(right, motion_scale=units[rng.integers(2)].motion),
-        "late motion": replace(right, motion_delay=delay),
-        "late torque": replace(right, torque_delay=delay),
-        "late joint": replace(right, motion_delay=delay, torque_delay=delay),
+        "unit of angles": replace(right, scale=units[rng.integers(2)]),
+        "late motion": replace(right, delay=np.stack([delay, none])),
+        "late torque": replace(right, delay=np.stack([none, delay])),
+        "late joint": replace(right, delay=np.stack([delay, delay])),
     }[kind]
 
 
 def wrong_log(log: Trajectory, right: Hypothesis) -> Trajectory:
     """Return the log for which a reading is right: the inverse of the reading."""
     n = len(right.offset)
-    motion, torque = np.argsort(right.motion_source), np.argsort(right.torque_source)
-    columns = [
-        (log.q - right.offset) / right.motion_scale,
-        log.qd / right.motion_scale,
-        log.tau / right.torque_scale,
-    ]
-    delays = [right.motion_delay, right.motion_delay, right.torque_delay]
+    motion, torque = np.argsort(right.source)
+    columns = [(log.q - right.offset) / right.scale[0], log.qd / right.scale[0], log.tau / right.scale[1]]
     late = []
-    for values, delay in zip(columns, delays, strict=True):
+    for values, delay in zip(columns, right.delay[[0, 0, 1]], strict=True):
         late.append(np.column_stack([np.interp(log.t - delay[k], log.t, values[:, k]) for k in range(n)]))
     return replace(log, q=late[0][:, motion], qd=late[1][:, motion], tau=late[2][:, torque])
 
 
 def compared(problem: GeometryProblem) -> HypothesisComparison:
     """Return the readings of a log that are better than the unchanged one."""
-    return compare_readings(problem, position_scalings(problem.arm, problem.unchanged.motion_scale))
+    faults = kinds_of_faults(problem.arm, position_scale=problem.unchanged.scale[0])
+    return compare_hypotheses(problem, faults)
 
 
 def is_same(one: Hypothesis, other: Hypothesis) -> bool:
@@ -157,13 +154,10 @@ def is_same(one: Hypothesis, other: Hypothesis) -> bool:
     turn = np.angle(np.exp(1j * (one.offset - other.offset)))
     gravity = np.array(one.gravity) - np.array(other.gravity)
     return bool(
-        (one.motion_source == other.motion_source).all()
-        and (one.torque_source == other.torque_source).all()
-        and np.allclose(one.motion_scale, other.motion_scale)
-        and np.allclose(one.torque_scale, other.torque_scale)
+        (one.source == other.source).all()
+        and np.allclose(one.scale, other.scale)
         and np.abs(turn).max() < NEAR
-        and np.abs(one.motion_delay - other.motion_delay).max() < NEAR_DELAY
-        and np.abs(one.torque_delay - other.torque_delay).max() < NEAR_DELAY
+        and np.abs(one.delay - other.delay).max() < NEAR_DELAY
         and np.linalg.norm(gravity) < NEAR * 9.81
     )
 

@@ -8,159 +8,20 @@ inertial parameters at the URDF, and penalties for negative rotor inertia and fo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag
 
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.identification.drive_hints import FRICTION, OFFSETS, drive_rows
+from spelgen.identification.drive_hints import FRICTION, drive_rows
+from spelgen.identification.hypotheses import Hypothesis, HypothesisFit, MotionSamples, Vector3
 from spelgen.identification.least_squares import block_products, varying
 from spelgen.identification.tuning import GEOMETRY
-from spelgen.logs.dynamics_samples import FREQUENCY
 from spelgen.runtime.body_chain import BodyChain
-
-Vector3 = tuple[float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class MotionSamples:
-    """S samples of motion and joint torques of n joints.
-
-    values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at E times around each sample, see `DriveSamples`;
-    E = 1 for samples without their neighbours. bent: (S, n, K) bristle deflections of the unchanged log; K = 0 for
-    samples without a history of motion.
-    """
-
-    values: np.ndarray
-    bent: np.ndarray
-
-    @classmethod
-    def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
-        """Return the samples of signals, (S, n) each, without their neighbours."""
-        return cls(np.stack([q, qd, qdd, tau], axis=2)[..., None], np.zeros((*q.shape, 0)))
-
-    @property
-    def motion(self) -> np.ndarray:
-        """Positions, velocities and accelerations, (3, S, n)."""
-        return np.moveaxis(self._central[..., :3], 2, 0)
-
-    @property
-    def tau(self) -> np.ndarray:
-        """Joint torques, (S, n)."""
-        return self._central[..., 3]
-
-    @property
-    def _central(self) -> np.ndarray:
-        return self.values[..., self.values.shape[3] // 2]
-
-    def at(self, delays: np.ndarray) -> np.ndarray:
-        """Return the signals (S, n, 4) at the times `delays` (n, 4) [s] after the samples."""
-        if not delays.any():
-            return self._central
-        weights = CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))(delays)
-        return np.asarray(np.einsum("snie,nie->sni", self.values, weights))
-
-    def thinned(self, count: int) -> MotionSamples:
-        """Return at most `count` samples, evenly spaced."""
-        stride = -(-len(self.values) // count) or 1
-        return MotionSamples(self.values[::stride], self.bent[::stride])
-
-
-def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
-    """Return the concatenation of several sets of samples."""
-    values, bent = (
-        np.concatenate(columns) for columns in zip(*((x.values, x.bent) for x in samples), strict=True)
-    )
-    return MotionSamples(values, bent)
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """Hypothesis about a log: columns, scales, offsets and delays of n joints, and gravity.
-
-    The position of joint k is motion_scale[k] times the logged position of joint motion_source[k], plus offset[k] [rad,
-    m]. The torque of joint k is torque_scale[k] times the logged torque of joint torque_source[k].
-
-    codes: codes of the changes, as in findings; empty for the unchanged log. motion_delay, torque_delay: (n,) [s] delay
-    of the logged positions and velocities, and of the torques, of each joint. gravity: vector of gravity in the frame
-    of the root link [m/s^2].
-    """
-
-    codes: tuple[str, ...]
-    motion_source: np.ndarray
-    torque_source: np.ndarray
-    motion_scale: np.ndarray
-    torque_scale: np.ndarray
-    offset: np.ndarray
-    motion_delay: np.ndarray
-    torque_delay: np.ndarray
-    gravity: Vector3
-
-    @classmethod
-    def unchanged(cls, arm: Chain) -> Hypothesis:
-        """Return the hypothesis of the unchanged log, in SI units and without offsets."""
-        order, ones = np.arange(len(arm.coordinates)), np.ones(len(arm.coordinates))
-        x, y, z = map(float, arm.gravity)
-        zeros = 0.0 * ones
-        return cls((), order, order, ones, ones, zeros, zeros, zeros, (x, y, z))
-
-    @property
-    def motion_key(self) -> tuple[bytes, Vector3]:
-        """Key under which the regressor is cached: it depends only on the motion and on gravity."""
-        arrays = (self.motion_source, self.motion_scale, self.offset, self.motion_delay)
-        return b"".join(x.tobytes() for x in arrays), self.gravity
-
-    @property
-    def _scales(self) -> np.ndarray:
-        """Factors of q, qd, qdd and tau of each joint, (n, 4)."""
-        return np.stack([*[self.motion_scale] * 3, self.torque_scale], axis=1)
-
-    def signals(self, samples: MotionSamples) -> MotionSamples:
-        """Return the samples of the joints, in SI units, for logged samples under this hypothesis."""
-        of_joint = _permuted(samples.values, self.motion_source, self.torque_source)
-        delays = np.stack([*[self.motion_delay] * 3, self.torque_delay], axis=1)
-        signals = MotionSamples(of_joint, samples.bent).at(delays) * self._scales
-        signals[..., 0] += self.offset
-        return MotionSamples(signals[..., None], samples.bent)
-
-    def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the logged samples for `samples` of the joints: the inverse of `signals` without delays."""
-        signals = samples.values.copy()
-        signals[:, :, 0] -= self.offset[:, None]
-        signals /= self._scales[..., None]
-        signals = _permuted(signals, np.argsort(self.motion_source), np.argsort(self.torque_source))
-        return MotionSamples(signals, samples.bent)
-
-
-def _permuted(values: np.ndarray, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """Return signals (S, n, 4, E) in which joint k has the motion of joint motion[k] and the torque of torque[k]."""
-    return np.concatenate([values[:, motion, :3], values[:, torque, 3:]], axis=2)
-
-
-@dataclass(frozen=True, eq=False)
-class HypothesisFit:
-    """MAP estimate of the K parameters of an arm with n joints under a hypothesis about the log.
-
-    Attributes:
-        hypothesis: the hypothesis.
-        cost: negative log posterior up to a constant.
-        misfit: contribution of the torque residual to the cost.
-        parameters: (K,) inertial parameters, then friction and rotor inertias.
-        covariance: (K, K) posterior covariance of the parameters.
-        errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
-    """
-
-    hypothesis: Hypothesis
-    cost: float
-    misfit: float
-    parameters: np.ndarray
-    covariance: np.ndarray
-    errors: np.ndarray
 
 
 class GeometryProblem:
@@ -322,6 +183,45 @@ class GeometryProblem:
         vector = flat.T @ ((tau - rows @ fit.parameters) * np.sqrt(weights)).ravel()
         vector[:known] += self._precision @ (self.prior_mean - fit.parameters)
         return np.asarray((inverse(matrix) @ vector)[known:])
+
+    def descend(
+        self,
+        at: Callable[[np.ndarray], Hypothesis],
+        start: np.ndarray,
+        *,
+        largest: float,
+        smallest: float,
+        allowed: Callable[[np.ndarray], np.ndarray] = np.asarray,
+    ) -> tuple[np.ndarray, HypothesisFit]:
+        """Return continuous quantities of a hypothesis, (D,), with a low cost, and their fit.
+
+        At most four Gauss-Newton steps are made. The descent ends when a step does not lower the cost, or is
+        negligible.
+
+        Args:
+            at: function of the quantities (D,) that returns the hypothesis.
+            start: (D,) initial values.
+            largest: bound of each component of a step, which is clipped.
+            smallest: norm below which a step is negligible.
+            allowed: function of values (D,) after a step that returns the nearest allowed values.
+        """
+        values, fit = start, self.fit(at(start))
+        difference = 1e-4 * largest
+        for _ in range(4):
+            residual = self.residual(fit.hypothesis, fit.parameters)
+            columns = []
+            for shift in difference * np.eye(len(values)):
+                changed = self.residual(at(values + shift), fit.parameters)
+                columns.append((changed - residual) / difference)
+            step = np.clip(self.step(fit, np.stack(columns, axis=2)), -largest, largest)
+            new = allowed(values + step)
+            if np.linalg.norm(new - values) < smallest:
+                break
+            best = self.fit(at(new))
+            if best.cost > fit.cost:
+                break
+            values, fit = new, best
+        return values, fit
 
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the penalty for negative rotor inertias, and for friction that drives the motion on average.

@@ -59,8 +59,6 @@ class LogGeometryTuning:
     needed: float = 20.0
     # Cost difference up to which two hypotheses count as equally good, and are both reported.
     ambiguous: float = 8.0
-    # Unit of the penalties for changes that are rarer than a wrong sign or order.
-    rare: float = 1.0
     # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which a log is probably in another order.

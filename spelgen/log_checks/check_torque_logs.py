@@ -11,20 +11,18 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic
+from spelgen.identification.column_faults import UNITS
 from spelgen.identification.drive_hints import Coupling, DriveLog, DriveSamples, drive_problem
-from spelgen.identification.geometry_search import (
-    UNITS,
-    Scaling,
-    compare_readings,
-    position_scalings,
-)
+from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
+from spelgen.identification.hypotheses import Hypothesis, HypothesisFit, MotionSamples, joined_samples
 from spelgen.identification.least_squares import varying
-from spelgen.identification.log_geometry import GeometryProblem, HypothesisFit, MotionSamples, joined_samples
+from spelgen.identification.log_faults import Correction, Fault
+from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.listing import Listing, number
+from spelgen.log_checks.geometry_finding import geometry_finding
 from spelgen.log_checks.limits_in_logs import CLIPPED, FlatTops, find_limits
-from spelgen.log_checks.remedies import Remedies, mapped_reading
 from spelgen.log_checks.report import JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import (
     CHECKS,
@@ -163,8 +161,21 @@ class TorqueLogs:
             samples = MotionSamples(moving.around, moving.bent)
         if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
-        reading = mapped_reading(self._arm.chain, self._mapping, self._drives)
-        return GeometryProblem(self._arm.chain, samples, self._drives.speeds, self._seconds, reading)
+        return GeometryProblem(
+            self._arm.chain, samples, self._drives.speeds, self._seconds, self._stated_hypothesis()
+        )
+
+    def _stated_hypothesis(self) -> Hypothesis:
+        """Return the hypothesis without faults, with the signs, scales and offsets that the mapping states.
+
+        The scale of the torques includes the gear ratios of the drives if each motor drives one joint.
+        """
+        joints, inputs, mapping = self._arm.chain.joint_names, self._drives.inputs, self._mapping
+        gears = np.diag(inputs) if np.count_nonzero(inputs) == len(joints) else np.ones(len(joints))
+        scale = np.array([[mapping.scale(quantity, joint) for joint in joints] for quantity in ("q", "tau")])
+        scale[1] *= np.where(gears, gears, 1.0)
+        offset = np.array([mapping.offset("q", joint) for joint in joints])
+        return replace(Hypothesis.unchanged(self._arm.chain), scale=scale, offset=offset)
 
     def _check_geometry(
         self,
@@ -183,44 +194,42 @@ class TorqueLogs:
         if limits.errors and CLIPPED not in accepted:
             summary.errors.extend(limits.errors)
             return False
-        comparison = compare_readings(problem, self._scalings(evidence, problem))
+        comparison = compare_hypotheses(problem, self._faults(evidence, problem))
         if not comparison.better:
             summary.notes.extend(_link_notes(problem, comparison.unchanged))
         if not comparison.better or set(comparison.codes) <= accepted:
             return True
-        remedies = Remedies(problem.unchanged, self._arm.chain, self._mapping, self._is_bag)
-        finding = remedies.finding(comparison)
+        corrections = []
+        for fit in comparison.better:
+            corrections.append(
+                Correction(problem.arm, self._mapping, self._is_bag, problem.unchanged, fit.hypothesis)
+            )
+        finding = geometry_finding(comparison.unchanged, comparison.better[0], corrections)
         if isinstance(finding, Diagnostic):
             summary.notes.append(finding)
         else:
             summary.errors.append(finding)
         return False
 
-    def _scalings(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> list[Scaling]:
-        """Return candidate unit corrections: factors on torques, from the magnitude of gravity, and on all positions.
+    def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
+        """Return the kinds of faults to test, with candidates for factors on torques from the magnitude of gravity.
 
-        A unit of torques that the mapping states is not changed.
+        A unit of torques that the mapping states is not changed, unless it is mNm.
         """
         names, ones = self._arm.chain.joint_names, np.ones(len(evidence))
-        scalings = []
         undeclared = [self._mapping.unit("tau", name) in (None, "mNm") for name in names]
         coarse = problem.thinned(GEOMETRY.coarse_samples)
-        fitted, stated = coarse.gravity_torques(coarse.fit(coarse.unchanged))
-        loads = stated.std(axis=0)
+        fitted, of_urdf = coarse.gravity_torques(coarse.fit(coarse.unchanged))
+        loads = of_urdf.std(axis=0)
         candidates = torque_factors(evidence, undeclared, loads > TUNING.loaded * loads.max())
-        ratio = float((fitted * stated).sum() / max(float(np.square(stated).sum()), 1e-12))
+        ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
         if all(undeclared) and ratio > 0 and not 1 / 5 < ratio < 5:
             candidates.append(rounded_factor(1 / ratio) * ones)
-        scalings += [Scaling("torque-unit", ones, factors) for factors in candidates]
-        scale = np.array([self._mapping.scale("q", name) for name in names])
         # velocities must have the unit of the positions per second, so that both are changed by the same factor
         units = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
-        if units <= {
-            (None, None),
-            *((unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])),
-        }:
-            scalings += position_scalings(self._arm.chain, scale)
-        return scalings
+        stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}
+        scale = problem.unchanged.scale[0] if units <= {(None, None), *stated} else None
+        return kinds_of_faults(problem.arm, candidates, scale)
 
     def _check_drives(self, moving: DriveSamples, summary: Findings) -> None:
         """Add a warning about a coupling of motors that the logs show, or else a note on a delay of the torques."""

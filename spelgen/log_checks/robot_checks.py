@@ -11,7 +11,7 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Chain, Coordinate
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
-from spelgen.identification.log_geometry import MotionSamples
+from spelgen.identification.hypotheses import MotionSamples
 from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, GravityFit, JointReport
 from spelgen.log_checks.statistics import has_few_levels

@@ -1,0 +1,239 @@
+"""Faults of the columns of a log: other joints, the opposite sense, another unit."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from spelgen.arm.arm import Chain
+from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
+from spelgen.identification.log_faults import Correction, Fault
+from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.logs.joint_signals import plain_number
+from spelgen.settings.log_mapping import SCALES
+
+UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
+
+
+class WrongOrder(Fault):
+    """Joints in another order.
+
+    description: the exchanged columns. rows: rows of `Hypothesis.source` that are permuted, 0 for the motion and 1 for
+    the torques. starts: number of orders from which the search for the best order starts.
+    """
+
+    def __init__(self, code: str, description: str, rows: tuple[int, ...], starts: int = 9) -> None:
+        self.code, self.description = code, description
+        self._rows, self._starts = rows, starts
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the fits with the columns of two joints exchanged, for all pairs."""
+        return map(problem.fit, self._swapped(base.hypothesis))
+
+    def _swapped(self, base: Hypothesis) -> Iterator[Hypothesis]:
+        for pair in combinations(range(len(base.offset)), 2):
+            source = base.source.copy()
+            source[np.ix_(self._rows, pair)] = source[np.ix_(self._rows, pair[::-1])]
+            yield base.changed(self, source=source)
+
+    def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the fits with the best orders of all joints, one per start of the search.
+
+        An order is improved by exchanging two joints at a time. The search also starts at random orders, since the
+        cost has local minima for arms with many joints.
+        """
+        joints, rng = problem.arm.joint_names, np.random.default_rng(0)
+        present = np.arange(len(joints))
+        # joints may be logged in the alphabetical order of their names
+        starts = [present, present[::-1], np.argsort(np.argsort(joints))]
+        starts += [rng.permutation(len(joints)) for _ in range(6)]
+        # fits are cached, since searches from several starts visit the same orders
+        known: dict[bytes, HypothesisFit] = {}
+
+        def fitted(hypothesis: Hypothesis) -> HypothesisFit:
+            key = hypothesis.source.tobytes()
+            if key not in known:
+                known[key] = problem.fit(hypothesis)
+            return known[key]
+
+        for start in starts[: self._starts]:
+            source = unchanged.hypothesis.source.copy()
+            source[list(self._rows)] = start
+            fit = fitted(unchanged.hypothesis.changed(self, source=source))
+            while True:
+                best = min(map(fitted, self._swapped(fit.hypothesis)), key=lambda x: x.rank)
+                if best.cost > fit.cost - 1.0:
+                    break
+                fit = best
+            if (fit.hypothesis.source != present).any():
+                yield fit
+
+    def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
+        """Return the name of the joint in the log if all its columns belong to one joint; else the columns."""
+        names, mapping = correction.arm.joint_names, correction.mapping
+        motion, torque = (names[k] for k in correction.hypothesis.source[:, joint])
+        if correction.by_name and motion == torque != names[joint]:
+            return {"name": mapping.log_name(motion)}
+        columns = {}
+        for quantity in mapping.quantities:
+            source = torque if quantity == "tau" else motion
+            if source != names[joint]:
+                columns[quantity] = mapping.column(quantity, source)
+        return {"columns": columns} if columns else {}
+
+
+class WrongScale(Fault):
+    """Signals of joints in another sense or unit.
+
+    factors: candidates (2, n) for factors on the motion and on the torques of n joints. The settings are the same for
+    all kinds of scales, since the setting `sign` applies to the motion and to the torque of a joint.
+    """
+
+    def __init__(self, factors: Sequence[np.ndarray]) -> None:
+        self.factors = factors
+
+    @abstractmethod
+    def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the mask (n,) of the joints with this fault, for factors on their motion and torques (n,)."""
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the fits with each candidate."""
+        reading = base.hypothesis
+        for factor in self.factors:
+            # the offset in the mapping may have been measured with the right or with the wrong sign
+            offsets = {x.tobytes(): x for x in (reading.offset, np.sign(factor[0]) * reading.offset + 0.0)}
+            for offset in offsets.values():
+                yield problem.fit(reading.changed(self, scale=reading.scale * factor, offset=offset))
+
+    def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
+        """Return the sign, the units and the gain of a joint, and the offsets of its position and torque."""
+        if not self.has(*correction.factors)[joint]:
+            return {}
+        name, (motion, torque) = correction.arm.joint_names[joint], correction.factors[:, joint].tolist()
+        present = correction.mapping.joint(name)
+        keys: dict[str, object] = {}
+        units = {}
+        if motion < 0:
+            keys["sign"] = -present.sign
+        if abs(motion) != 1:
+            unit = position_unit(correction, joint)
+            units = {"q": unit, "qd": f"{unit}/s"}
+        gain = torque * np.sign(motion)
+        if correction.mapping.unit("tau", name) == "mNm" and np.isclose(abs(gain), 1e3):
+            units["tau"] = "Nm"
+            gain /= 1e3
+        if units:
+            keys["units"] = units
+        if gain != 1.0:
+            keys["gain"] = plain_number((present.gain or 1.0) * gain)
+        if present.torque_offset and torque != np.sign(motion):
+            keys["torque_offset"] = present.torque_offset * torque
+        if motion < 0 and correction.hypothesis.offset[joint] != correction.unchanged.offset[joint]:
+            keys["offset"] = plain_number(correction.hypothesis.offset[joint])
+        return keys
+
+
+class JointSense(WrongScale):
+    """Positions and velocities of a joint that have the opposite sense, with or without its torque."""
+
+    code = "joint-sense"
+
+    def __init__(self, n: int) -> None:
+        signs = 1.0 - 2.0 * np.eye(n)
+        super().__init__([np.stack([sign, torque]) for sign in signs for torque in (np.ones(n), sign)])
+
+    def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the mask (n,) of the joints whose motion has the opposite sense."""
+        return np.asarray(motion < 0)
+
+    def text(self, correction: Correction) -> str:
+        """Return a description of the signals of the opposite sense."""
+        motion, torque = correction.factors
+        if (torque[motion < 0] < 0).all():
+            return "positions, velocities and torques of the opposite sense"
+        return "positions and velocities of the opposite sense, and torques of the right one"
+
+
+class TorqueSense(WrongScale):
+    """Torques of the opposite sense, of all joints or of one joint."""
+
+    code = "torque-sense"
+    description = "torques of the opposite sense"
+
+    def __init__(self, n: int) -> None:
+        super().__init__([np.stack([np.ones(n), sign]) for sign in (-np.ones(n), *(1.0 - 2.0 * np.eye(n)))])
+
+    def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the mask (n,) of the joints of which only the torque has the opposite sense."""
+        return np.asarray((torque < 0) & (motion > 0))
+
+
+class TorqueUnit(WrongScale):
+    """Torques in another unit.
+
+    The evidence for a factor is the magnitude of the gravity in the torques, and no decrease of the cost is required:
+    light bodies can explain torques that are too small.
+    """
+
+    code = "torque-unit"
+    rarity = 2
+    needed = 0.0
+    evidence = "by the URDF's gravity"
+
+    def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the mask (n,) of the joints whose torque has another unit."""
+        return np.asarray(np.abs(torque) != 1)
+
+    def text(self, correction: Correction) -> str:
+        """Return a description with the largest factor, and with the sense of the torques if no other fault has it."""
+        torque = correction.factors[1]
+        largest = torque[np.abs(np.log(np.abs(torque))).argmax()]
+        senses = (JointSense, TorqueSense)
+        is_reversed = largest < 0 and not any(isinstance(x, senses) for x in correction.hypothesis.faults)
+        sense = " and of the opposite sense" if is_reversed else ""
+        return f"torques of another unit{sense}, {abs(1 / largest):.3g} times as large"
+
+    def minor_code(self, correction: Correction) -> str:
+        """Return a code for factors between 0.1 and 10; inertials of a URDF are never wrong by a factor of ten."""
+        torque = correction.factors[1]
+        return "torque-scale" if (torque > 0.1).all() and (torque < 10).all() else ""
+
+
+class PositionUnit(WrongScale):
+    """Positions of all revolute or of all prismatic joints in another unit than the mapping states."""
+
+    code = "joint-unit"
+    rarity = 2
+
+    def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the mask (n,) of the joints whose positions have another unit."""
+        return np.asarray(np.abs(motion) != 1)
+
+    def text(self, correction: Correction) -> str:
+        """Return a description with the units."""
+        joints = np.flatnonzero(self.has(*correction.factors)).tolist()
+        return f"positions in {' and '.join(dict.fromkeys(position_unit(correction, k) for k in joints))}"
+
+
+def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
+    """Return candidates for factors (2, n) on the motion of all joints of a type, for each other unit.
+
+    scale: (n,) factor from logged positions to SI units, with the sign of the joint.
+    """
+    types, candidates = np.array(arm.joint_types), []
+    for joint_type, units in UNITS.items():
+        for unit in units:
+            motion = np.where(types == joint_type, SCALES.get(unit, 1.0) / np.abs(scale), 1.0)
+            if (motion != 1).any():
+                candidates.append(np.stack([motion, np.ones_like(motion)]))
+    return candidates
+
+
+def position_unit(correction: Correction, joint: int) -> str:
+    """Return the unit of a joint's positions whose factor to SI units is nearest to the factor of the hypothesis."""
+    scale = abs(float(correction.hypothesis.scale[0, joint]))
+    units = UNITS[correction.arm.coordinates[joint].joint_type]
+    return min(units, key=lambda unit: abs(np.log(scale / SCALES.get(unit, 1.0))))

@@ -1,0 +1,250 @@
+"""Faults of a log with a continuous quantity: zero offsets, delays, the vector of gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
+from spelgen.identification.log_faults import Correction, Fault
+from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.tuning import GEOMETRY
+from spelgen.logs.joint_signals import plain_number
+
+RIGHT_ANGLE = np.pi / 2
+
+
+class ZeroOffset(Fault):
+    """Positions of a joint with another zero than the URDF's."""
+
+    code = "joint-zero"
+    rarity = 2
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the fit with the best offset of each joint.
+
+        Offsets as small as calibration errors are omitted, and offsets that hardly improve the fit to the torques.
+        """
+        for k, coordinate in enumerate(problem.arm.coordinates):
+            yield from self._best(problem, base, k, coordinate.joint_type == "revolute")
+
+    def _best(
+        self, problem: GeometryProblem, base: HypothesisFit, joint: int, is_revolute: bool
+    ) -> Iterator[HypothesisFit]:
+        """Yield the fit with the offset of minimum cost of a joint, for which multiples of 90 degrees are preferred."""
+        reading, unit = base.hypothesis, np.eye(len(base.hypothesis.offset))[joint]
+        min_offset = GEOMETRY.min_angle if is_revolute else GEOMETRY.min_shift
+
+        def shifted(values: np.ndarray) -> Hypothesis:
+            return reading.changed(self, offset=reading.offset + values * unit)
+
+        starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if is_revolute else np.zeros((1, 1))
+        start = min(starts, key=lambda x: problem.fit(shifted(x)).cost)
+        # from the unchanged zero, a step as small as calibration errors is no other zero
+        smallest = GEOMETRY.min_shift if start.any() else min_offset
+        offset, best = problem.descend(shifted, start, largest=1.0, smallest=smallest)
+        is_right_angle = False
+        if is_revolute:
+            offset = (offset + np.pi) % (2 * np.pi) - np.pi
+            right = RIGHT_ANGLE * np.round(offset / RIGHT_ANGLE)
+            exact = problem.fit(shifted(right))
+            is_right_angle = bool(right.any()) and exact.cost < best.cost + GEOMETRY.right_angle
+            if is_right_angle:
+                best, offset = exact, right
+        # An offset must also lower the torque residual (misfit), and not only the prior term: otherwise it only
+        # replaces a change of the masses, whose values in the URDF are uncertain.
+        if abs(offset[0]) >= min_offset and best.misfit <= base.misfit - GEOMETRY.needed / 2:
+            yield best if is_right_angle else problem.fit(shifted(offset.round(4)))
+
+    def text(self, correction: Correction) -> str:
+        """Return a description with the largest offset of the joints whose sense is right."""
+        shifts = correction.hypothesis.offset - correction.unchanged.offset
+        shifts[correction.factors[0] < 0] = 0.0
+        k = int(np.abs(shifts).argmax())
+        size = f"{np.rad2deg(shifts[k]):.3g} degrees"
+        if correction.arm.coordinates[k].joint_type == "prismatic":
+            size = f"{shifts[k]:.3g} m"
+        return f"positions with another zero, by {size}"
+
+    def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
+        """Return the offset of a joint whose sense is right; a wrong sense has another offset, too."""
+        offset = correction.hypothesis.offset[joint]
+        if correction.factors[0, joint] < 0 or offset == correction.unchanged.offset[joint]:
+            return {}
+        return {"offset": plain_number(offset)}
+
+    def minor_code(self, correction: Correction) -> str:
+        """Return the code for offsets as small as errors of a URDF."""
+        shifts = correction.hypothesis.offset - correction.unchanged.offset
+        return self.code if np.abs(shifts).max() < GEOMETRY.serious_angle else ""
+
+
+class Delay(Fault):
+    """Motion, torque or all signals of a joint, or the torques of all joints, that were logged later or earlier."""
+
+    code = "joint-delay"
+    rarity = 2
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the fits with the best delay of the signals of each joint, and of all torques.
+
+        Delays as short as the apparent delays that friction causes are omitted, and a second delay. Samples without
+        their neighbours show no delay.
+        """
+        reading, longest = base.hypothesis, problem.samples.longest_delay
+        if not longest or self in reading.faults:
+            return
+        n, stateful = len(reading.offset), problem.with_hysteresis()
+        stateful_errors = stateful.fit(reading).errors
+        parts = [np.stack([np.zeros(n), np.ones(n)])]
+        for rows in ([1.0, 0.0], [0.0, 1.0], [1.0, 1.0]):
+            parts += [np.outer(rows, unit) for unit in np.eye(n)]
+        for part in parts:
+
+            def delayed(delay: np.ndarray, part: np.ndarray = part) -> Hypothesis:
+                return reading.changed(self, delay=reading.delay + delay * part)
+
+            # a step from 0 would be too short for noisy torques, whose derivative is mostly noise
+            starts = GEOMETRY.delay_start * np.array([[0.0], [1.0], [-1.0]])
+            delay, _ = problem.descend(
+                delayed, min(starts, key=lambda x: problem.fit(delayed(x)).cost), largest=0.05, smallest=0.002,
+                allowed=lambda x: np.clip(x, -longest, longest),
+            )  # fmt: skip
+            if abs(delay[0]) < GEOMETRY.min_delay:
+                continue
+            fit = problem.fit(delayed(delay.round(3)))
+            # Friction with a history also resembles a delay. A delay explains a joint's residual with both friction
+            # models.
+            is_better = fit.errors < GEOMETRY.delay_gain * base.errors
+            is_better &= stateful.fit(fit.hypothesis).errors < GEOMETRY.delay_gain * stateful_errors
+            if is_better.any():
+                yield fit
+
+    def text(self, correction: Correction) -> str:
+        """Return a description with the longest delay."""
+        delay = correction.hypothesis.delay
+        longest = 1e3 * float(delay.ravel()[np.abs(delay).argmax()])
+        late = {
+            (0, 1): "torques",
+            (1, 0): "positions and velocities",
+            (1, 1): "positions, velocities and torques",
+        }
+        is_motion, is_torque = bool(delay[0].any()), bool(delay[1].any())
+        order = "later" if longest > 0 else "earlier"
+        return f"{late[is_motion, is_torque]} logged {abs(longest):.3g} ms {order}"
+
+    def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
+        """Return the delays of the signals of a joint."""
+        mapping, delays = correction.mapping, correction.hypothesis.delay[:, joint]
+        if self.log_keys(correction) or not delays.any():
+            return {}
+        present = mapping.joint(correction.arm.joint_names[joint]).delay
+        late = {}
+        for quantity in mapping.quantities:
+            delay = delays[int(quantity == "tau")]
+            if delay:
+                late[quantity] = plain_number(present.model_dump()[quantity] + delay)
+        return {"delay": {**present.model_dump(exclude_unset=True), **late}}
+
+    def log_keys(self, correction: Correction) -> dict[str, object]:
+        """Return the delay of all torques if it is common to all joints."""
+        delay = correction.hypothesis.delay[1]
+        if not delay.any() or (delay != delay[0]).any():
+            return {}
+        return {"torque_delay": plain_number(correction.mapping.torque_delay + delay[0])}
+
+
+class Compensation(Fault):
+    """Torques from which a controller's gravity compensation is missing, entirely or in part."""
+
+    code = "gravity-compensated"
+    rarity = 3
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the fit with at most half of gravity, or without gravity if it fits about equally well."""
+        present = np.array(base.hypothesis.gravity)
+        if not present.any():
+            return
+
+        def reduced(part: np.ndarray) -> Hypothesis:
+            return with_gravity(self, base, part * present)
+
+        without = problem.fit(reduced(np.zeros(1)))
+        # a fraction of more than a half in all joints is ascribed to wrong masses of the URDF, not to a compensation
+        part, _ = problem.descend(
+            reduced, np.zeros(1), largest=0.5, smallest=1e-3, allowed=lambda x: np.clip(x, -0.5, 0.5)
+        )
+        some = problem.fit(with_gravity(self, base, (part * present).round(3)))
+        yield some if some.cost < without.cost - GEOMETRY.ambiguous else without
+
+    def text(self, correction: Correction) -> str:
+        """Return a description with the remaining fraction of gravity."""
+        present = np.array(correction.unchanged.gravity)
+        part = float(np.array(correction.hypothesis.gravity) @ present / (present @ present))
+        return f"torques in which gravity is compensated: {part:.2g} times the URDF's gravity remains in all joints"
+
+    def robot_keys(self, correction: Correction) -> dict[str, object]:
+        """Return the vector of gravity."""
+        return {"gravity": [plain_number(x) for x in correction.hypothesis.gravity]}
+
+
+class Gravity(Compensation):
+    """Torques of an arm that is mounted in another orientation than the settings state."""
+
+    code = "gravity"
+    rarity = 1
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the fit with the best direction of gravity; directions along the axes of the root link are preferred.
+
+        A direction is omitted if it differs from the present one by less than calibration errors.
+        """
+        present = np.array(base.hypothesis.gravity)
+        size = float(np.linalg.norm(present))
+        standard = size or 9.81  # m/s^2
+
+        def turned(gravity: np.ndarray) -> Hypothesis:
+            return with_gravity(self, base, gravity)
+
+        def normalised(gravity: np.ndarray) -> np.ndarray:
+            return np.asarray(gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9))
+
+        # gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as
+        # with a vertical prismatic joint
+        starts = [problem.fit(turned(standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
+        lowest = min(fit.cost for fit in starts)
+        start = next(fit for fit in starts if fit.cost < lowest + 1.0)
+        descents = []
+        for fit in [start, *([base] if size else [])]:
+            direction = np.array(fit.hypothesis.gravity)
+            descents.append(
+                problem.descend(
+                    turned, direction, largest=standard, smallest=0.01 * standard, allowed=normalised
+                )
+            )
+        new, best = min(descents, key=lambda x: x[1].cost)
+        if np.linalg.norm(new - present) > GEOMETRY.min_angle * size:
+            nearest = np.linalg.norm(new) * np.sign(new) * (np.abs(new) == np.abs(new).max())
+            axis = problem.fit(turned(nearest))
+            is_axis = axis.cost < best.cost + GEOMETRY.right_angle
+            yield axis if is_axis else problem.fit(turned(new.round(3)))
+
+    def text(self, correction: Correction) -> str:
+        """Return a description with the angle between both directions of gravity."""
+        present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
+        cosine = float(new @ present / max(np.linalg.norm(new) * np.linalg.norm(present), 1e-9))
+        angle = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+        return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
+
+    def minor_code(self, correction: Correction) -> str:
+        """Return the code for a tilt as small as errors of the mounting."""
+        present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
+        is_small = np.linalg.norm(present - new) < GEOMETRY.serious_angle * np.linalg.norm(present)
+        return self.code if is_small else ""
+
+
+def with_gravity(fault: Fault, base: HypothesisFit, gravity: np.ndarray) -> Hypothesis:
+    """Return the hypothesis of a fit with another vector of gravity (3,) [m/s^2], which corrects a fault."""
+    x, y, z = (float(value) + 0.0 for value in gravity)
+    return base.hypothesis.changed(fault, gravity=(x, y, z))

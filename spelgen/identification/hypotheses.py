@@ -1,0 +1,166 @@
+"""Hypotheses about a log: which signals of the joints and which gravity its columns represent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from spelgen.arm.arm import Chain
+from spelgen.identification.drive_hints import OFFSETS
+from spelgen.logs.dynamics_samples import FREQUENCY
+
+if TYPE_CHECKING:
+    from spelgen.identification.log_faults import Fault
+
+Vector3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSamples:
+    """S samples of motion and joint torques of n joints.
+
+    values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at E times around each sample, see `DriveSamples`;
+    E = 1 for samples without their neighbours. bent: (S, n, K) bristle deflections of the unchanged log; K = 0 for
+    samples without a history of motion.
+    """
+
+    values: np.ndarray
+    bent: np.ndarray
+
+    @classmethod
+    def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
+        """Return the samples of signals, (S, n) each, without their neighbours."""
+        return cls(np.stack([q, qd, qdd, tau], axis=2)[..., None], np.zeros((*q.shape, 0)))
+
+    @property
+    def motion(self) -> np.ndarray:
+        """Positions, velocities and accelerations, (3, S, n)."""
+        return np.moveaxis(self._central[..., :3], 2, 0)
+
+    @property
+    def tau(self) -> np.ndarray:
+        """Joint torques, (S, n)."""
+        return self._central[..., 3]
+
+    @property
+    def _central(self) -> np.ndarray:
+        return self.values[..., self.values.shape[3] // 2]
+
+    def at(self, delays: np.ndarray) -> np.ndarray:
+        """Return the signals (S, n, 4) at the times `delays` (n, 4) [s] after the samples."""
+        if not delays.any():
+            return self._central
+        weights = CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))(delays)
+        return np.asarray(np.einsum("snie,nie->sni", self.values, weights))
+
+    @property
+    def longest_delay(self) -> float:
+        """Longest delay [s] at which the signals are known; 0 for samples without their neighbours."""
+        return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
+
+    def thinned(self, count: int) -> MotionSamples:
+        """Return at most `count` samples, evenly spaced."""
+        stride = -(-len(self.values) // count) or 1
+        return MotionSamples(self.values[::stride], self.bent[::stride])
+
+
+def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
+    """Return the concatenation of several sets of samples."""
+    values, bent = (
+        np.concatenate(columns) for columns in zip(*((x.values, x.bent) for x in samples), strict=True)
+    )
+    return MotionSamples(values, bent)
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """Hypothesis about a log: columns, scales, offsets and delays of n joints, and gravity.
+
+    Arrays of shape (2, n) have a row for the motion (position and velocity) and a row for the torque of each joint. The
+    position of joint k is scale[0, k] times the logged position of joint source[0, k], plus offset[k] [rad, m]. The
+    torque of joint k is scale[1, k] times the logged torque of joint source[1, k].
+
+    faults: kinds of the faults that the hypothesis assumes; empty for the unchanged log. source: (2, n) indices of
+    joints. scale: (2, n) factors. offset: (n,) [rad, m]. delay: (2, n) [s] delays of the logged signals. gravity:
+    vector of gravity in the frame of the root link [m/s^2].
+    """
+
+    faults: tuple[Fault, ...]
+    source: np.ndarray
+    scale: np.ndarray
+    offset: np.ndarray
+    delay: np.ndarray
+    gravity: Vector3
+
+    @classmethod
+    def unchanged(cls, arm: Chain) -> Hypothesis:
+        """Return the hypothesis of the unchanged log, in SI units and without offsets."""
+        n = len(arm.coordinates)
+        x, y, z = map(float, arm.gravity)
+        order = np.tile(np.arange(n), (2, 1))
+        return cls((), order, np.ones((2, n)), np.zeros(n), np.zeros((2, n)), (x, y, z))
+
+    @property
+    def motion_key(self) -> tuple[bytes, Vector3]:
+        """Key under which the regressor is cached: it depends only on the motion and on gravity."""
+        arrays = (self.source[0], self.scale[0], self.offset, self.delay[0])
+        return b"".join(x.tobytes() for x in arrays), self.gravity
+
+    def changed(self, fault: Fault, **changes: object) -> Hypothesis:
+        """Return the hypothesis with changed fields, which correct one more fault of the log."""
+        faults = self.faults if fault in self.faults else (*self.faults, fault)
+        return replace(self, faults=faults, **changes)  # type: ignore[arg-type]
+
+    def signals(self, samples: MotionSamples) -> MotionSamples:
+        """Return the samples of the joints, in SI units, for logged samples under this hypothesis."""
+        of_joint = _permuted(samples.values, self.source)
+        signals = MotionSamples(of_joint, samples.bent).at(_per_signal(self.delay)) * _per_signal(self.scale)
+        signals[..., 0] += self.offset
+        return MotionSamples(signals[..., None], samples.bent)
+
+    def logged(self, samples: MotionSamples) -> MotionSamples:
+        """Return the logged samples for `samples` of the joints: the inverse of `signals` without delays."""
+        signals = samples.values.copy()
+        signals[:, :, 0] -= self.offset[:, None]
+        signals /= _per_signal(self.scale)[..., None]
+        return MotionSamples(_permuted(signals, np.argsort(self.source)), samples.bent)
+
+
+def _per_signal(values: np.ndarray) -> np.ndarray:
+    """Return values (2, n) of motion and torque as values (n, 4) of q, qd, qdd and tau."""
+    return values[[0, 0, 0, 1]].T
+
+
+def _permuted(values: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """Return signals (S, n, 4, E) in which joint k has the motion of joint source[0, k], torque of source[1, k]."""
+    return np.concatenate([values[:, source[0], :3], values[:, source[1], 3:]], axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisFit:
+    """MAP estimate of the K parameters of an arm with n joints under a hypothesis about the log.
+
+    Attributes:
+        hypothesis: the hypothesis.
+        cost: negative log posterior up to a constant.
+        misfit: contribution of the torque residual to the cost.
+        parameters: (K,) inertial parameters, then friction and rotor inertias.
+        covariance: (K, K) posterior covariance of the parameters.
+        errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
+    """
+
+    hypothesis: Hypothesis
+    cost: float
+    misfit: float
+    parameters: np.ndarray
+    covariance: np.ndarray
+    errors: np.ndarray
+
+    @property
+    def rank(self) -> float:
+        """Cost plus penalties for rare faults, so that common faults of about the same cost are preferred."""
+        return self.cost + sum(fault.rarity for fault in self.hypothesis.faults)

@@ -1,0 +1,109 @@
+"""Kinds of faults of a log that settings can correct: the base class, and the settings that a hypothesis changes.
+
+A subclass of `Fault` holds all that concerns a kind of fault: the hypotheses to test, the sentence about the fault, and
+the settings that correct it. `kinds_of_faults` in `spelgen.identification.geometry_search` lists all kinds.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from spelgen.arm.arm import Chain
+from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
+from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.tuning import GEOMETRY
+from spelgen.logs.joint_signals import joint_keys, settings_line
+from spelgen.settings.log_mapping import LogMapping
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """Correction of the settings of a log of n joints: the difference between a hypothesis and the unchanged log.
+
+    unchanged: hypothesis of the log with its current mapping. by_name: True if the log consists of messages that
+    contain joint names, as in ROS bags, and not of columns.
+    """
+
+    arm: Chain
+    mapping: LogMapping
+    by_name: bool
+    unchanged: Hypothesis
+    hypothesis: Hypothesis
+
+    @property
+    def factors(self) -> np.ndarray:
+        """Factors (2, n) on the motion and on the torques, with which the present scales are multiplied."""
+        return np.asarray(self.hypothesis.scale / self.unchanged.scale)
+
+    def lines(self) -> str:
+        """Return a text with the settings that implement the hypothesis, and where to write them; "" if none do."""
+        entries: dict[str, dict[str, Any]] = {}
+        of_log: dict[str, object] = {}
+        of_robot: dict[str, object] = {}
+        for k, name in enumerate(self.arm.joint_names):
+            keys: dict[str, Any] = {}
+            for fault in self.hypothesis.faults:
+                for key, value in fault.joint_keys(self, k).items():
+                    keys[key] = {**keys.get(key, {}), **value} if isinstance(value, dict) else value
+            if keys:
+                entries[name] = keys
+        if entries:
+            of_log = joint_keys(entries, self.arm.joint_names)
+        for fault in self.hypothesis.faults:
+            of_log |= fault.log_keys(self)
+            of_robot |= fault.robot_keys(self)
+        texts = []
+        if of_log:
+            texts.append(f"'{settings_line(of_log)}' under 'logs' in the robot's YAML")
+        if of_robot:
+            texts.append(f"'{settings_line(of_robot)}' in the robot's YAML (then build the model again)")
+        return " and ".join(texts)
+
+
+class Fault(ABC):
+    """Kind of fault of a log.
+
+    code: code of the finding. description: description of the fault, if it is constant. rarity: penalty on the cost of
+    a correction, for faults that are rarer than a wrong sense or order; it decides between corrections that explain the
+    torques equally well. needed: smallest cost decrease of an accepted correction. evidence: sentence with the evidence
+    for the fault; "" if the evidence is the torque residual.
+    """
+
+    code: str
+    description = ""
+    rarity = 0
+    needed = GEOMETRY.needed
+    evidence = ""
+
+    @abstractmethod
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterable[HypothesisFit]:
+        """Return the fits of hypotheses that correct one fault of this kind in addition to the faults of `base`."""
+
+    def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterable[HypothesisFit]:
+        """Return the fits of corrections that take seconds; they are tried if no other correction is enough."""
+        return ()
+
+    def text(self, correction: Correction) -> str:
+        """Return a description of the fault of the log."""
+        return self.description
+
+    def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
+        """Return the settings of a joint in the group `logs` that correct the fault; {} if it is right."""
+        return {}
+
+    def log_keys(self, correction: Correction) -> dict[str, object]:
+        """Return the settings in the group `logs` that correct the fault, besides the settings of joints."""
+        return {}
+
+    def robot_keys(self, correction: Correction) -> dict[str, object]:
+        """Return the settings of the robot, outside the group `logs`, that correct the fault."""
+        return {}
+
+    def minor_code(self, correction: Correction) -> str:
+        """Return the code of a warning if an error of the URDF or of the mounting may be the reason; else ""."""
+        return ""

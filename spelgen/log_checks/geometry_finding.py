@@ -1,0 +1,54 @@
+"""Finding about a hypothesis that fits a log better than its mapping, with the settings that implement it."""
+
+from collections.abc import Sequence
+
+from spelgen.errors import Diagnostic, LogError
+from spelgen.identification.continuous_faults import Gravity, ZeroOffset
+from spelgen.identification.hypotheses import HypothesisFit
+from spelgen.identification.log_faults import Correction, Fault
+
+WARNINGS = ("torque-scale", ZeroOffset.code, Gravity.code)
+RIGHT = "joints, zeros, units and gravity as the URDF and the settings state them"
+
+
+def geometry_finding(
+    unchanged: HypothesisFit, best: HypothesisFit, corrections: Sequence[Correction]
+) -> LogError | Diagnostic:
+    """Return the finding about a log for which another hypothesis fits better.
+
+    It is an error, or a warning if an error of the URDF or of the mounting may be the reason: a small zero offset, a
+    small tilt, or a moderate factor on the torques.
+
+    Args:
+        unchanged: fit of the unchanged log.
+        best: fit of the best hypothesis.
+        corrections: corrections of the log by the best hypothesis, and by others that fit about equally well.
+    """
+    faults, correction = best.hypothesis.faults, corrections[0]
+    where = " and ".join(dict.fromkeys(_place(correction, fault) for fault in faults))
+    evidence = faults[0].evidence
+    if len(faults) > 1 or not evidence:
+        evidence = _evidence(unchanged.errors.mean(), best.errors.mean())
+    got = f"{' and '.join(fault.text(correction) for fault in faults)} ({evidence})"
+    do = f"write {'; or '.join(dict.fromkeys(x.lines() for x in corrections))}"
+    code = faults[0].minor_code(correction)
+    if code and len(faults) == 1:
+        return Diagnostic("warning", code, where, None, f"{got}; {do}")
+    do += f"; {' '.join(f'--accept {fault.code}' for fault in faults)} if it is right"
+    return LogError(got, element=where, expected=RIGHT, do=do)
+
+
+def _place(correction: Correction, fault: Fault) -> str:
+    """Return a text that names the joints for which a fault has settings, or all joints."""
+    joints = correction.arm.joint_names
+    faulty = [name for k, name in enumerate(joints) if fault.joint_keys(correction, k)]
+    if len(joints) > 1 and len(faulty) in (0, len(joints)):
+        return "all joints"
+    return f"joint {', '.join(map(repr, faulty or joints))}"
+
+
+def _evidence(before: float, after: float) -> str:
+    """Return a sentence that compares squared torque residuals, relative to the variance of the torques."""
+    if after < 0.9 * before:
+        return f"the squared torque error of least squares falls from {before:.2%} to {after:.2%} of the variance"
+    return "the torque error of least squares remains the same, with plausible masses, rotor inertias and friction"
