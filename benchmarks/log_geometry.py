@@ -93,7 +93,7 @@ def samples_of(arm: Arm, logs: Sequence[Trajectory]) -> MotionSamples:
         collected.add(log)
     samples = collected.samples()
     assert samples is not None
-    return MotionSamples(samples.around, samples.bent)
+    return MotionSamples(samples.around, samples.bent, samples.times)
 
 
 def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -93,14 +95,11 @@ class Delay(Fault):
         their neighbours show no delay.
         """
         reading, longest = base.hypothesis, problem.samples.longest_delay
-        if not longest or self in reading.faults:
+        if not longest or reading.delay.any():
             return
-        n, stateful = len(reading.offset), problem.with_hysteresis()
+        stateful = problem.with_hysteresis()
         stateful_errors = stateful.fit(reading).errors
-        parts = [np.stack([np.zeros(n), np.ones(n)])]
-        for rows in ([1.0, 0.0], [0.0, 1.0], [1.0, 1.0]):
-            parts += [np.outer(rows, unit) for unit in np.eye(n)]
-        for part in parts:
+        for part in _delayed_parts(len(reading.offset)):
 
             def delayed(delay: np.ndarray, part: np.ndarray = part) -> Hypothesis:
                 return reading.changed(self, delay=reading.delay + delay * part)
@@ -125,14 +124,8 @@ class Delay(Fault):
         """Return a description with the longest delay."""
         delay = correction.hypothesis.delay
         longest = 1e3 * float(delay.ravel()[np.abs(delay).argmax()])
-        late = {
-            (0, 1): "torques",
-            (1, 0): "positions and velocities",
-            (1, 1): "positions, velocities and torques",
-        }
-        is_motion, is_torque = bool(delay[0].any()), bool(delay[1].any())
         order = "later" if longest > 0 else "earlier"
-        return f"{late[is_motion, is_torque]} logged {abs(longest):.3g} ms {order}"
+        return f"{_late_signals(delay)} logged {abs(longest):.3g} ms {order}"
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
         """Return the delays of the signals of a joint."""
@@ -153,6 +146,84 @@ class Delay(Fault):
         if not delay.any() or (delay != delay[0]).any():
             return {}
         return {"torque_delay": plain_number(correction.mapping.torque_delay + delay[0])}
+
+
+class Clock(Fault):
+    """Motion, torque or all signals of a joint, or the torques of all joints, whose times are of another clock."""
+
+    code = "joint-clock"
+    rarity = 3
+    advice = "no setting corrects it: log all joints with one clock"
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the fit with a delay that changes, if the base has a constant delay."""
+        delay = base.hypothesis.delay
+        if delay.any() and not base.hypothesis.drift.any():
+            faults = tuple(x for x in base.hypothesis.faults if not isinstance(x, Delay))
+            reading = replace(base.hypothesis, faults=faults, delay=np.zeros_like(delay))
+            yield from self._best(problem, reading, np.full(2, delay[delay != 0][0]), 1.0 * (delay != 0))
+
+    def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the fits with the best delays of signals at the start and the end of the log, if they differ."""
+        reading, starts = unchanged.hypothesis, []
+        for part in _delayed_parts(len(reading.offset)) if problem.samples.longest_delay else ():
+            for last in GEOMETRY.clock_starts:
+                delays = np.array([0.0, last])
+                starts.append(
+                    (problem.fit(self._drifting(problem, reading, delays, part)).cost, delays, part)
+                )
+        # the best starts have the right signals and the right sign
+        for _, start, part in sorted(starts, key=itemgetter(0))[:3]:
+            yield from self._best(problem, reading, start, part)
+
+    def _best(
+        self, problem: GeometryProblem, reading: Hypothesis, start: np.ndarray, part: np.ndarray
+    ) -> Iterator[HypothesisFit]:
+        delays, best = problem.descend(
+            lambda x: self._drifting(problem, reading, x, part), start, largest=0.3, smallest=0.002
+        )
+        if abs(delays[1] - delays[0]) >= 2 * GEOMETRY.min_delay:
+            yield best
+
+    def _drifting(
+        self, problem: GeometryProblem, reading: Hypothesis, delays: np.ndarray, part: np.ndarray
+    ) -> Hypothesis:
+        """Return the hypothesis with delays (2,) [s] of some signals at the start and the end of the log.
+
+        part: mask (2, n) of these signals.
+        """
+        first, last = delays
+        drift = (last - first) / float(problem.samples.times[-1])
+        return reading.changed(self, delay=first * part, drift=drift * part)
+
+    def text(self, correction: Correction) -> str:
+        """Return a description with the relative error of the clock."""
+        drift = correction.hypothesis.drift
+        largest = float(drift.ravel()[np.abs(drift).argmax()])
+        return f"{_late_signals(drift)} of a clock that runs {abs(largest):.2%} {'fast' if largest > 0 else 'slow'}"
+
+    def joints(self, correction: Correction) -> list[str]:
+        """Return the names of the joints with another clock."""
+        names = np.array(correction.arm.joint_names)
+        return list(names[correction.hypothesis.drift.any(axis=0)].tolist())
+
+
+def _delayed_parts(n: int) -> list[np.ndarray]:
+    """Return the masks (2, n) of signals with a common delay: all torques, and signals of each of n joints."""
+    parts = [np.stack([np.zeros(n), np.ones(n)])]
+    for rows in ([1.0, 0.0], [0.0, 1.0], [1.0, 1.0]):
+        parts += [np.outer(rows, unit) for unit in np.eye(n)]
+    return parts
+
+
+def _late_signals(delay: np.ndarray) -> str:
+    """Return the names of the signals whose delay (2, n) is not 0."""
+    names = {
+        (0, 1): "torques",
+        (1, 0): "positions and velocities",
+        (1, 1): "positions, velocities and torques",
+    }
+    return names[bool(delay[0].any()), bool(delay[1].any())]
 
 
 class Compensation(Fault):

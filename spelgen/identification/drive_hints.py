@@ -50,12 +50,14 @@ class DriveSamples(NamedTuple):
     """S samples of a moving arm with n joints, and time-shifted signals.
 
     around: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and joint torques [Nm, N] at each of the E times `OFFSETS` after the
-    sample; beyond the ends of a recording its first or last value. bent: (S, n, K) bristle deflections, divided by the
+    sample; beyond the ends of a recording its first or last value. times: (S,) [s] times of the samples since the start
+    of the first recording, without the pauses between recordings. bent: (S, n, K) bristle deflections, divided by the
     break-away displacements. direction: (S, n) direction of dry friction, see `DynamicsSamples`. torques: (S, n, D)
     [Nm, N] joint torques, shifted in time by each of the D `SHIFTS`.
     """
 
     around: np.ndarray
+    times: np.ndarray
     bent: np.ndarray
     direction: np.ndarray
     torques: np.ndarray
@@ -96,6 +98,7 @@ class DriveLog:
         self._samples: list[DriveSamples] = []
         self._every = self._step = 1
         self._number = 0
+        self._seconds = 0.0
 
     def add(self, trajectory: Trajectory) -> None:
         """Add the samples of a trajectory; nothing is added if it is too short, or its sample rate is too low."""
@@ -139,9 +142,10 @@ class DriveLog:
         signals = np.pad(signals, ((OFFSETS[-1], OFFSETS[-1]), (0, 0), (0, 0)), mode="edge")
         around = sliding_window_view(signals, 2 * OFFSETS[-1] + 1, axis=0)[STEPS:-STEPS, ..., ::2]
         torques = sliding_window_view(tau, len(SHIFTS), axis=0)
-        columns = (around, inner.z, inner.direction, torques)
-        around, z, direction, torques = (column[moving[:: self._every]] for column in columns)
-        return DriveSamples(around, z / self._reach.values, direction, torques)
+        times = self._seconds + np.arange(len(tau)) / FREQUENCY
+        self._seconds = float(times[-1])
+        columns = (around, times[STEPS:-STEPS], inner.z / self._reach.values, inner.direction, torques)
+        return DriveSamples(*(column[moving[:: self._every]] for column in columns))
 
     @property
     def _count(self) -> int:

@@ -25,16 +25,18 @@ class MotionSamples:
 
     values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at E times around each sample, see `DriveSamples`;
     E = 1 for samples without their neighbours. bent: (S, n, K) bristle deflections of the unchanged log; K = 0 for
-    samples without a history of motion.
+    samples without a history of motion. times: (S,) [s] times of the samples, see `DriveSamples`; 0 for samples without
+    their neighbours.
     """
 
     values: np.ndarray
     bent: np.ndarray
+    times: np.ndarray
 
     @classmethod
     def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
         """Return the samples of signals, (S, n) each, without their neighbours."""
-        return cls(np.stack([q, qd, qdd, tau], axis=2)[..., None], np.zeros((*q.shape, 0)))
+        return cls(np.stack([q, qd, qdd, tau], axis=2)[..., None], np.zeros((*q.shape, 0)), np.zeros(len(q)))
 
     @property
     def motion(self) -> np.ndarray:
@@ -51,11 +53,20 @@ class MotionSamples:
         return self.values[..., self.values.shape[3] // 2]
 
     def at(self, delays: np.ndarray) -> np.ndarray:
-        """Return the signals (S, n, 4) at the times `delays` (n, 4) [s] after the samples."""
+        """Return the signals (S, n, 4) at the times `delays`, (n, 4) or (S, n, 4) [s], after the samples.
+
+        Signals at a longer delay than `longest_delay` are those around the sample that is nearest in time.
+        """
         if not delays.any():
             return self._central
-        weights = CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))(delays)
-        return np.asarray(np.einsum("snie,nie->sni", self.values, weights))
+        spline = CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
+        if delays.ndim == 2:
+            return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
+        times = self.times[:, None, None] + delays
+        nearest = np.searchsorted((self.times[1:] + self.times[:-1]) / 2, times)
+        rest = np.clip(times - self.times[nearest], -self.longest_delay, self.longest_delay)
+        joint, signal = np.ogrid[: delays.shape[1], :4]
+        return np.asarray(np.einsum("snie,snie->sni", self.values[nearest, joint, signal], spline(rest)))
 
     @property
     def longest_delay(self) -> float:
@@ -65,15 +76,13 @@ class MotionSamples:
     def thinned(self, count: int) -> MotionSamples:
         """Return at most `count` samples, evenly spaced."""
         stride = -(-len(self.values) // count) or 1
-        return MotionSamples(self.values[::stride], self.bent[::stride])
+        return MotionSamples(self.values[::stride], self.bent[::stride], self.times[::stride])
 
 
 def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
     """Return the concatenation of several sets of samples."""
-    values, bent = (
-        np.concatenate(columns) for columns in zip(*((x.values, x.bent) for x in samples), strict=True)
-    )
-    return MotionSamples(values, bent)
+    columns = zip(*((x.values, x.bent, x.times) for x in samples), strict=True)
+    return MotionSamples(*map(np.concatenate, columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +94,9 @@ class Hypothesis:
     torque of joint k is scale[1, k] times the logged torque of joint source[1, k].
 
     faults: kinds of the faults that the hypothesis assumes; empty for the unchanged log. source: (2, n) indices of
-    joints. scale: (2, n) factors. offset: (n,) [rad, m]. delay: (2, n) [s] delays of the logged signals. gravity:
-    vector of gravity in the frame of the root link [m/s^2].
+    joints. scale: (2, n) factors. offset: (n,) [rad, m]. delay: (2, n) [s] delays of the logged signals at time 0.
+    drift: (2, n) [1] derivative of the delays with respect to time. gravity: vector of gravity in the frame of the root
+    link [m/s^2].
     """
 
     faults: tuple[Fault, ...]
@@ -94,6 +104,7 @@ class Hypothesis:
     scale: np.ndarray
     offset: np.ndarray
     delay: np.ndarray
+    drift: np.ndarray
     gravity: Vector3
 
     @classmethod
@@ -102,12 +113,12 @@ class Hypothesis:
         n = len(arm.coordinates)
         x, y, z = map(float, arm.gravity)
         order = np.tile(np.arange(n), (2, 1))
-        return cls((), order, np.ones((2, n)), np.zeros(n), np.zeros((2, n)), (x, y, z))
+        return cls((), order, np.ones((2, n)), np.zeros(n), *np.zeros((2, 2, n)), (x, y, z))
 
     @property
     def motion_key(self) -> tuple[bytes, Vector3]:
         """Key under which the regressor is cached: it depends only on the motion and on gravity."""
-        arrays = (self.source[0], self.scale[0], self.offset, self.delay[0])
+        arrays = (self.source[0], self.scale[0], self.offset, self.delay[0], self.drift[0])
         return b"".join(x.tobytes() for x in arrays), self.gravity
 
     def changed(self, fault: Fault, **changes: object) -> Hypothesis:
@@ -118,16 +129,19 @@ class Hypothesis:
     def signals(self, samples: MotionSamples) -> MotionSamples:
         """Return the samples of the joints, in SI units, for logged samples under this hypothesis."""
         of_joint = _permuted(samples.values, self.source)
-        signals = MotionSamples(of_joint, samples.bent).at(_per_signal(self.delay)) * _per_signal(self.scale)
+        delays = _per_signal(self.delay)
+        if self.drift.any():
+            delays = delays + samples.times[:, None, None] * _per_signal(self.drift)
+        signals = replace(samples, values=of_joint).at(delays) * _per_signal(self.scale)
         signals[..., 0] += self.offset
-        return MotionSamples(signals[..., None], samples.bent)
+        return replace(samples, values=signals[..., None])
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
         """Return the logged samples for `samples` of the joints: the inverse of `signals` without delays."""
         signals = samples.values.copy()
         signals[:, :, 0] -= self.offset[:, None]
         signals /= _per_signal(self.scale)[..., None]
-        return MotionSamples(_permuted(signals, np.argsort(self.source)), samples.bent)
+        return replace(samples, values=_permuted(signals, np.argsort(self.source)))
 
 
 def _per_signal(values: np.ndarray) -> np.ndarray:

@@ -71,7 +71,7 @@ class Fault(ABC):
     code: code of the finding. description: description of the fault, if it is constant. rarity: penalty on the cost of
     a correction, for faults that are rarer than a wrong sense or order; it decides between corrections that explain the
     torques equally well. needed: smallest cost decrease of an accepted correction. evidence: sentence with the evidence
-    for the fault; "" if the evidence is the torque residual.
+    for the fault; "" if the evidence is the torque residual. advice: what to do about a fault that no setting corrects.
     """
 
     code: str
@@ -79,6 +79,7 @@ class Fault(ABC):
     rarity = 0
     needed = GEOMETRY.needed
     evidence = ""
+    advice = ""
 
     @abstractmethod
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterable[HypothesisFit]:
@@ -91,6 +92,11 @@ class Fault(ABC):
     def text(self, correction: Correction) -> str:
         """Return a description of the fault of the log."""
         return self.description
+
+    def joints(self, correction: Correction) -> list[str]:
+        """Return the names of the joints that have this fault: of those with settings; all joints if there are none."""
+        names = correction.arm.joint_names
+        return [x for k, x in enumerate(names) if self.joint_keys(correction, k)] or list(names)
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
         """Return the settings of a joint in the group `logs` that correct the fault; {} if it is right."""

@@ -75,6 +75,8 @@ class LogGeometryTuning:
     min_delay: float = 0.03
     # [s] Delay, late or early, from which the search for a delay starts if it fits better than no delay.
     delay_start: float = 0.06
+    # [s] Delays at the end of a log from which the search for the rate of a clock starts.
+    clock_starts: tuple[float, ...] = (-0.4, -0.15, 0.15, 0.4)
     # [1] Largest ratio of a joint's squared residuals with and without a delay of its signals; wrong delays have
     # ratios from 0.78 on, on recordings of seven arms.
     delay_gain: float = 0.65

@@ -158,7 +158,7 @@ class TorqueLogs:
         """
         samples = motion
         if moving is not None:
-            samples = MotionSamples(moving.around, moving.bent)
+            samples = MotionSamples(moving.around, moving.bent, moving.times)
         if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
         return GeometryProblem(

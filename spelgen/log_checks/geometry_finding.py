@@ -30,7 +30,8 @@ def geometry_finding(
     if len(faults) > 1 or not evidence:
         evidence = _evidence(unchanged.errors.mean(), best.errors.mean())
     got = f"{' and '.join(fault.text(correction) for fault in faults)} ({evidence})"
-    do = f"write {'; or '.join(dict.fromkeys(x.lines() for x in corrections))}"
+    advice = [fault.advice for fault in faults if fault.advice]
+    do = advice[0] if advice else f"write {'; or '.join(dict.fromkeys(x.lines() for x in corrections))}"
     code = faults[0].minor_code(correction)
     if code and len(faults) == 1:
         return Diagnostic("warning", code, where, None, f"{got}; {do}")
@@ -39,12 +40,10 @@ def geometry_finding(
 
 
 def _place(correction: Correction, fault: Fault) -> str:
-    """Return a text that names the joints for which a fault has settings, or all joints."""
-    joints = correction.arm.joint_names
-    faulty = [name for k, name in enumerate(joints) if fault.joint_keys(correction, k)]
-    if len(joints) > 1 and len(faulty) in (0, len(joints)):
+    joints = fault.joints(correction)
+    if len(joints) == len(correction.arm.joint_names) > 1:
         return "all joints"
-    return f"joint {', '.join(map(repr, faulty or joints))}"
+    return f"joint {', '.join(map(repr, joints))}"
 
 
 def _evidence(before: float, after: float) -> str:

@@ -177,13 +177,14 @@ def torque_factors(
 
 
 def rounded_factor(factor: float) -> float:
-    """Return a rounded factor: 0.001, from mNm to Nm, if it is close; else with one significant digit, or with two.
+    """Return a rounded factor: 0.001 or 1000, between mNm and Nm, if it is close; else with one or two digits.
 
     One digit is enough if it changes the factor by less than 10 %.
     """
-    if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
+    for milli in (1e-3, 1e3):
         # a tolerance of 50 %, since the factor is only as exact as the masses of the URDF
-        return float(np.copysign(1e-3, factor))
+        if 1 / 1.5 < abs(factor) / milli < 1.5:
+            return float(np.copysign(milli, factor))
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
 

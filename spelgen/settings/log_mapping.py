@@ -39,8 +39,8 @@ Delay = Annotated[Number, Field(ge=-LONGEST_DELAY, le=LONGEST_DELAY)]
 Accepted = Literal[
     "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",
     "velocity-is-no-derivative", "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "motion-order",
-    "joint-sense", "joint-order", "joint-unit", "joint-zero", "joint-delay", "gravity", "gravity-compensated",
-    "torque-clipped", "torque-copied", "normalised",
+    "joint-sense", "joint-order", "joint-unit", "joint-zero", "joint-delay", "joint-clock", "gravity",
+    "gravity-compensated", "torque-clipped", "torque-copied", "normalised",
 ]  # fmt: skip
 """Codes of errors of `spelgen logs` that a user can accept."""
 
