@@ -7,7 +7,8 @@ Every draw is an arm with inertials 30 % wrong in the URDF, friction of one of f
 torques, and 20 s of excitation or pick-and-place. The log is compared unchanged, and with single random faults:
 the sense of a joint's position, torque or both, an order of all columns or of the torques, a zero offset (a multiple of
 90 degrees, or any), another gravity than the settings state, angles in revolutions or degrees, and the motion, the
-torque or all signals of a joint logged 40 to 140 ms late or early.
+torque or all signals of a joint logged 40 to 140 ms late or early, and a joint's clock that runs 0.4 to 1.4 % fast or
+slow.
 
 A fault is named if the first reading is the right one, named with others if it is among the readings that the
 message lists, and not found without a finding. It is invisible if the evidence for the right reading is below the
@@ -52,7 +53,7 @@ OTHERS = (
 )  # fmt: skip
 KINDS = (
     "position", "torque", "position and torque", "order", "order of torques", "two torques", "zero, 90 degrees",
-    "zero, any angle", "gravity", "unit of angles", "late motion", "late torque", "late joint",
+    "zero, any angle", "gravity", "unit of angles", "late motion", "late torque", "late joint", "clock",
 )  # fmt: skip
 SECONDS = 20.0
 NEAR = 0.2  # rad, and of the size of gravity: angles that are found within it are right
@@ -129,6 +130,7 @@ def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
         "late motion": replace(right, delay=np.stack([delay, none])),
         "late torque": replace(right, delay=np.stack([none, delay])),
         "late joint": replace(right, delay=np.stack([delay, delay])),
+        "clock": replace(right, drift=2 / SECONDS * np.stack([delay, delay])),
     }[kind]
 
 
@@ -138,8 +140,9 @@ def wrong_log(log: Trajectory, right: Hypothesis) -> Trajectory:
     motion, torque = np.argsort(right.source)
     columns = [(log.q - right.offset) / right.scale[0], log.qd / right.scale[0], log.tau / right.scale[1]]
     late = []
-    for values, delay in zip(columns, right.delay[[0, 0, 1]], strict=True):
-        late.append(np.column_stack([np.interp(log.t - delay[k], log.t, values[:, k]) for k in range(n)]))
+    for values, row in zip(columns, (0, 0, 1), strict=True):
+        delays = right.delay[row] + np.outer(log.t - log.t[0], right.drift[row])
+        late.append(np.column_stack([np.interp(log.t - delays[:, k], log.t, values[:, k]) for k in range(n)]))
     return replace(log, q=late[0][:, motion], qd=late[1][:, motion], tau=late[2][:, torque])
 
 
@@ -158,6 +161,7 @@ def is_same(one: Hypothesis, other: Hypothesis) -> bool:
         and np.allclose(one.scale, other.scale)
         and np.abs(turn).max() < NEAR
         and np.abs(one.delay - other.delay).max() < NEAR_DELAY
+        and SECONDS * np.abs(one.drift - other.drift).max() < NEAR_DELAY
         and np.linalg.norm(gravity) < NEAR * 9.81
     )
 

@@ -51,6 +51,43 @@ def test_torques_of_all_joints_that_are_late_have_one_line(arm):  # noqa: F811
     assert "'torque_delay: 0.0" in error and "all joints" in error and "delay: {" not in error
 
 
+@pytest.mark.parametrize(("rate", "torque"), [(1.015, True), (0.985, True), (1.006, False)])
+def test_the_clock_of_one_joint_that_runs_fast_or_slow_is_named(arm, rate, torque):  # noqa: F811
+    """A constant delay would explain only a part of such a log, and no setting corrects it."""
+    k, log = len(arm.chain.joint_names) // 2 - 1, recorded(arm, 21, excitation, noise=0.01)
+
+    def stamped(values):
+        values = values.copy()
+        values[:, k] = np.interp(log.t / rate, log.t, values[:, k])
+        return values
+
+    tau = stamped(log.tau) if torque else log.tau
+    # the joint with a slow clock has no values at the end
+    wrong = replace(log, q=stamped(log.q), qd=stamped(log.qd), tau=tau)[: int(0.97 * len(log))]
+    error = told(arm, wrong)
+    assert f"joint {arm.chain.joint_names[k]!r}: got" in error and "--accept joint-clock" in error
+    signals = "positions, velocities and torques" if torque else "positions and velocities"
+    percent, order = re.search(rf"{signals} of a clock that runs ([\d.]+)% (fast|slow)", error).groups()
+    assert float(percent) == pytest.approx(100 * abs(rate - 1), abs=0.15)
+    assert order == ("fast" if rate > 1 else "slow") and "write" not in error
+
+
+@pytest.mark.parametrize(
+    ("arm", "sign", "line"),
+    [
+        ("rpr", 1, "'units: {tau: Nm}'"), ("six_dof", 1, "'units: {tau: Nm}'"),
+        ("six_dof", -1, "joint1: {units: {tau: Nm}, gain: -1}"),
+    ],
+    indirect=["arm"],
+)  # fmt: skip
+def test_a_unit_of_torques_that_the_mapping_states_wrongly_is_named(arm, sign, line):  # noqa: F811
+    """The answer is the unit, and not a gain of 1000 on mNm."""
+    mapping = LogMapping.model_validate({"units": {"tau": "mNm"}})
+    log = recorded(arm, 13)
+    error = told(arm, replace(log, tau=sign * 1e-3 * log.tau, mapping=mapping), mapping)
+    assert "--accept torque-unit" in error and line in error and "gain: 1000" not in error
+
+
 def test_a_copied_torque_is_an_error(arm):  # noqa: F811
     rng = np.random.default_rng(len(arm.chain.name))
     k, other = rng.choice(len(arm.chain.joint_names), 2, replace=False)

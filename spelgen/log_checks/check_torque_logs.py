@@ -225,6 +225,11 @@ class TorqueLogs:
         ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
         if all(undeclared) and ratio > 0 and not 1 / 5 < ratio < 5:
             candidates.append(rounded_factor(1 / ratio) * ones)
+        # a thousandth of the torque is explained by a wrong mNm in the mapping, even if the masses of the URDF are wrong
+        is_milli = np.array([self._mapping.unit("tau", name) == "mNm" for name in names])
+        for factor in candidates:
+            is_unit = is_milli & (np.abs(factor) > 1e3 / 5) & (np.abs(factor) < 1e3 * 5)
+            factor[is_unit] = np.copysign(1e3, factor[is_unit])
         # velocities must have the unit of the positions per second, so that both are changed by the same factor
         units = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}

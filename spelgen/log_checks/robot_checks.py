@@ -177,14 +177,13 @@ def torque_factors(
 
 
 def rounded_factor(factor: float) -> float:
-    """Return a rounded factor: 0.001 or 1000, between mNm and Nm, if it is close; else with one or two digits.
+    """Return a rounded factor: 0.001, from mNm to Nm, if it is close; else with one significant digit, or with two.
 
     One digit is enough if it changes the factor by less than 10 %.
     """
-    for milli in (1e-3, 1e3):
+    if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
         # a tolerance of 50 %, since the factor is only as exact as the masses of the URDF
-        if 1 / 1.5 < abs(factor) / milli < 1.5:
-            return float(np.copysign(milli, factor))
+        return float(np.copysign(1e-3, factor))
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
 

@@ -14,7 +14,7 @@ import yaml
 from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.labels import counted
-from spelgen.logs.jumps import is_lost, is_outlier, jumps, read_as_words
+from spelgen.logs.jumps import is_lost, is_outlier, jump_count, jumps, read_as_words, signed, unwrapped
 from spelgen.logs.recording import listed_times, outlier_rows, stale_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SIGNALS, shows_accelerations
@@ -217,7 +217,12 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
         what = (
             "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
         )
-        message = f"{name} that jumps by {word.value:.6g} ({unit}), {counted(word.jumps, 'time')}: {what}"
+        # The first samples of a sign-magnitude word may be 0 like lost ones: jumps are counted between all samples that
+        # are no outliers of the decoded signal.
+        raw = (signals.signal(name) - offset) / scale
+        decoded = signed(raw, word.value) if word.key == "sign_bit" else unwrapped(raw, word.value)
+        count = jump_count(raw[~is_outlier(decoded, smooth=name == "q")], word.value)
+        message = f"{name} that jumps by {word.value:.6g} ({unit}), {counted(count, 'time')}: {what}"
         return Advice(message, keys)
     return None
 
