@@ -133,7 +133,8 @@ def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, t
     file = written(columns | {f"q_{joint}": words.astype(float)}, tmp_path / "log.csv")
     (log,) = read_logs(file, joints, base)
     told = errors([log], arm)
-    assert f"joint {joint!r}: got q that jumps by " in told
+    count = int(np.count_nonzero(np.abs(np.diff(words)) > size / 2))
+    assert f"joint {joint!r}: got q that jumps by " in told and f", {count} time" in told
     line = advised(told).joints[joint].model_dump(exclude_unset=True)
     fixed = base | {"joints": {joint: base["joints"][joint] | line}}
     (decoded,) = read_logs(file, joints, fixed)
@@ -144,6 +145,17 @@ def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, t
     if form != "overflow":  # of which no one knows in which revolution it began
         assert difference[0] == pytest.approx(0, abs=1e-6)
     assert "jumps" not in errors([decoded], arm)
+
+
+def test_the_first_jump_of_a_joint_that_rests_at_zero_is_counted(arm, tmp_path):
+    columns, joints = motion(arm, 0), arm.chain.joint_names
+    counts = np.round(4096 / 6.2832 * 0.8 * np.sin(np.maximum(columns["t"] - 0.05, 0.0)))
+    words = np.where(counts > 0, 32768 + counts, -counts)
+    file = written(columns | {f"q_{joints[0]}": words}, tmp_path / "log.csv")
+    mapping = {"joints": {joints[0]: {"counts_per_turn": 4096, "units": {"q": "counts"}}}}
+    (log,) = read_logs(file, joints, mapping)
+    count = int(np.count_nonzero(np.abs(np.diff(words)) > 16384))
+    assert not words[:5].any() and f"jumps by 32768 (counts), {count} times" in errors([log], arm)
 
 
 @pytest.mark.parametrize("seed", range(3))

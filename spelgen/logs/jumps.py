@@ -175,12 +175,11 @@ class Word(NamedTuple):
     """Decoding of a signal as register words.
 
     key: setting of the mapping that decodes it, "period" or "sign_bit". value: value of this setting in logged units.
-    jumps: number of jumps of the undecoded signal. values: (T,) the decoded signal.
+    values: (T,) the decoded signal.
     """
 
     key: str
     value: float
-    jumps: int
     values: np.ndarray
 
 
@@ -217,9 +216,9 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
         # a sign bit needs values above the sign bit, which represent the negative numbers.
         readings = []
         if np.ptp(values) < 1.01 * size:
-            readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))
+            readings.append(Word("period", size, centred(unwrapped(values, size), size)))
         if not is_signed and values.max() >= size:
-            readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
+            readings.append(Word("sign_bit", size, signed(values, size)))
         for reading in readings:
             jumps = np.abs(np.diff(reading.values))
             # A wrong decoding is rejected: it shortens large steps of the motion by one period, but the steps remain
