@@ -6,6 +6,7 @@ another direction of gravity. Single corrections, orders of all joints, and comb
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from spelgen.identification.hypotheses import HypothesisFit
 from spelgen.identification.log_faults import Fault
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.tuning import GEOMETRY
+
+RANK = attrgetter("rank")
 
 
 def kinds_of_faults(
@@ -82,23 +85,23 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> Hyp
     # At most three corrections are combined, where an order of all joints is one correction: more corrections could
     # explain any log.
     for _ in range(3):
-        base = min(fits, key=_rank)
+        base = min(fits, key=RANK)
         tried = [fit for fault in faults for fit in fault.fits(coarse, base)]
-        better = min(tried, key=_rank)
+        better = min(tried, key=RANK)
         # orders of all joints are searched only if no single correction explains the torques
         is_wrong = (
             better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
         )
         if base is unchanged and is_wrong and better.errors.max() > GEOMETRY.explained:
             tried += [fit for fault in faults for fit in fault.thorough_fits(coarse, base)]
-        if min(tried, key=_rank).cost > base.cost - GEOMETRY.needed:
+        if min(tried, key=RANK).cost > base.cost - GEOMETRY.needed:
             break
         fits = [*tried, unchanged]
     likely = _likely(unchanged, fits)
     if not likely:
         # faults for which there is other evidence than the cost
         known = [fit for fault in faults if not fault.needed for fit in fault.fits(coarse, unchanged)]
-        best = min(known, key=_rank, default=unchanged)
+        best = min(known, key=RANK, default=unchanged)
         return HypothesisComparison(unchanged, (best,) if best.cost < unchanged.cost else ())
     finer = problem.thinned(GEOMETRY.confirming_samples)
     unchanged = finer.fit(problem.unchanged)
@@ -110,13 +113,9 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> Hyp
 def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[HypothesisFit, ...]:
     """Return the best fit and all fits of about the same cost; () if none is significantly better than `unchanged`.
 
-    unchanged: fit of the log as recorded. fits: fits of the log with other signs, orders, offsets or gravity.
+    unchanged: fit of the unchanged log. fits: fits of hypotheses that correct faults of the log.
     """
     best = min(fit.cost for fit in fits)
     if best > unchanged.cost - GEOMETRY.needed:
         return ()
-    return tuple(sorted((fit for fit in fits if fit.cost < best + GEOMETRY.ambiguous), key=_rank))
-
-
-def _rank(fit: HypothesisFit) -> float:
-    return fit.rank
+    return tuple(sorted((fit for fit in fits if fit.cost < best + GEOMETRY.ambiguous), key=RANK))

@@ -137,11 +137,10 @@ class Hypothesis:
         return replace(samples, values=signals[..., None])
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the logged samples for `samples` of the joints: the inverse of `signals` without delays."""
+        """Return the logged samples for `samples` of the joints, for a hypothesis of scales and offsets only."""
         signals = samples.values.copy()
         signals[:, :, 0] -= self.offset[:, None]
-        signals /= _per_signal(self.scale)[..., None]
-        return replace(samples, values=_permuted(signals, np.argsort(self.source)))
+        return replace(samples, values=signals / _per_signal(self.scale)[..., None])
 
 
 def _per_signal(values: np.ndarray) -> np.ndarray:

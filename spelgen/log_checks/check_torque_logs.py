@@ -225,7 +225,7 @@ class TorqueLogs:
         ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
         if all(undeclared) and ratio > 0 and not 1 / 5 < ratio < 5:
             candidates.append(rounded_factor(1 / ratio) * ones)
-        # a thousandth of the torque is explained by a wrong mNm in the mapping, even if the masses of the URDF are wrong
+        # torques a thousandth as large show that mNm in the mapping is wrong, even if the masses of the URDF are wrong
         is_milli = np.array([self._mapping.unit("tau", name) == "mNm" for name in names])
         for factor in candidates:
             is_unit = is_milli & (np.abs(factor) > 1e3 / 5) & (np.abs(factor) < 1e3 * 5)
