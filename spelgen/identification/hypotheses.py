@@ -112,8 +112,8 @@ class Hypothesis:
         """Return the hypothesis of the unchanged log, in SI units and without offsets."""
         n = len(arm.coordinates)
         x, y, z = map(float, arm.gravity)
-        order = np.tile(np.arange(n), (2, 1))
-        return cls((), order, np.ones((2, n)), np.zeros(n), *np.zeros((2, 2, n)), (x, y, z))
+        order, zeros = np.tile(np.arange(n), (2, 1)), np.zeros((2, n))
+        return cls((), order, np.ones((2, n)), np.zeros(n), zeros, zeros, (x, y, z))
 
     @property
     def motion_key(self) -> tuple[bytes, Vector3]:

@@ -31,7 +31,8 @@ def geometry_finding(
         evidence = _evidence(unchanged.errors.mean(), best.errors.mean())
     got = f"{' and '.join(fault.text(correction) for fault in faults)} ({evidence})"
     advice = [fault.advice for fault in faults if fault.advice]
-    do = advice[0] if advice else f"write {'; or '.join(dict.fromkeys(x.lines() for x in corrections))}"
+    lines = dict.fromkeys(x.lines() for x in corrections)
+    do = advice[0] if advice else f"write {'; or '.join(line for line in lines if line)}"
     code = faults[0].minor_code(correction)
     if code and len(faults) == 1:
         return Diagnostic("warning", code, where, None, f"{got}; {do}")
