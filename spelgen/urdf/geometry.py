@@ -46,8 +46,8 @@ class LinkShape:
 class LinkShapes(NamedTuple):
     """The shapes that were read, and the shapes that could not be read.
 
-    unread: by the name of the link, a text for each of its unread shapes: the name of the mesh file, or the reason for
-    which the shape was not read.
+    unread: {name of a link: a text for each of its unread shapes}. The text is the name of the mesh file, or the reason
+    for which the shape could not be read.
     """
 
     shapes: tuple[LinkShape, ...]
@@ -145,7 +145,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
 
 
 def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[str, tuple[float, ...]], Mesh]:
-    """Return the meshes of these shapes by (file, scale); a mesh that cannot be read is omitted.
+    """Return {(file, scale): mesh} of the shapes that are meshes; a mesh that cannot be read is omitted.
 
     faces: largest number of triangles of all meshes together.
     """
