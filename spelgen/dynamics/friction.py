@@ -56,7 +56,7 @@ class DriveFriction:
         of the friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
-        # s (f - b) / 2 + s^2 (f + b) / 2 is f at s = 1, b at s = -1, and has no jump between them.
+        # With the direction s, forward f and backward b: s (f - b)/2 + s^2 (f + b)/2 is f at s = 1 and b at s = -1.
         odd, even = self.forward - self.backward, self.forward + self.backward
         torque: np.ndarray = self.viscous * v + 0.5 * direction * (odd + direction * even)
         return torque if self.speeds is None else torque @ self.speeds
@@ -68,9 +68,10 @@ def joint_friction(
     smoothing_velocity: float,
     speeds: np.ndarray | None,
 ) -> DriveFriction:
-    """Return the friction of joints, from the settings of their drives or else from <dynamics> of the URDF.
+    """Return the friction of joints: from ``drives`` for joints in it, from <dynamics> of the URDF for the others.
 
-    joints: joints of a URDF, or coordinates of an arm. speeds: matrix C, (n, n), see ``DriveFriction``.
+    joints: joints of a URDF, or coordinates of an arm. drives: {name of a joint: settings of its drive}.
+    smoothing_velocity and speeds: see ``DriveFriction``.
     """
     # Settings replace the whole <dynamics> element: both describe the same losses, so adding them would count
     # the losses twice.
@@ -93,12 +94,12 @@ BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolu
 
 @dataclass(frozen=True)
 class FrictionModel:
-    """Columns of the regressor for armature, viscous and Coulomb friction, torque offset, and optional effects.
+    """Friction of drives that is linear in its coefficients: columns of the regressor.
 
-    coulomb_smoothing_velocity: width of the tanh that replaces the sign of the velocity [rad/s, m/s]. stribeck: adds
-    dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991). polynomial: adds qd |qd| and qd^3. memory: dry
-    friction is a function of the deflection of bristles (see ``runtime.friction_laws``), with one column per bristle,
-    instead of the tanh.
+    The effects are armature, viscous and Coulomb friction, and torque offset; the following are optional. stribeck: dry
+    friction at low velocity (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3. memory: if True, Coulomb
+    friction depends on the deflections of bristles (see ``runtime.friction_laws``), with a column per bristle; if
+    False, on a tanh of the velocity, with the width coulomb_smoothing_velocity [rad/s, m/s].
     """
 
     coulomb_smoothing_velocity: float = 0.01

@@ -35,9 +35,10 @@ def tip_frame(loaded: Arm) -> Tip:
 
 
 def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
-    """Return, by the name of each link, the body that carries the link and the pose of the link, (4, 4), in its frame.
+    """Return {name of a link: (body, pose)}: the body that carries the link, and the pose of the link, (4, 4).
 
-    The body is an index in `Chain.bodies`, or -1 for the root link. Angles of the URDF are not rounded.
+    The body is an index in `Chain.bodies`, or -1 for the root link. The pose is in the frame of this body. Angles of
+    the URDF are not rounded.
     """
     chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
     poses: dict[str, tuple[int, np.ndarray]] = {}

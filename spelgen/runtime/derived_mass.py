@@ -143,9 +143,9 @@ class DerivedMass(LinearMass):
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
-        """Return M'(q), (..., n, n), and the intermediate values that the derivatives need.
+        """Return M'(q), (..., n, n), and the values that its derivatives need.
 
-        These are the intermediate values of the network, and the factor t (see the class).
+        The values are the intermediate values of the network, and the factor t (see the class).
         """
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
@@ -223,7 +223,7 @@ class DenseMass(nn.Module):
         self.nominal = nn.Buffer(factor)
         self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])
         row, column = torch.tril_indices(self.size, self.size, -1)
-        # Indices of the entries below the diagonal in the flattened matrix U, row by row.
+        # Indices of the entries below the diagonal in the flattened matrix U, in row-major order.
         self.below = nn.Buffer(row * self.size + column)
         # At zero outputs of the network U is the identity, and e = softplus(log(exp(1) - 1)) = 1.
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
@@ -249,7 +249,7 @@ class DenseMass(nn.Module):
         return self._lower(entries), F.softplus(scale)
 
     def _lower(self, entries: Tensor) -> Tensor:
-        """Return the strictly lower triangular matrix, (..., 3 n, 3 n), with these entries, row by row."""
+        """Return the strictly lower triangular matrix, (..., 3 n, 3 n), with these entries, in row-major order."""
         rows = entries.new_zeros(*entries.shape[:-1], self.size * self.size)
         rows = rows.index_copy(-1, self.below, entries)
         return rows.reshape(*entries.shape[:-1], self.size, self.size)
