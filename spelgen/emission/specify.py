@@ -86,7 +86,9 @@ def find_urdf(module: Path, name: str) -> Path:
 
 
 def _path_of_urdf(module: Path, urdf: Path) -> str:
-    """Return the URDF's file name if ``find_urdf`` finds this file by name, else its path relative to the module."""
+    """Return the name of the URDF, or, if ``find_urdf`` does not find it by this name, its path from the module's
+    folder.
+    """
     try:
         if find_urdf(module, urdf.name).samefile(urdf):
             return urdf.name
