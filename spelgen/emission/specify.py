@@ -86,9 +86,7 @@ def find_urdf(module: Path, name: str) -> Path:
 
 
 def _path_of_urdf(module: Path, urdf: Path) -> str:
-    """Return the name of the URDF, or, if ``find_urdf`` does not find it by this name, its path from the module's
-    folder.
-    """
+    """Return the name of the URDF if it is in a folder that ``find_urdf`` searches, else its relative path."""
     try:
         if find_urdf(module, urdf.name).samefile(urdf):
             return urdf.name

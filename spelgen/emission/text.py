@@ -274,8 +274,7 @@ def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
 
 
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
-    """Return the specification in a module's text. Raises ModuleError unless `spelgen build` wrote exactly this text.
-    """
+    """Return the specification in a module's text. Raises ModuleError if the text was changed since it was built."""
     spec = parse_spec(text, file)
     # The whole text is compared, since a model is assembled from the specification only: any other edit would
     # be ignored.
