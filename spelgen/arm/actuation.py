@@ -90,8 +90,8 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
 
     Returns:
         C (n, n), row i for motor i. The speed of a motor is divided by its gear ratio to the joint on which the motor
-            has the largest torque: C is the identity if each motor moves only its own joint. For a passive joint, which
-            has no motor, the row of C is the row of the identity.
+        has the largest torque: C is the identity if each motor moves only its own joint. For a passive joint, which has
+        no motor, the row of C is the row of the identity.
     """
     # Motors and joints have equal power: tau_m . speed_m = tau . qd, and tau = G tau_m, so that speed_m = G^T qd. C is
     # G^T with each row divided by its element of largest magnitude.
@@ -155,7 +155,7 @@ def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEnt
 
 
 def _reduction(robot: Robot, name: str) -> float | None:
-    """Return the reduction of the simple transmission of a joint; None if it is absent or 0 in the URDF."""
+    """Return the reduction of the transmission of a joint, of type SimpleTransmission; None if it is absent or 0."""
     for transmission in robot.transmissions:
         if _SIMPLE in transmission.type and transmission.joint_names == [name]:
             collect(transmission.errors)

@@ -51,7 +51,7 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
 
 
 def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-    """Return the deflections, (..., n, K), of bristles after a monotonic displacement of the drives (exact).
+    """Return the exact deflections, (..., n, K), of bristles after a monotonic displacement of the drives.
 
     Args:
         z: (..., n, K) deflections of the bristles [rad, m].
@@ -104,8 +104,8 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
 def encoded(q: np.ndarray) -> np.ndarray:
     """Return the path (T, n) [rad, m] without encoder jitter.
 
-    q: measured path, (T, n). The result follows the path only when they differ by more than one encoder step
-    (backlash).
+    q: measured path, (T, n). The result changes only if q would differ from it by more than one encoder step, as behind
+    a gear with backlash.
     """
     step = encoder_step(q)
     if not step.any():

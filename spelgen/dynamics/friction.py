@@ -52,8 +52,8 @@ class DriveFriction:
     def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the joint friction torque (..., n) [Nm, N] at joint velocities qd (..., n).
 
-        direction: direction of dry friction per drive, (..., n) in [-1, 1]: tanh(v / smoothing_velocity), or a function
-        of the friction state.
+        direction: factor of the dry friction of each drive, from -1 to 1, (..., n): tanh(v / smoothing_velocity) with
+        the velocity v of the drive, or a function of the friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
         # With the direction s, forward f and backward b: s (f - b)/2 + s^2 (f + b)/2 is f at s = 1 and b at s = -1.

@@ -23,7 +23,7 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class ServoDrives(NamedTuple):
     """Constants of the servos and of friction, (..., n).
 
-    Constants of the K bristles are (K, ..., n): this layout takes two thirds of the time of (..., n, K).
+    Constants of the K bristles are (K, ..., n): a rollout takes two thirds of the time that it takes with (..., n, K).
     """
 
     servo: ServoConstants

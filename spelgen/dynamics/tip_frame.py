@@ -15,8 +15,8 @@ class Tip:
     """The frame of the tip link.
 
     carrier: index of the body that carries the link; -1: the root link. pose: pose of the link in the frame of this
-    body, (4, 4). bodies: bodies of the arm with the unrounded angles of the URDF, so that poses are equal to the ones
-    of other URDF parsers.
+    body, (4, 4). bodies: bodies of the arm with the unrounded angles of the URDF, so that poses are equal to the
+    results of other URDF parsers.
     """
 
     link: str

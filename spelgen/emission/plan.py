@@ -222,7 +222,7 @@ def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten
-    # All other second moments and the principal directions are unchanged.
+    # Smaller second moments are raised to twice the bound; all others and the principal directions are unchanged.
     raised = np.maximum(values, 2 * TUNING.min_second_moment * values[-1])
     pseudo[:3, :3] += (vectors * (raised - values)) @ vectors.T
     return _significant(parameters_of(pseudo))

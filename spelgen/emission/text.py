@@ -233,7 +233,7 @@ def _sum(sums: Sums, names: list[str]) -> str:
 
 def _number(value: float) -> str:
     """Return the shortest text that gives exactly this number."""
-    # Most numbers of a URDF have at most six digits.
+    # The form with six digits is tried first: most numbers of a URDF have no more digits.
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
 

@@ -174,7 +174,7 @@ def body_factor(parameters: Tensor) -> Tensor:
     """Return the upper triangular matrix T, (..., 4, 4), of log-Cholesky parameters.
 
     The pseudo-inertia of a body is C T T^T C^T, with C C^T its initial value (see ``InertialParameters``).
-    parameters: upper triangular, (..., 4, 4); the diagonal has the logarithms.
+    parameters: upper triangular matrix, (..., 4, 4), with the logarithms of extents and mass on the diagonal.
     """
     logarithms = parameters.diagonal(dim1=-2, dim2=-1)
     sizes, mass = logarithms[..., :3], logarithms[..., 3:] / 2

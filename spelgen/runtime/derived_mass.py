@@ -95,12 +95,14 @@ class DerivedMass(LinearMass):
     """A mass matrix M(q) that is linear in learned functions of q.
 
     M is ``entries(*functions, *constants)`` plus the armature; ``entries`` is a function in the emitted
-    module. The result is positive definite for all q and all parameters: if M - margin C is not positive
-    definite, with C the nominal mean of M, M is replaced by M' = C + t (M - C). The factor t is the largest
-    of 1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin. The norm |X| is an upper bound of the spectral norm of
-    L^-1 X L^-T, with C = L L^T. Since t is piecewise constant, the derivatives of M' are t times the
-    derivatives of M. The zeros of M and the linear relations between entries of M are valid for C, and
-    therefore for M', too.
+    module.
+
+    The result is positive definite for all q and all parameters: if M - margin C is not positive definite,
+    with C the nominal mean of M, M is replaced by M' = C + t (M - C). The factor t is the largest of 1/2,
+    1/4, 1/8, ... with t |M - C| <= 1 - margin. The norm |X| is an upper bound of the spectral norm of L^-1 X
+    L^-T, with C = L L^T. Since t is piecewise constant, the derivatives of M' are t times the derivatives of
+    M. The zeros of M and the linear relations between entries of M are valid for C, and therefore for M',
+    too.
     """
 
     def __init__(
@@ -116,7 +118,8 @@ class DerivedMass(LinearMass):
         super().__init__(joints, entries, constants=constants, functions=functions)
         self.network = network
         center = self._by_outputs()[-1].detach()
-        # `center` is C and `smallest` is margin C: see the docstring of the class.
+        # `center` is C, the nominal mean of M, and `smallest` is margin C. `forward` corrects M if M -
+        # `smallest` is not positive definite.
         self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size

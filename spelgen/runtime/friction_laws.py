@@ -24,7 +24,7 @@ class FrictionConstants(NamedTuple):
     stribeck: Tensor  # additional dry friction at low velocity [Nm, N]
     stribeck_velocity: Tensor  # [rad/s, m/s]
     load_dependence: Tensor  # dry friction per magnitude of the gravity torque [1]
-    stribeck_rounding: Tensor  # speed below which the Stribeck curve is rounded / Stribeck velocity [1]
+    stribeck_rounding: Tensor  # speed of the rounding of the Stribeck curve, in Stribeck velocities [1]
     coulomb_smoothing_velocity: Tensor  # speed at which the smooth sign of velocity is 0.7 [rad/s, m/s]
     min_load: Tensor  # torque below which |gravity torque| is smoothed [Nm, N]
     bristle_fractions: Tensor  # fraction of dry friction per bristle, (n, K); sum 1, or 0 without bristles
@@ -56,9 +56,9 @@ class FrictionConstants(NamedTuple):
             qd: velocities, (..., n) [rad/s, m/s].
             gravity: gravity torques, (..., n) [Nm, N].
             z: bristle displacements, (..., n, K) [rad, m]; None if unknown: the dry friction of all joints
-        then depends on velocity.
+                then depends on velocity.
             direction: factor of dry friction, from -1 to 1, at joints without bristles, (..., n); None:
-        smooth sign of qd.
+                smooth sign of qd.
         """
         if direction is None:
             direction = qd * turning(qd, self.coulomb_smoothing_velocity)
@@ -78,11 +78,15 @@ class FrictionConstants(NamedTuple):
 
 
 class FrictionLaws(nn.Module):
-    """Friction with trained constants, which dissipates energy for any parameters. The friction torque is
+    """Friction with trained constants, which dissipates energy for any parameters.
 
-    viscous qd + saturation s(qd, saturation_velocity) + (coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) /
-    8)^8 + load_dependence load) direction, with v = |qd| / stribeck_velocity, r = stribeck_rounding, load =
-    sqrt(gravity torque^2 + min_load^2) and s(x, width) = x / sqrt(x^2 + width^2).
+    The friction torque is
+
+        viscous qd + saturation s(qd, saturation_velocity) + dry direction,
+        dry = coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + load_dependence load,
+
+    with v = |qd| / stribeck_velocity, r = stribeck_rounding, load = sqrt(gravity torque^2 + min_load^2) and
+    s(x, width) = x / sqrt(x^2 + width^2).
 
     The parameters are logarithms of the constants, and logits of the bristle fractions. The direction is from
     -1 to 1: sum_k fraction_k z_k / breakaway_k over the bristles of a joint, which may return elastic energy;

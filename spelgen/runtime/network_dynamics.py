@@ -16,7 +16,7 @@ from spelgen.runtime.rows import Joint, vector
 
 
 class NetworkConfiguration(NamedTuple):
-    """Configuration cache: all quantities that depend on q, but not on qd or the input."""
+    """Configuration cache of ``NetworkDynamics``: the quantities that depend on q and not on qd."""
 
     encoded: Tensor  # encoding of q, (..., 2 n), input of the networks
     mass: Tensor  # M(q), (..., n, n)

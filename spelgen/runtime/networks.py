@@ -39,9 +39,9 @@ class JointEncoding(nn.Module):
         return torch.cat([(self.slope - second) * qd, self.revolute * first * qd], dim=-1)
 
     def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
-        """Return the gradient with respect to q, (..., n).
+        """Return the gradient of a scalar with respect to q, (..., n).
 
-        cotangent: gradient of the same quantity with respect to the encoding, (..., 2 n).
+        cotangent: gradient of this scalar with respect to the encoding of q, (..., 2 n).
         """
         first, second = encoded.chunk(2, dim=-1)
         by_first, by_second = cotangent.chunk(2, dim=-1)
@@ -51,9 +51,9 @@ class JointEncoding(nn.Module):
 def hidden_units(outputs: Sequence[tuple[int, ...]], width: int, min_units: int) -> list[tuple[int, ...]]:
     """Return a tuple of joints for each unit of a hidden layer: the joints that the unit may depend on.
 
-    ``outputs`` has the same for each output of the network. Outputs that depend on the same joints form a
-    group. The ``width`` units are divided among the groups in proportion to their numbers of outputs, but
-    each group has at least ``min_units``.
+    outputs: the joints that each output of the network depends on. Outputs that depend on the same joints
+    form a group. The ``width`` units are divided among the groups in proportion to their numbers of outputs,
+    but each group has at least ``min_units``.
     """
     counts = Counter(outputs)
     groups = sorted(counts, key=lambda joints: (len(joints), joints))
@@ -134,8 +134,9 @@ class MaskedNetwork(nn.Module):
         min_units: int = 1,
     ) -> None:
         super().__init__()
-        # The initial weight of an edge is a random number. The Gaussians of an edge have random numbers times
-        # `slopes` as weights, linear over the grid, so that the edge's function is nearly linear.
+        # The initial weights of an edge are one random number times `slopes`: 1 for a single weight, or
+        # numbers that increase linearly over the grid of Gaussians, so that the edge's function is nearly
+        # linear.
         slopes = torch.ones((), dtype=torch.float64)
         if self.points:
             slopes = torch.linspace(-1, 1, self.points, dtype=torch.float64)
@@ -175,7 +176,7 @@ class MaskedMLP(MaskedNetwork):
         return F.linear(layer, *layers[-1]), (hidden, layers)
 
     def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
-        """Return cotangent^T J, (..., inputs), with the Jacobian J; cotangent: (..., rows)."""
+        """Return cotangent^T J, (..., inputs), with the network's Jacobian J; cotangent: (..., rows)."""
         hidden, layers = intermediates
         layer: Tensor = cotangent @ layers[-1][0]
         for (weight, _), value in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
@@ -184,7 +185,7 @@ class MaskedMLP(MaskedNetwork):
         return layer
 
     def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
-        """Return J tangent, (..., rows), with the Jacobian J; tangent: (..., inputs)."""
+        """Return J tangent, (..., rows), with the network's Jacobian J; tangent: (..., inputs)."""
         hidden, layers = intermediates
         for (weight, _), value in zip(layers[:-1], hidden, strict=True):
             tangent = torch.ops.aten.tanh_backward(F.linear(tangent, weight), value)
@@ -192,7 +193,7 @@ class MaskedMLP(MaskedNetwork):
 
 
 class Bumps(NamedTuple):
-    """The values of the Gaussians at the inputs of a layer of ``MaskedKAN``; both are (..., inputs, GRID)."""
+    """Arguments and values of the Gaussians of a layer of ``MaskedKAN``, (..., inputs, GRID) each."""
 
     distance: Tensor  # distance of the input from each grid point, in grid spacings
     height: Tensor
@@ -222,7 +223,7 @@ class MaskedKAN(MaskedNetwork):
         return F.linear(bumps[-1].height.flatten(-2), *layers[-1]), (bumps, hidden, layers)
 
     def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
-        """Return cotangent^T J, (..., inputs), with the Jacobian J; cotangent: (..., rows)."""
+        """Return cotangent^T J, (..., inputs), with the network's Jacobian J; cotangent: (..., rows)."""
         bumps, hidden, layers = intermediates
         layer = self._bumps_vjp(bumps[-1], cotangent @ layers[-1][0])
         for index in reversed(range(len(hidden))):
@@ -235,7 +236,7 @@ class MaskedKAN(MaskedNetwork):
         return (-2 / SPACING) * (bumps.distance * bumps.height * cotangent).sum(dim=-1)
 
     def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
-        """Return J tangent, (..., rows), with the Jacobian J; tangent: (..., inputs)."""
+        """Return J tangent, (..., rows), with the network's Jacobian J; tangent: (..., inputs)."""
         bumps, hidden, layers = intermediates
         for index, (weight, _) in enumerate(layers):
             slopes = bumps[index].distance * bumps[index].height

@@ -8,7 +8,7 @@ from torch import Tensor
 
 Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
-Entries = Callable[..., Tensor]  # function of the learned functions and constants, (...): M, (..., n, n)
+Entries = Callable[..., Tensor]  # returns M, (..., n, n), from functions and constants, (...) each
 Layers = tuple[tuple[Tensor, Tensor], ...]  # masked weights, and biases, of each layer of a network
 # The following types are Any, because each class of models defines its own named tuples for them.
 Intermediates = Any  # values of a forward pass that its derivatives need

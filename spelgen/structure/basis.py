@@ -89,8 +89,8 @@ def _constants(
     constant: S samples of this difference, (S, entries), in the prime field and in double precision. basis: the m
     matrices B_j, (m, entries), in the prime field and in double precision. entries: n(n+1)/2, of the lower triangle.
     """
-    # Each constant is defined by one entry of M, at a pivot of the row reduction, which are in the first possible
-    # columns. The entries that depend on the fewest joints are therefore the first columns.
+    # The entry of M at each pivot of the row reduction defines a constant. Row reduction places pivots in the first
+    # possible columns: the entries that depend on the fewest joints come first.
     order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(constant[0][:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
@@ -113,7 +113,7 @@ def _constants(
 
 
 def _functionals(spans: Spans) -> Iterator[_Functional]:
-    """Yield linearly independent functionals that together determine every change of M."""
+    """Yield linear functionals of M that are linearly independent and together determine every change of M."""
     chosen = np.zeros((0, len(spans.varying)), dtype=np.uint64)
     tried: set[int] = set()
     for joints in _joint_sets(spans):
@@ -226,8 +226,8 @@ def _fraction(element: int, value: float) -> Fraction:
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         candidate = Fraction(numerator, denominator)
-        # For any element there is a fraction with a numerator up to 2^30 that is equal modulo PRIME. If it differs from
-        # `value`, it is not the number, which then has no such fraction.
+        # A fraction with this numerator is equal to any element modulo PRIME. It is the number only if it is also close
+        # to `value`; otherwise the number has no short fraction.
         if abs(candidate - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
             return candidate
     return Fraction(value)

@@ -85,7 +85,7 @@ def energies(
         arm: the arm.
         positions: position of each coordinate.
         inertias: ten inertial parameters of each body.
-        number: conversion of the exact constants of the arm to elements of the ring.
+        number: conversion of the exact constants of the arm to the number type of `positions` and `inertias`.
 
     V is zero for a mass at the origin of the root link and increases against ``arm.gravity``.
     """
@@ -266,14 +266,14 @@ def _turned(pose: _Pose, vector: Vector) -> Vector:
 
 
 def _translated(offset: Vector, inertia: _Inertia) -> _Inertia:
-    """Return the inertia about an origin displaced by -p, p = ``offset``, by the parallel-axis theorem.
+    """Return the inertia about an origin that is displaced by -``offset``, by the parallel-axis theorem.
 
-    The first moment h changes to h + m p, with the mass m.
+    With the mass m and p = ``offset``, the first moment h changes to h + m p.
     """
     (x, y, z), mass, (hx, hy, hz) = offset, inertia.mass, inertia.moment
     xx, xy, xz, yy, yz, zz = inertia.tensor
     moment = (hx + x * mass, hy + y * mass, hz + z * mass)
-    # I becomes I + (p.k) 1 - (p k^T + k p^T) / 2, with k = 2 h + m p.
+    # The inertia tensor I becomes I + (p.k) 1 - (p k^T + k p^T) / 2, with k = 2 h + m p (see the docstring).
     dx, dy, dz = (p * (old + new) for p, old, new in zip(offset, inertia.moment, moment, strict=True))
     xy = xy - x * hy - y * hx - x * y * mass
     xz = xz - x * hz - z * hx - x * z * mass

@@ -70,8 +70,8 @@ def read_urdf(path: Path) -> Robot:
 def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
     """Return the diagnostics of reading and of ``lint`` in the order of lines.
 
-    If <inertia> is absent, the tensor is zero: reading has added a diagnostic for this, so that the one of ``lint`` is
-    omitted.
+    If <inertia> is absent, the tensor is zero: reading has added a diagnostic for this, so that the diagnostic of
+    ``lint`` is omitted.
     """
     absent = {remark.line for remark in notes.diagnostics if remark.code == "inertial-without-inertia"}
     warnings = [x for x in lint(robot) if x.code != "zero-inertia" or x.line not in absent]

@@ -116,7 +116,10 @@ class Element:
         return (values[0], values[1], values[2]) if values else default
 
     def number(self, key: str) -> float | None:
-        """Return the number in an attribute; None if it is absent, or unusable, which is added to the errors."""
+        """Return the number in an attribute; None if it is absent.
+
+        For an unusable text, add an error and return None.
+        """
         values = self._numbers(self.text(key), key)
         return values[0] if values else None
 
