@@ -211,7 +211,8 @@ class InertialParameters(nn.Module):
 
     def __init__(self, links: Sequence[Link]) -> None:
         super().__init__()
-        # Linear map, (10, 16), from the entries of an upper triangle, in row-major order, to the flattened matrix.
+        # Linear map, (10, 16), from the entries of an upper triangle, in row-major order, to the flattened
+        # matrix.
         row, column = torch.triu_indices(4, 4)
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
         pseudo = torch.stack([pseudo_inertia(link) for link in links])

@@ -252,7 +252,10 @@ class DenseMass(nn.Module):
         return self._lower(entries), F.softplus(scale)
 
     def _lower(self, entries: Tensor) -> Tensor:
-        """Return the strictly lower triangular matrix, (..., 3 n, 3 n), with these entries, in row-major order."""
+        """Return the strictly lower triangular matrix, (..., 3 n, 3 n), with these entries.
+
+        entries: in row-major order, (..., 3 n (3 n - 1) / 2).
+        """
         rows = entries.new_zeros(*entries.shape[:-1], self.size * self.size)
         rows = rows.index_copy(-1, self.below, entries)
         return rows.reshape(*entries.shape[:-1], self.size, self.size)

@@ -205,7 +205,8 @@ class DenseFriction(NetworkFriction):
         super().__init__(joints, network)
         rows = axes * len(joints)
         row, column = torch.tril_indices(rows, rows)
-        # Linear map, (rows, rows, entries), from the entries of a lower triangle, in row-major order, to the matrix.
+        # Linear map, (rows, rows, entries), from the entries of a lower triangle, in row-major order, to the
+        # matrix.
         spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
         # The initial L is diagonal, in units of the square root of typical friction / typical speed.
