@@ -53,7 +53,7 @@ def read_bytes(
             return path.read_bytes()
     except FileNotFoundError:
         raise error("no such file", file=path) from None
-    except (OSError, ValueError) as problem:  # ValueError: a null character in the name
+    except (OSError, ValueError) as problem:  # `stat` raises ValueError for a null character
         reason = problem.strerror if isinstance(problem, OSError) else None
         raise error(f"cannot be read ({reason or problem})", file=path) from None
     raise error(f"a file of {size} bytes", file=path, expected=f"at most {largest}", do=do)
@@ -160,7 +160,7 @@ def write_json(path: Path | str, content: Mapping[str, object]) -> Path:
 # is a drive of Windows.
 ADDRESS = re.compile(r"^([a-z][a-z0-9+.-]+):/+(?=[^/])")
 
-_copies: dict[str, Path] = {}  # address -> local copy
+_copies: dict[str, Path] = {}  # {address: path of its local copy}
 
 
 def local(path: Path | str) -> Path:

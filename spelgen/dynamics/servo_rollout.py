@@ -56,7 +56,7 @@ class Load(NamedTuple):
 
 
 def servo_drives(model: PortHamiltonian) -> ServoDrives:
-    """Return the constants of a model with servos."""
+    """Return the constants of servos and friction of a model with servos."""
     assert isinstance(model, RigidBodyDynamics) and model.servo is not None
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()

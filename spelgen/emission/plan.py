@@ -246,7 +246,7 @@ def _about_center(
 
 def _significant(values: Iterable[Fraction | float]) -> list[float]:
     """Return values rounded to the significant digits of inertial parameters."""
-    # The sum with 0.0 is 0.0 for -0.0.
+    # Adding 0.0 changes -0.0 to 0.0.
     return [rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values]
 
 

@@ -87,7 +87,7 @@ class BodyChain(nn.Module):
         self.base = nn.Buffer(-vector(gravity)[:, None, None])
 
     def forward(self, q: Tensor, points: Tensor) -> ChainConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m].
+        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m].
 
         points: point masses of the bodies in body frames, four columns (position, 1) * sqrt(mass) per
         body, as a block diagonal matrix, (4 bodies, 4 bodies).

@@ -187,9 +187,9 @@ class DenseIntermediates(NamedTuple):
     """
 
     network: Intermediates
-    factor: Tensor  # U without its diagonal of ones, (..., 3 n, 3 n)
-    moved: Tensor  # U^-1 A, (..., 3 n, n)
-    scale: Tensor  # e, (..., 3 n)
+    factor: Tensor  # U of this formula without its diagonal of ones, (..., 3 n, 3 n)
+    moved: Tensor  # U^-1 A of this formula, (..., 3 n, n)
+    scale: Tensor  # e of this formula, (..., 3 n)
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:

@@ -17,12 +17,12 @@ SMOOTHING_VELOCITY = 0.006
 class FrictionConstants(NamedTuple):
     """The friction constants of all joints, (n,). All are >= 0; torques are 0 at joints without friction."""
 
-    viscous: Tensor  # [Nm s/rad, N s/m]
+    viscous: Tensor  # viscous friction coefficient [Nm s/rad, N s/m]
     saturation: Tensor  # limit of the saturating viscous friction [Nm, N]
-    saturation_velocity: Tensor  # [rad/s, m/s]
-    coulomb: Tensor  # [Nm, N]
+    saturation_velocity: Tensor  # velocity scale of the saturating viscous friction [rad/s, m/s]
+    coulomb: Tensor  # Coulomb friction [Nm, N]
     stribeck: Tensor  # additional dry friction at low velocity [Nm, N]
-    stribeck_velocity: Tensor  # [rad/s, m/s]
+    stribeck_velocity: Tensor  # velocity scale of the Stribeck curve [rad/s, m/s]
     load_dependence: Tensor  # dry friction per magnitude of the gravity torque [1]
     stribeck_rounding: Tensor  # speed of the rounding of the Stribeck curve, in Stribeck velocities [1]
     coulomb_smoothing_velocity: Tensor  # speed at which the smooth sign of velocity is 0.7 [rad/s, m/s]

@@ -66,9 +66,9 @@ class MotorInputs(nn.Module):
 class ServoConstants(NamedTuple):
     """The constants of all servos, (n,); all are positive, and the dead zone may be zero."""
 
-    kp: Tensor  # [Nm/rad, N/m]
-    kd: Tensor  # [Nm s/rad, N s/m]
-    limit: Tensor  # [Nm, N]
+    kp: Tensor  # torque per position error [Nm/rad, N/m]
+    kd: Tensor  # torque per velocity [Nm s/rad, N s/m]
+    limit: Tensor  # largest torque [Nm, N]
     dead_zone: Tensor  # half the width of the dead zone [rad, m]
 
 
@@ -101,7 +101,7 @@ class PositionServo(nn.Module):
         self.nominal_kd = nn.Buffer(vector(kd))
         self.trained = nn.Buffer(vector(float(not x) for x in known))
         self.limit = nn.Buffer(vector(math.inf if x is None else x for x in limit))
-        self.delay = nn.Buffer(torch.zeros((), dtype=torch.float64))  # [s]
+        self.delay = nn.Buffer(torch.zeros((), dtype=torch.float64))  # delay of commands [s]
         # The dead zone is a buffer, not a parameter: training must not change it; a fit to commands sets it.
         self.dead_zone = nn.Buffer(torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kp = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))

@@ -50,7 +50,7 @@ class NetworkDynamics(PortHamiltonian):
         return {"mass": self.mass.prepare(), "potential": potential, "friction": self.friction.prepare()}
 
     def configuration(self, q: Tensor, parameters: dict[str, Parameters]) -> NetworkConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m]."""
+        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m]."""
         encoded = self.encoding.forward(q)
         mass, intermediates = self.mass.forward(encoded, parameters["mass"])
         return NetworkConfiguration(encoded, mass, intermediates, parameters)
@@ -135,7 +135,7 @@ class NetworkFriction(nn.Module):
     The network's outputs are in units of the joint's typical friction and typical speed.
     """
 
-    prepare: Callable[[], Parameters]  # returns the parameter cache
+    prepare: Callable[[], Parameters]  # returns the quantities that depend on parameters only
     # Returns the product of D(q, qd) and a matrix, (..., n, k). The arguments are the encoded positions,
     # qd, the parameter cache, and the matrix, (..., n, k).
     forward: Callable[[Tensor, Tensor, Parameters, Tensor], Tensor]
@@ -173,7 +173,7 @@ class JointFriction(NetworkFriction):
         return self.nominal * F.softplus(self.raw_viscous) / self.speed
 
     def prepare(self) -> JointFrictionParameters:
-        """Return the parameter cache."""
+        """Return the quantities that depend on trained parameters only (parameter cache)."""
         # Dry friction is multiplied by qd / sqrt(qd^2 + smoothing). The root of `smoothing` is initially 3 %
         # of the typical speed and at least 0.1 %, so that the quotient is always smooth.
         smoothing = self.speed**2 * (0.001**2 + (0.03 * self.raw_smoothing.exp()) ** 2)

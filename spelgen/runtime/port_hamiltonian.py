@@ -121,7 +121,7 @@ class PortHamiltonian(nn.Module):
         cache = self.at(q, qd, tau)
         force = self.input_force(cache, qd, tau) - self.nonlinear_effects(cache, qd)
         force = force - self.friction_torque(cache, qd, *state)
-        return self.velocity(cache, force)  # M^-1 force
+        return self.velocity(cache, force)  # `velocity` multiplies by M^-1
 
     def inverse_dynamics(self, q: Position, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the input tau, (..., n), that gives qdd; state: friction state, if the model has one."""

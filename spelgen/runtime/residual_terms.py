@@ -143,7 +143,7 @@ class ResidualTerms(nn.Module):
         return LARGEST * (self.raw_friction_splines / LARGEST).tanh()
 
     def prepare(self, armature: Tensor) -> ResidualParameters:
-        """Return the parameter cache; armature: armature matrix, (n, n)."""
+        """Return the parameter cache: quantities that depend on parameters only; armature: matrix, (n, n)."""
         splines = [self.unit * self.raw_torque_splines, self.friction_logarithms()]
         rows = self._by_entry(self.bounds(armature)).flatten(1)
         functions, constants = rows.tensor_split((self.functions,))
@@ -163,7 +163,7 @@ class ResidualTerms(nn.Module):
         )
 
     def at(self, q: Tensor, parameters: ResidualParameters) -> ResidualConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m]."""
+        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m]."""
         encoded = self.encoding.forward(q)
         splines = torch.einsum("...ik,ikm->...im", self.splines(q), parameters.splines)
         # Torque and friction factor have the same splines: both sums are one product.
@@ -246,7 +246,7 @@ class ResidualDynamics(RigidBodyDynamics):
         self.residuals = residuals
 
     def prepare(self) -> RigidParameters:
-        """Return the parameter cache; valid until a parameter changes."""
+        """Return the parameter cache, which is valid until a parameter changes."""
         prepared = super().prepare()
         if self.residuals is None:
             return prepared

@@ -122,7 +122,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self) -> RigidParameters:
-        """Return the parameter cache; valid until a parameter changes."""
+        """Return the parameter cache, which is valid until a parameter changes."""
         points = torch.ops.aten.block_diag([*self.bodies.forward()])
         armature = torch.diag_embed(self.armature)
         if self.motors is not None:
@@ -130,7 +130,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return RigidParameters(points, armature, self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m]."""
+        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m]."""
         chain, ratios = self.chain.forward(q, prepared.points), self.chain.ratios
         mass = ratios.mT @ (chain.jacobian @ chain.jacobian.mT) @ ratios + prepared.armature
         return RigidConfiguration(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)

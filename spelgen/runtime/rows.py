@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 Triple = tuple[float, float, float]
-Tensor6 = tuple[float, float, float, float, float, float]  # (xx, xy, xz, yy, yz, zz)
+Tensor6 = tuple[float, float, float, float, float, float]  # inertia tensor (xx, xy, xz, yy, yz, zz)
 
 
 def _rounded(value: float) -> float:

@@ -120,12 +120,12 @@ class Robot:
 
     @cached_property
     def link(self) -> dict[str, UrdfLink]:
-        """The links by name."""
+        """{name: link} of all links."""
         return {link.name: link for link in self.links}
 
     @cached_property
     def joint(self) -> dict[str, UrdfJoint]:
-        """The joints by name."""
+        """{name: joint} of all joints."""
         return {joint.name: joint for joint in self.joints}
 
     @cached_property
