@@ -35,9 +35,10 @@ class InputEntry:
 class Drives(NamedTuple):
     """Matrices (n, n) of the motors of n joints.
 
-    inputs: the matrix G; the joint torques are G times the logged torques. speeds: the matrix C; the motor speeds,
-    measured on the output side of the gears, are C qd (see `motor_speeds`). Friction and rotor inertia act at the motor
-    speeds.
+    Attributes:
+        inputs: the matrix G; the joint torques are G times the logged torques.
+        speeds: the matrix C; the motor speeds, measured on the output side of the gears, are C qd (see `motor_speeds`).
+            Friction and rotor inertia act at the motor speeds.
     """
 
     inputs: np.ndarray

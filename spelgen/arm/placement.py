@@ -131,9 +131,11 @@ def _text(values: Sequence[float] | np.ndarray) -> str:
 class Frame(NamedTuple):
     """The pose of the frame of a link at zero position.
 
-    body: index of the body of the link, -1 for the root link. rotation, position: exact rotation (3, 3) and position
-    (3,) [m] of the link in the frame of this body. composed: float64 rotation (3, 3) of the link relative to the start
-    of the segment, which is the last body with a revolute joint on the path from the root to the link.
+    Attributes:
+        body: index of the body of the link, -1 for the root link.
+        rotation, position: exact rotation (3, 3) and position (3,) [m] of the link in the frame of this body.
+        composed: float64 rotation (3, 3) of the link relative to the start of the segment, which is the last body with
+            a revolute joint on the path from the root to the link.
     """
 
     body: int

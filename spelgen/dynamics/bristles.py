@@ -16,9 +16,12 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class BristleReach:
     """Break-away displacements of the K bristles of each of n drives.
 
-    values: (n, K) [rad, m]; K is 0 without bristles. motors: matrix C, (n, n): the velocities of the drives are C qd
-    (see ``Actuation.motor_speeds``); None: each drive moves its own joint. smoothing_velocity: width of the smooth sign
-    of velocity for dry friction without bristles, (n,) [rad/s, m/s]; None: unknown.
+    Attributes:
+        values: (n, K) [rad, m]; K is 0 without bristles.
+        motors: matrix C, (n, n): the velocities of the drives are C qd (see ``Actuation.motor_speeds``); None: each
+            drive moves its own joint.
+        smoothing_velocity: width of the smooth sign of velocity for dry friction without bristles, (n,) [rad/s, m/s];
+            None: unknown.
     """
 
     values: np.ndarray

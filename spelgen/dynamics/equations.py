@@ -19,8 +19,10 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 class MotionEquations:
     """Equations of motion of W rollouts at fixed positions (W, n).
 
-    mass: mass matrix M, (W, n, n). force: function of (qd, tau, z) that returns M qdd, (W, n) [Nm, N]. friction:
-    function of (qd, z) that returns the friction torque, (W, n) [Nm, N].
+    Attributes:
+        mass: mass matrix M, (W, n, n).
+        force: function of (qd, tau, z) that returns M qdd, (W, n) [Nm, N].
+        friction: function of (qd, z) that returns the friction torque, (W, n) [Nm, N].
     """
 
     mass: Tensor
@@ -91,9 +93,13 @@ def runge_kutta(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return q, p and z after one step of the classical Runge-Kutta method, and q' at the start of the step.
 
-    Hairer et al., Solving ODEs I, II.1. rhs: function of (q, p, z) that returns q' and p'. p: momenta or velocities,
-    (..., n). z: friction state, (..., n, K); it is not integrated, but computed from the displacement of the joints.
-    step: duration [s].
+    Hairer et al., Solving ODEs I, II.1.
+
+    Args:
+        rhs: function of (q, p, z) that returns q' and p'.
+        p: momenta or velocities, (..., n).
+        z: friction state, (..., n, K); it is not integrated, but computed from the displacement of the joints.
+        step: duration [s].
     """
 
     qd1 = qd = pd = torch.zeros_like(p)

@@ -25,9 +25,12 @@ class DampedJoint(Protocol):
 class DriveFriction:
     """Friction of n drives; arrays are (n,), in Nm and rad/s, or N and m/s for prismatic joints.
 
-    forward: Coulomb torque for velocities > 0, not negative. backward: Coulomb torque for velocities < 0, not positive.
-    smoothing_velocity: width of the tanh that replaces the sign of the velocity. speeds: matrix C, (n, n): the
-    velocities of the drives are C qd (see `motor_speeds`); None: each drive moves its own joint.
+    Attributes:
+        forward: Coulomb torque for velocities > 0, not negative.
+        backward: Coulomb torque for velocities < 0, not positive.
+        smoothing_velocity: width of the tanh that replaces the sign of the velocity.
+        speeds: matrix C, (n, n): the velocities of the drives are C qd (see `motor_speeds`); None: each drive moves its
+            own joint.
     """
 
     viscous: np.ndarray
@@ -70,8 +73,10 @@ def joint_friction(
 ) -> DriveFriction:
     """Return the friction of joints: from ``drives`` for joints in it, from <dynamics> of the URDF for the others.
 
-    joints: joints of a URDF, or coordinates of an arm. drives: {name of a joint: settings of its drive}.
-    smoothing_velocity and speeds: see ``DriveFriction``.
+    Args:
+        joints: joints of a URDF, or coordinates of an arm.
+        drives: {name of a joint: settings of its drive}.
+        smoothing_velocity, speeds: see ``DriveFriction``.
     """
     # Settings replace the whole <dynamics> element: both describe the same losses, so adding them would count
     # the losses twice.
@@ -96,10 +101,14 @@ BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolu
 class FrictionModel:
     """Friction of drives that is linear in its coefficients: columns of the regressor.
 
-    The effects are armature, viscous and Coulomb friction, and torque offset; the following are optional. stribeck: dry
-    friction at low velocity (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3. memory: if True, Coulomb
-    friction depends on the deflections of bristles (see ``runtime.friction_laws``), with a column per bristle; if
-    False, on a tanh of the velocity, with the width coulomb_smoothing_velocity [rad/s, m/s].
+    The effects are armature, viscous and Coulomb friction, and torque offset; the following are optional.
+
+    Attributes:
+        stribeck: dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991).
+        polynomial: qd |qd| and qd^3.
+        memory: if True, Coulomb friction depends on the deflections of bristles (see ``runtime.friction_laws``), with a
+            column per bristle; if False, on a tanh of the velocity, with the width coulomb_smoothing_velocity [rad/s,
+            m/s].
     """
 
     coulomb_smoothing_velocity: float = 0.01

@@ -45,9 +45,11 @@ def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
 class PinocchioDynamics:
     """Dynamics of an arm of n coordinates (see ``RigidDynamics``).
 
-    model: Pinocchio model of b joints, with the rotor inertia as armature. constraint: mimic joints; joints of the
-    model that it does not name are locked. friction: function of the velocity (..., n) that returns the torque (...,
-    n); None: no friction. inputs: input matrix G, (n, n); None: each input is the torque of its joint.
+    Args:
+        model: Pinocchio model of b joints, with the rotor inertia as armature.
+        constraint: mimic joints; joints of the model that it does not name are locked.
+        friction: function of the velocity (..., n) that returns the torque (..., n); None: no friction.
+        inputs: input matrix G, (n, n); None: each input is the torque of its joint.
     """
 
     def __init__(

@@ -29,9 +29,13 @@ class State(NamedTuple):
 class PreparedModel:
     """A copy of a model with constant parameters.
 
-    Arguments q, qd, qdd and tau of the methods are (..., n), in rad and Nm, or m and N. The friction state z is
-    (..., n, K); its default is the steady state of motion at the velocity qd. tip: kinematics of the tip, see
-    ``tip_kinematics``. elements: number of bristles per joint, K. dtype: type of the parameters and states.
+    Arguments q, qd, qdd and tau of the methods are (..., n), in rad and Nm, or m and N. The friction state z is (...,
+    n, K); its default is the steady state of motion at the velocity qd.
+
+    Attributes:
+        tip: kinematics of the tip, see ``tip_kinematics``.
+        elements: number of bristles per joint, K.
+        dtype: type of the parameters and states.
     """
 
     def __init__(
@@ -186,7 +190,9 @@ class PreparedModel:
 def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: Tensor) -> tuple[Tensor, ...]:
     """Return the Jacobians, (batch, m, n), of a function with respect to each of its first ``variables`` inputs.
 
-    function: function of the states without batch dimension, (n,) each, with the result (m,). states: (batch, n) each.
+    Args:
+        function: function of the states without batch dimension, (n,) each, with the result (m,).
+        states: (batch, n) each.
     """
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)

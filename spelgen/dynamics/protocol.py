@@ -111,9 +111,10 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
     """Return (z, direction), (z,) or (): the arguments that describe past motion to the methods of `dynamics`.
 
-    z: friction state, (..., n, K) [rad, m]; omitted if friction has no state. direction: smooth sign of the velocity,
-    (..., n), the factor of dry friction of joints without bristles. It is needed only if tau was filtered: it must have
-    passed the same filter.
+    Args:
+        z: friction state, (..., n, K) [rad, m]; omitted if friction has no state.
+        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles. It is
+            needed only if tau was filtered: it must have passed the same filter.
     """
     if z is None or not z.shape[-1] or not is_stateful(dynamics):
         return ()

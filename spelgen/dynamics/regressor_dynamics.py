@@ -48,10 +48,14 @@ def _row(values: tuple[object, ...]) -> Row:
 class RegressorDynamics:
     """Dynamics of an arm of n coordinates and B bodies with given inertial parameters (see ``RigidDynamics``).
 
-    parameters: inertial parameters, (10 B,), in the order of ``regressor``. armature: armature of the drives, (n,)
-    [kg m^2, kg]. friction: function of velocities (T, n), and of the friction state z (T, n, K) or None, that returns
-    torques (T, n) [Nm, N]. bristle_reach: break-away displacements, (n, K) [rad, m]; None: friction has no state.
-    drives: matrices G of the inputs and C of the motors (see ``Drives``); None: each input is the torque of its joint.
+    Args:
+        parameters: inertial parameters, (10 B,), in the order of ``regressor``.
+        armature: armature of the drives, (n,) [kg m^2, kg].
+        friction: function of velocities (T, n), and of the friction state z (T, n, K) or None, that returns torques (T,
+            n) [Nm, N].
+        bristle_reach: break-away displacements, (n, K) [rad, m]; None: friction has no state.
+        drives: matrices G of the inputs and C of the motors (see ``Drives``); None: each input is the torque of its
+            joint.
     """
 
     def __init__(

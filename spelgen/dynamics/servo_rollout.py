@@ -45,8 +45,11 @@ class ServoState(NamedTuple):
 class Load(NamedTuple):
     """Inertia and torques of the rigid bodies that a step uses.
 
-    inertia: mass matrix M, (..., n, n), if ``coupled``; otherwise only its diagonal, (..., n), so that joints are
-    independent. bias: Coriolis, centrifugal and gravity torque, (..., n). gravity: gravity torque, (..., n).
+    Attributes:
+        inertia: mass matrix M, (..., n, n), if ``coupled``; otherwise only its diagonal, (..., n), so that joints are
+            independent.
+        bias: Coriolis, centrifugal and gravity torque, (..., n).
+        gravity: gravity torque, (..., n).
     """
 
     inertia: Tensor
@@ -124,10 +127,14 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
 def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Tensor) -> Tensor:
     """Return the displacement x, (..., n), that solves slope x + sum_k strength_k (z_k(x) - z_k) = push.
 
-    z_k(x) is the deflection of bristle k after the displacement x. push: force on the joint, (..., n). slope: stiffness
-    without bristles, (..., n). strength, z, reach: stiffness, initial deflection and break-away displacement of each
-    bristle, (K, ..., n), the shortest break-away displacement first: bristles begin to slide in this order. If k
-    bristles slide, the equation is linear in x. Of the K + 1 linear equations, the one with the largest |x| is valid.
+    z_k(x) is the deflection of bristle k after the displacement x. If k bristles slide, the equation is linear in x: of
+    these K + 1 linear equations, the one with the largest |x| is valid.
+
+    Args:
+        push: force on the joint, (..., n).
+        slope: stiffness without bristles, (..., n).
+        strength, z, reach: stiffness, initial deflection and break-away displacement of each bristle, (K, ..., n), the
+            shortest break-away displacement first: bristles begin to slide in this order.
     """
     direction, stiffness = push.sign(), slope + strength.sum(dim=0)
     # Cumulative sums over k = 0 .. K sliding bristles: push minus the force of these bristles, and the stiffness of the
@@ -140,8 +147,12 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
 def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:
     """Integrate W windows under their commands; return the positions (W, I, n) [rad, m] after each of I intervals.
 
-    q, qd: initial positions and velocities, (W, n). commands: delayed commands, (W, I, S, n), with S steps per
-    interval. dt: durations of the intervals, (W, I) [s]. M and the gravity torque are evaluated once per interval.
+    M and the gravity torque are evaluated once per interval.
+
+    Args:
+        q, qd: initial positions and velocities, (W, n).
+        commands: delayed commands, (W, I, S, n), with S steps per interval.
+        dt: durations of the intervals, (W, I) [s].
     """
     with torch.no_grad():
         drives, prepared, positions = servo_drives(model), model.prepare(), []

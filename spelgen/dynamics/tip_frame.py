@@ -14,9 +14,11 @@ from spelgen.dynamics.tip import last_link
 class Tip:
     """The frame of the tip link.
 
-    carrier: index of the body that carries the link; -1: the root link. pose: pose of the link in the frame of this
-    body, (4, 4). bodies: bodies of the arm with the unrounded angles of the URDF, so that poses are equal to the
-    results of other URDF parsers.
+    Attributes:
+        carrier: index of the body that carries the link; -1: the root link.
+        pose: pose of the link in the frame of this body, (4, 4).
+        bodies: bodies of the arm with the unrounded angles of the URDF, so that poses are equal to the results of other
+            URDF parsers.
     """
 
     link: str

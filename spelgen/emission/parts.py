@@ -19,8 +19,10 @@ FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code(
 class ModelParts:
     """The tables of an arm, and the constructor call that makes the model from the tables.
 
-    rows: {name of a table: rows}. The tables are ``JOINTS``, ``LINKS``, ``FUNCTIONS`` and ``CONSTANTS``; a row is a
-    call of ``Joint``, ``Link``, ``Function`` or ``Constant``. model: the constructor call of the model.
+    Attributes:
+        rows: {name of a table: rows}. The tables are ``JOINTS``, ``LINKS``, ``FUNCTIONS`` and ``CONSTANTS``; a row is a
+            call of ``Joint``, ``Link``, ``Function`` or ``Constant``.
+        model: the constructor call of the model.
 
     An argument of a call is a number, a text, a tuple, a call or a name. A name refers to a table, to the function
     ``mass_entries``, or to ``generator``, the random generator of the initial weights. The calls must be evaluated in

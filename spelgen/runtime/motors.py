@@ -15,8 +15,11 @@ from spelgen.runtime.rows import vector
 class MotorInputs(nn.Module):
     """A constant input matrix G, (n, n): entry (i, j) is the torque of joint i per input of motor j.
 
-    A joint without a motor is passive. gains: rows of G. trained: rows of a mask, True for entries of G
-    that are trained; None: all entries are constant. The sign of an entry is never trained.
+    A joint without a motor is passive. The sign of an entry is never trained.
+
+    Args:
+        gains: rows of G.
+        trained: rows of a mask, True for entries of G that are trained; None: all entries are constant.
     """
 
     parameter_groups = (("raw_gains", "gains", "1"),)

@@ -37,10 +37,13 @@ class RigidConfiguration(NamedTuple):
 class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction and a torque offset.
 
-    The friction state z, (..., n, K) [rad, m], has the displacements of the bristles, whose energy is
-    part of H. Without z, dry friction depends on velocity. motor_speeds: rows of the matrix C, (n, n),
-    for which C qd are the motor speeds; friction, z and armature then belong to the motors. None: every
-    motor drives its own joint. servo: position servos; None: inputs are torques.
+    The friction state z, (..., n, K) [rad, m], has the displacements of the bristles, whose energy is part of
+    H. Without z, dry friction depends on velocity.
+
+    Args:
+        motor_speeds: rows of the matrix C, (n, n), for which C qd are the motor speeds; friction, z and
+            armature then belong to the motors. None: every motor drives its own joint.
+        servo: position servos; None: inputs are torques.
     """
 
     parameter_groups = (

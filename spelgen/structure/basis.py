@@ -86,8 +86,11 @@ def _constants(
 ) -> tuple[Term, ...]:
     """Return the constant terms of M: a basis of the span of M - sum_j f_j B_j, with the varying terms f_j(q) B_j.
 
-    constant: S samples of this difference, (S, entries), in the prime field and in double precision. basis: the m
-    matrices B_j, (m, entries), in the prime field and in double precision. entries: n(n+1)/2, of the lower triangle.
+    Matrices are lower triangles with entries = n(n+1)/2 elements.
+
+    Args:
+        constant: S samples of this difference, (S, entries), in the prime field and in double precision.
+        basis: the m matrices B_j, (m, entries), in the prime field and in double precision.
     """
     # The entry of M at each pivot of the row reduction defines a constant. Row reduction places pivots in the first
     # possible columns: the entries that depend on the fewest joints come first.

@@ -20,9 +20,11 @@ PARAMETERS = ("kp", "kd", "armature", "dry")
 class ServoRank(NamedTuple):
     """Identifiable ratios of the parameters of servos.
 
-    groups: sets of joints (0-based). Within a set, all ratios of two kp are identifiable, so that one known kp, mass or
-    load determines all parameters of the set. open: pairs (parameter, joint) whose ratio to the kp of the joint is not
-    identifiable; such a parameter can be identified only together with the inertial parameters of the bodies.
+    Attributes:
+        groups: sets of joints (0-based). Within a set, all ratios of two kp are identifiable, so that one known kp,
+            mass or load determines all parameters of the set.
+        open: pairs (parameter, joint) whose ratio to the kp of the joint is not identifiable; such a parameter can be
+            identified only together with the inertial parameters of the bodies.
     """
 
     groups: tuple[tuple[int, ...], ...]

@@ -29,10 +29,14 @@ COUNTS = {"box": 3, "cylinder": 2, "sphere": 1, "mesh": 3}
 class LinkShape:
     """A shape of a link.
 
-    link: name of the link. kind and size: "box" with the lengths of three edges, "cylinder" with radius and length
-    along z, "sphere" with radius [m], "mesh" with the scale factors along x, y and z. pose: homogeneous transform
-    (4, 4) of the shape in the frame of the link. file: name of the file of a mesh in the URDF. mesh: scaled vertices
-    (V, 3) [m] in the frame of the shape, and vertex indices (F, 3) of triangles; None for other kinds.
+    Attributes:
+        link: name of the link.
+        kind, size: "box" with the lengths of three edges, "cylinder" with radius and length along z, "sphere" with
+            radius [m], "mesh" with the scale factors along x, y and z.
+        pose: homogeneous transform (4, 4) of the shape in the frame of the link.
+        file: name of the file of a mesh in the URDF.
+        mesh: scaled vertices (V, 3) [m] in the frame of the shape, and vertex indices (F, 3) of triangles; None for
+            other kinds.
     """
 
     link: str

@@ -61,8 +61,10 @@ class Notes:
 class Element:
     """An element of a URDF with checked access to its attributes.
 
-    notes: the list to which errors and warnings about the element are added. xml: the element of lxml; None if it is
-    absent: all attributes are then absent, too. where: name of the element in messages.
+    Attributes:
+        notes: the list to which errors and warnings about the element are added.
+        xml: the element of lxml; None if it is absent: all attributes are then absent, too.
+        where: name of the element in messages.
     """
 
     notes: Notes
