@@ -130,7 +130,7 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context that adds the file name `path` to an OSError that has none, for instance the error of a full disk."""
+    """Context manager that adds the file name `path` to an OSError without one, as raised for a full disk."""
     try:
         yield
     except OSError as error:

@@ -1,7 +1,7 @@
 """Conversions of inertial parameters, the regressor of the joint torques, and base parameters.
 
-`base_combinations` computes base parameters of bodies and armatures numerically. Without armatures, they are equal to
-the exact base parameters of `structure.base_parameters`.
+`base_combinations` computes base parameters of bodies and armatures numerically. Their inertial parts (without
+armatures) are equal to the exact base parameters of `structure.base_parameters`.
 """
 
 import numpy as np

@@ -126,7 +126,10 @@ def unbounded(mass: Tensor) -> Tensor:
 
 @contextmanager
 def mass_as_learned(model: nn.Module) -> Iterator[None]:
-    """Context in which an indefinite mass matrix of a ``DerivedMass`` is not corrected; other models are unchanged."""
+    """Context manager that switches off the correction of an indefinite M by ``DerivedMass``.
+
+    Models with other mass matrices are unchanged.
+    """
     mass = model.mass if isinstance(model, NetworkDynamics) else None
     if not isinstance(mass, DerivedMass):
         yield
