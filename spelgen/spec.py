@@ -29,7 +29,7 @@ class Options:
 
     preset: str = "hybrid"
     design: Design | None = None
-    """Design from a YAML file; None for the design of spelgen that ``preset`` names."""
+    """Design from a YAML file; None: the design is the preset of spelgen with the name ``preset``."""
     assume: Assume = "kinematics"
     joints: tuple[str, ...] | None = None
     tip: str | None = None
@@ -84,7 +84,7 @@ class LinkSpec:
     ratio: float
     offset: float
     position: Triple
-    """Origin of the joint's frame in the parent's frame at q = 0 [m]."""
+    """Origin of the joint's frame in the parent's frame at displacement 0 [m]."""
     rotation: tuple[Triple, Triple, Triple]
     mass: float
     center_of_mass: Triple
@@ -160,7 +160,7 @@ class ModelSpec:
     """The joints that V depends on."""
     potential_scale: float
     margin: float
-    """Lower bound of the eigenvalues of M, relative to the nominal mean of M; M is corrected below this bound."""
+    """Lower bound of the generalised eigenvalues of M relative to its nominal mean; below it, M is corrected."""
     started_from_urdf: bool
     """Whether the initial inertial parameters are from the URDF."""
     links: tuple[LinkSpec, ...] = ()

@@ -31,7 +31,7 @@ class ParameterInfo:
 
 
 NETWORK = ParameterInfo("network", "1")
-"""Weights and biases, which no part declares."""
+"""Group and unit of the weights and biases of networks, which no module declares."""
 
 
 def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
@@ -64,7 +64,7 @@ def parameters_of_kind(model: nn.Module, *kinds: str) -> tuple[str, ...]:
 Model = TypeVar("Model", bound=nn.Module)
 Result = TypeVar("Result")
 NamedTensors = Mapping[str, Tensor]
-"""Tensors by the names of a model's parameters and buffers."""
+"""{name of a parameter or buffer of a model: tensor}."""
 
 
 def idle_residuals(model: object) -> list[str]:

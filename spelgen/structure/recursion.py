@@ -16,15 +16,15 @@ from typing import Any, NamedTuple
 from spelgen.arm.arm import Body, Chain
 
 Element = Any
-"""An element of the ring: an object that supports +, - and * with other elements and with integers."""
+"""A number of the recursion: any object that supports +, - and * with such objects and with integers."""
 
 Number = Callable[[Fraction], Element]
-"""Conversion of the exact constants of an arm to elements of the ring."""
+"""Conversion of the exact constants of an arm to the numbers of the recursion."""
 
 Vector = tuple[Element, ...]
 
 TENSOR = tuple(combinations_with_replacement(range(3), 2))
-"""Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
+"""Order of the components of an inertia tensor: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
 
 
 class Position(NamedTuple):
