@@ -21,12 +21,13 @@ STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
 ENDING = ".pos"
 # Largest normalised position: 100, with a tolerance for rounding to single precision.
 LARGEST_NORMALISED = 100.001
-# Doubt about positions in degrees; the check of servo logs removes it if the steps of the encoders decide.
+# Text of the remark that positions may be normalised and not in degrees. The check of servo logs removes this remark if
+# the step size of the encoders determines the unit.
 UNLESS_NORMALISED = "unless they are LeRobot's normalised values"
 
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with the only table of a file. The mapping is ignored for files that spelgen wrote."""
+    """Return a list with one table, the content of a file. The mapping is ignored for files that spelgen wrote."""
     schema = pa.parquet.read_schema(file)
     layout = table_layout(schema, joints, mapping, file)
     columns = stored_columns(layout, schema.names)
@@ -35,10 +36,10 @@ def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the tables of all files of a LeRobot data set, whose motors have the names of the joints.
+    """Return the tables of all Parquet files of a LeRobot data set; joints and motors are matched by their names.
 
-    Raises LogError if the data set has no files, if a joint is not among the motors, and for normalised positions
-    without a calibration.
+    Raises LogError if the data set has no Parquet files, if a joint is not among the motors, and for normalised
+    positions without a calibration.
     """
     info = read_json(folder / INFO, LogError)
     states, actions = _motor_names(folder, info, STATE), _motor_names(folder, info, ACTION)
@@ -62,7 +63,7 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         expected = "data/chunk-000/file-000.parquet"
         raise LogError("a data set without Parquet files", file=folder, expected=expected)
     mapping, remarks = _with_scale(folder, files, joints, mapping)
-    # Joint names of LeRobot 2 have no suffix, and its positions are in degrees: these remarks do not apply.
+    # LeRobot 2, whose joint names have no suffix, always writes degrees: remarks on the unit do not apply.
     if ENDING not in str(info["features"][STATE]["names"]):
         remarks = ()
     fps = info.get("fps")
@@ -137,7 +138,7 @@ def _motor_names(folder: Path, info: Any, feature: str) -> list[str]:
     """Return the motors' names for a feature ("observation.state" or "action"), without LeRobot's suffix ".pos"."""
     try:
         names = info["features"][feature]["names"] or []
-        if isinstance(names, dict):  # LeRobot writes a list, or a group of lists
+        if isinstance(names, dict):  # LeRobot writes a list, or a dict of lists
             names = chain(*names.values())
         return [str(name).removesuffix(ENDING) for name in names]
     except (KeyError, TypeError, AttributeError) as error:

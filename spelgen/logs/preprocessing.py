@@ -49,7 +49,8 @@ class Preprocessing:
         cutoff, decimation = self.cutoff, self.decimation or 1
         if cutoff is None and all(rate > TUNING.dense_rate * FAST for rate in rates):
             cutoff = TUNING.automatic_cutoff
-        # by default only filtered logs are decimated, if their rate is higher than the filter needs
+        # By default, filtered logs are decimated to the lowest rate that the cutoff permits; other logs are not
+        # decimated.
         if self.decimation is None and cutoff:
             decimation = max(1, int(min(rates) * FAST / (TUNING.samples_per_period * cutoff)))
         return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=self.torque_delay or 0.0)
@@ -63,7 +64,7 @@ class Preprocessing:
 
     @property
     def filtered(self) -> bool:
-        """True if windows are cut from filtered logs; the options must be ``resolved``."""
+        """True if q, qd and tau are filtered before windows are cut from the logs; the options must be ``resolved``."""
         return bool(self.cutoff)
 
     @property
@@ -94,7 +95,7 @@ class Preprocessing:
         return prepared
 
     def moved(self, trajectories: Sequence[Trajectory]) -> Sequence[Trajectory]:
-        """Return the trajectories with torques shifted back by `torque_delay`, to the times at which they acted."""
+        """Return the trajectories with torques shifted back in time by `torque_delay`."""
         delay = self.torque_delay
         # Most logs have no delay: the unchanged trajectories are returned, which need not be validated again.
         if not delay:
