@@ -162,7 +162,7 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
 
 
 def held_samples(values: np.ndarray) -> int:
-    """Return the number of consecutive samples in which a logger repeats each value of a signal (T,); 1: none."""
+    """Return the number of consecutive samples that a logger writes for each value of a signal (T,); normally 1."""
     changes = np.flatnonzero(np.diff(values))
     if len(changes) < TUNING.jump_window:
         return 1
