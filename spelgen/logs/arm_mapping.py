@@ -93,7 +93,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
 def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
     """Return the LogMapping for the argument `mapping` of `read_logs`: a LogMapping, a dict, or a file.
 
-    stated: mapping in the arm's settings; it has the values of keys that the dict or the file does not contain.
+    stated: mapping in the arm's settings, which applies to all keys that the dict or the file does not contain.
     """
     # A LogMapping is complete and replaces the mapping of the settings. A file or a dict overrides single keys.
     if isinstance(mapping, LogMapping):

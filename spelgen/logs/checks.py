@@ -90,8 +90,8 @@ class Findings:
     ) -> None:
         """Add the message of a check, as an error or as a note according to the check's severity.
 
-        keys: settings of the group `logs` that correct the fault. A fault that settings correct is always an error, so
-        that it is not trained on.
+        keys: settings of the group `logs` that correct the fault. A fault with such a correction is always an error, so
+        that no model is trained on the log without the correction.
         """
         if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
@@ -227,8 +227,7 @@ class LogChecks:
 
     Trajectories are added one at a time, so that only one of them has to be in memory.
 
-    products: (2n, 2n) sum of `velocity_products` over all trajectories: the scalar products of 2n columns, the
-    increments of the integral of qd and the increments of q of each joint.
+    products: (2n, 2n) sum of the results of `velocity_products` for all trajectories.
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:

@@ -79,7 +79,7 @@ def _sections(rate: float, cutoff: float) -> np.ndarray:
 
 
 def regular_times(t: np.ndarray, frequency: float) -> np.ndarray:
-    """Return times [s] at intervals of 1 / frequency [1 / Hz] within the range of the times t (T,)."""
+    """Return evenly spaced times [s] with the rate `frequency` [Hz], within the range of the times t (T,)."""
     return np.arange(t[0], t[-1], 1.0 / frequency)
 
 

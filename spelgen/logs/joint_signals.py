@@ -139,8 +139,8 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
     """Return a finding if a signal is frozen while the joint moves: constant q, constant qd, or repeated old values."""
     from scipy.integrate import cumulative_trapezoid
 
-    # `motion` [rad, m]: a joint moves if q changes by more than this value, or if the integral of qd does. A constant
-    # qd or q, respectively, is then frozen.
+    # [rad, m] A constant qd is frozen if q changes by more than `motion`. A constant q is frozen if the integral of qd
+    # changes by more than `motion`.
     t, q, qd, motion = signals.trajectory.t, signals.q, signals.qd, 0.05
     if np.ptp(qd) == 0 and np.ptp(q) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"

@@ -139,10 +139,10 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
-    Equal rows are repeats if the arm moved while they were written. Of a block of k equal rows, all but the first are
-    repeats if the step at the end of the block is about as large as k steps of the following motion. Equal rows of an
-    arm at rest are not repeats, except if the logger writes each row m times during motion: then of the rows at rest,
-    too, all but every m-th row are repeats. positions: number of leading columns that are positions.
+    Equal rows are repeats of the first of them if the arm moved while they were written: the step at the end of a block
+    of k equal rows is then about as large as k steps of the following motion. Equal rows of an arm at rest are not
+    repeats. The exception is a logger that writes each row m times during motion: at rest, too, only every m-th row is
+    then not a repeat. positions: number of leading columns that are positions.
     """
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
     lengths = np.diff(np.append(starts, len(columns)))

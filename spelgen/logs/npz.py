@@ -120,9 +120,9 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
 def _with_matrix_columns(
     quantity: str, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping
 ) -> LogMapping:
-    """Return the mapping in which each joint has a column of a matrix (T, n) of the quantity, such as `q[0]`.
+    """Return the mapping with columns such as `q[0]` for a quantity that is stored as a matrix (T, n).
 
-    If the archive contains no matrix of the quantity, the mapping is returned unchanged.
+    If the archive contains no such matrix, the mapping is returned unchanged.
     """
     pattern = mapping.pattern(quantity)
     matrix = pattern.replace("{joint}", "").rstrip("_")
@@ -133,7 +133,7 @@ def _with_matrix_columns(
     columns: dict[str, dict[str, str | None]] = {}
     for joint, name in zip(joints, names, strict=True):
         column = mapping.column(quantity, joint)
-        # `name` has priority, but the mapping may assign the column of another joint to this joint.
+        # The mapping may assign the column of another joint to this joint; owners[0] is the joint whose column it is.
         owners = [x for x in (name, *names) if pattern.replace("{joint}", x) == column]
         columns[joint] = {quantity: f"{matrix}[{column_of[owners[0]]}]" if owners else column}
     return mapping.with_joint_columns(columns)

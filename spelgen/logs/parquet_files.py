@@ -16,7 +16,7 @@ from spelgen.logs.tables import LogFormat, LogTable, reading, stored_columns, ta
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.yaml_document import YamlDocument, validated
 
-INFO = "meta/info.json"  # description of a LeRobot data set, within the folder of the data set
+INFO = "meta/info.json"  # file that describes a LeRobot data set, in its folder
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
 ENDING = ".pos"
 # Largest normalised position: 100, with a tolerance for rounding to single precision.
@@ -121,7 +121,7 @@ def _with_scale(
 
 
 def _calibration(folder: Path) -> dict[str, MotorCalibration]:
-    """Return the calibration per motor from the calibration.json of a data set; {} if there is no such file."""
+    """Return {motor: calibration} from the file calibration.json of a data set; {} if there is no such file."""
     for file in (folder / "calibration.json", folder / "meta" / "calibration.json"):
         if file.is_file():
             document = YamlDocument(file, None)
@@ -130,7 +130,7 @@ def _calibration(folder: Path) -> dict[str, MotorCalibration]:
 
 
 def dataset_motors(folder: Path) -> list[str]:
-    """Return the names of the motors of a data set, in the order of the columns of its state."""
+    """Return the names of the motors of a data set, in the order of the elements of `observation.state`."""
     return _motor_names(folder, read_json(folder / INFO, LogError), STATE)
 
 

@@ -17,11 +17,12 @@ from spelgen.logs.tuning import FAST, TUNING
 class Preprocessing:
     """Options for cutting, filtering and decimating logs. Raises SettingsError for invalid values.
 
-    cutoff: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: no filter; None: 8 Hz, but no filter for windows
-    if a log is sampled at 50 Hz or less.
-    decimation: number of log samples from one sample of a window to the next; None: chosen for the filter.
-    gap: a time step longer than this multiple of the median step is a gap, at which a recording is cut.
-    torque_delay: delay of logged torques relative to positions [s]; None: estimated in fits to torques.
+    Attributes:
+        cutoff: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: no filter; None: 8 Hz, but no filter for
+            windows if a log is sampled at 50 Hz or less.
+        decimation: number of log samples from one sample of a window to the next; None: chosen according to the cutoff.
+        gap: a time step longer than this multiple of the median step is a gap, at which a recording is cut.
+        torque_delay: delay of logged torques relative to positions [s]; None: estimated in fits to torques.
     """
 
     cutoff: float | None = None
@@ -69,7 +70,7 @@ class Preprocessing:
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """A remark with the cutoff if the logs are filtered, else []; the options must be ``resolved``."""
+        """List with one remark, the cutoff, if the logs are filtered, else []; the options must be ``resolved``."""
         if not self.cutoff:
             return []
         message = f"q, qd and tau filtered at {self.cutoff:g} Hz, zero phase"

@@ -142,7 +142,10 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
 
 
 def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Return the trajectories with unique names, which are preceded by the file's stem or path if necessary."""
+    """Return the trajectories with unique names.
+
+    If names occur more than once, all names are preceded by the stems or paths of their files.
+    """
     names: list[str] = []
     # The shortest unique form is used, since names occur in tables and messages.
     for form in ("{0.name}", "{0.file.stem}/{0.name}", "{0.file}/{0.name}"):

@@ -209,8 +209,8 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
-    # The resolution of the clock is too low if more than ten rows, and more than 2 % of the rows, have the time of the
-    # row before and other values.
+    # The resolution of the clock is too low if more than ten rows, and more than 2 % of all rows, have the same time as
+    # the row before but other values.
     if np.count_nonzero(differs) > max(10, 0.02 * len(data)):
         t, message = _reconstructed(data[:, 0], layout)
         return np.column_stack([t, data[:, 1:]]), (*repairs, message)

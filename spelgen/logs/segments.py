@@ -24,7 +24,7 @@ class Segment(NamedTuple):
     Attributes:
         recording: number of the recording among all recordings.
         name: name of the recording.
-        layout: columns of the file.
+        layout: columns of the file, with their units.
         rows: (T,) row numbers in the file, from 0.
         values: (T, C) columns of the layout in SI units.
     """
@@ -119,7 +119,7 @@ def _taken(table: pa.Table, rows: np.ndarray) -> pa.Table:
 
 
 def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]:
-    """Return the name and the row numbers (T,) of each recording in a table, in order of their first rows."""
+    """Return (name, row numbers (T,)) for each recording in a table, in the order of their first rows."""
     if layout.labels is None:
         return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
     # Labels are encoded as numbers, so that each text is stored once: a small compressed file may repeat a label of a

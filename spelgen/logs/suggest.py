@@ -255,8 +255,8 @@ def _by_joint(
 ) -> dict[str, ColumnName]:
     """Return {joint: column}: the column whose name contains the name of the joint.
 
-    If no column name contains a joint name, columns are assigned by the last number in their names: `order` is the
-    number of each joint. If `order` does not contain all joints, the numbers are assigned in ascending order.
+    If no column name contains a joint name, columns are assigned by the last number in their names: `order` contains
+    {joint: number}. If `order` does not contain all joints, they are assigned to the numbers in ascending order.
     """
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
     numbers = [(re.findall(r"\d+", column.name), column) for column in columns]

@@ -56,7 +56,7 @@ class Layout:
     header: int = 1
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about a value: `row` is counted from 0; for a CSV file the error states the line, too."""
+        """Return an error about the value in a row (counted from 0) and column; for a CSV file also with the line."""
         line = int(row) + 1 + self.header if self.file.suffix == ".csv" else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
@@ -87,8 +87,8 @@ class LogFormat(NamedTuple):
 def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, file: Path) -> Layout:
     """Return the layout of a table with this schema. Raises LogError if a column is missing or occurs twice.
 
-    Files that spelgen wrote have SI units and default column names. Of the mapping,
-    only the input (torque or position), the accepted checks and the wraps of angles apply to them.
+    Files that spelgen wrote have SI units and default column names. Of the mapping, only the input (torque or
+    position), the accepted checks and the wraps of angles apply to them.
     """
     metadata = schema.metadata or {}
     # files of spelgen, e.g. simulated logs, are in SI units, even if the arm's mapping describes another logger

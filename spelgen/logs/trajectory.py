@@ -177,7 +177,7 @@ def _summary(x: Trajectory) -> tuple[str, ...]:
 
 
 def require_joints(trajectory: Trajectory, joints: Sequence[str]) -> None:
-    """Raise LogError unless the number of joints in the trajectory is the number of these joints."""
+    """Raise LogError if the number of joints in the trajectory differs from the number of names in `joints`."""
     count = trajectory.q.shape[1]
     if count != len(joints):
         raise trajectory.error(f"{count} joints", f"{len(joints)}: {', '.join(joints)}")
@@ -216,7 +216,7 @@ def joined_column(trajectories: Sequence[Trajectory], name: str) -> np.ndarray:
 
 
 def set_aside(items: Sequence[T], numbers: np.ndarray) -> tuple[list[T], list[T]]:
-    """Return two lists: the items without the indices `numbers` (k,), and the items with these indices."""
+    """Return two lists: the items whose index is not in `numbers` (k,), and the items whose index is in it."""
     chosen = set(numbers.tolist())
     remaining = [item for k, item in enumerate(items) if k not in chosen]
     return remaining, [item for k, item in enumerate(items) if k in chosen]

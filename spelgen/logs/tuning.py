@@ -80,7 +80,7 @@ FAST = 1.002
 
 
 def shows_accelerations(rate: float) -> bool:
-    """Return True if accelerations can be computed from logs of this sample rate [Hz]: 24 Hz by default or more."""
+    """Return True if accelerations can be computed from logs of this sample rate [Hz]: it must be at least 24 Hz."""
     return rate * FAST >= SLOWEST
 
 

@@ -61,9 +61,9 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_units(signals: JointSignals) -> str | Advice | None:
-    """Return a finding if q or qd has a wrong unit: q exceeds two turns, or dq/dt is a multiple of qd."""
+    """Return a finding if q or qd has a wrong unit: the range of q exceeds two turns, or dq/dt is a multiple of qd."""
     mapping, joint = signals.trajectory.mapping, signals.joint
-    # With steps this long, the times are in another unit, so dq/dt is wrong. The check of times reports this fault.
+    # Times with a median step above 0.5 s are in another unit, so dq/dt is wrong. The check of times reports it.
     if signals.step > SIGNALS.slowest_step:
         return None
     is_far = np.ptp(signals.q) > TURNS and signals.kind != "prismatic" and not signals.turns
@@ -134,9 +134,9 @@ def time_unit(step: float) -> str | None:
 
 
 def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
-    """Return a finding if qd is not dq/dt, with the sign or the columns with which it is."""
+    """Return a finding if qd is not dq/dt, with advice if another sign or other columns correct it."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
-    # With steps this long, the times are in another unit, so dq/dt is wrong. The check of times reports this fault.
+    # Times with a median step above 0.5 s are in another unit, so dq/dt is wrong. The check of times reports it.
     if signals.step > SIGNALS.slowest_step:
         return None
     if np.isnan(correlation):
@@ -188,7 +188,7 @@ def _velocity_lag(signals: JointSignals) -> float:
     power = float(speed @ speed)
     lag = float(speed @ difference) / power if power else 0.0
     residual = difference - lag * speed
-    # Integrated noise also causes a difference, so the delay must explain at least 75 % of its square.
+    # Noise also makes q and the integral of qd differ, so the delay must explain 75 % of the squared difference.
     return lag if residual @ residual < 0.25 * difference @ difference else 0.0
 
 

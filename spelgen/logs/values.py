@@ -25,8 +25,8 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
     """Return the columns of a layout as numbers (T, C) in SI units.
 
     Absent values are NaN in rows of another topic or publisher (see `foreign_rows`), and in logs whose signals are in
-    separate rows (see `is_split`). Raises LogError, with row and column, for other values that are not numbers, and for
-    values beyond the range of any arm.
+    separate rows (see `is_split`). Raises LogError, with row and column, for values that are absent elsewhere, that are
+    not numbers, or that are beyond the range of any arm.
 
     Args:
         table: the logged columns.

@@ -22,11 +22,13 @@ LAST_PART = " (last part)"
 class Windows:
     """W windows of K consecutive samples of n joints.
 
-    dt: (W, K-1) time steps between the samples [s], which need not be equal.
-    q, qd: (W, K, n) measured positions and velocities [rad, rad/s; m, m/s].
-    tau: (W, K-1, n) input, constant over each step: torques [Nm, N].
-    z: (W, n, B) [rad, m] states of the B friction bristles per joint at the first sample, computed from the history of
-        motion; None if not computed.
+    Attributes:
+        dt: (W, K-1) time steps between the samples [s], which need not be equal.
+        q: (W, K, n) measured positions [rad, m].
+        qd: (W, K, n) measured velocities [rad/s, m/s].
+        tau: (W, K-1, n) torques [Nm, N], the input, constant over each step.
+        z: (W, n, B) [rad, m] states of the B friction bristles per joint at the first sample of a window, computed from
+            the motion before it; None if not computed.
     """
 
     dt: torch.Tensor
@@ -153,7 +155,7 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
         note = Diagnostic("info", "validation-split", "logs", None, message)
         last = replace(trajectory[cut:], name=trajectory.name + LAST_PART)
         return Split((trajectory[:cut],), (last,), note)
-    # Trajectories are not cut, since neighbouring windows of a trajectory have common samples.
+    # Validation uses whole trajectories, since neighbouring windows of one trajectory have common samples.
     count = min(max(1, round(fraction * total)), total - 1)
     training, validation = set_aside(trajectories, np.random.default_rng(seed).permutation(total)[:count])
     names = ", ".join(x.name for x in validation) if count <= 3 else f"{count} of {total} trajectories"
