@@ -237,7 +237,7 @@ class LogChecks:
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
-        """Check a trajectory, and add its findings."""
+        """Apply all checks to a trajectory, and add the findings."""
         self._count += 1
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
         findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]

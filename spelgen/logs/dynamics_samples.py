@@ -14,9 +14,8 @@ from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, TUNING, shows_accelerations
 
 FREQUENCY = 100.0  # [Hz] common sample rate, twelve times the default cutoff of the low-pass filter
-SHORTEST = (
-    1.0  # [s] Shorter gap-free pieces are omitted: more than a fifth of them would be filter transients.
-)
+# [s] Shorter gap-free pieces are omitted: more than a fifth of them would be filter transients.
+SHORTEST = 1.0
 # [s] Shorter gaps do not cut a recording: the low-pass would remove motion that is fast enough to occur within them.
 HOLE = 0.25 / TUNING.automatic_cutoff
 AUTOMATIC = Preprocessing()
@@ -24,10 +23,14 @@ AUTOMATIC = Preprocessing()
 
 @dataclass(frozen=True, eq=False)
 class DynamicsSamples:
-    """Filtered samples of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N], each (T, n).
+    """Filtered samples of one trajectory of n joints at T times.
 
     Attributes:
         name: name of the trajectory.
+        q: (T, n) positions [rad, m].
+        qd: (T, n) velocities [rad/s, m/s].
+        qdd: (T, n) accelerations [rad/s^2, m/s^2].
+        tau: (T, n) torques [Nm, N].
         z: (T, n, K) [rad, m] states of the K friction bristles of each joint, filtered like tau; None if not computed.
         direction: (T, n) smooth sign of the velocity, the factor of dry friction without bristles, filtered like tau;
             None if not computed.

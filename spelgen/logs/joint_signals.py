@@ -192,7 +192,10 @@ def find_jumps(signals: JointSignals) -> str | Advice | None:
 
 
 def _find_words(signals: JointSignals, name: str) -> Advice | None:
-    """Return a finding if a signal, "q", "qd", "tau" or "u", consists of undecoded register words or wrapped angles."""
+    """Return a finding if a signal consists of undecoded register words or wrapped angles.
+
+    name: signal, "q", "qd", "tau" or "u". Register words are defined in the module `jumps`.
+    """
     mapping, values = signals.trajectory.mapping, signals.signal(name)
     scale, offset = mapping.scale(name, signals.joint), mapping.offset(name, signals.joint)
     unit = mapping.unit(name, signals.joint)

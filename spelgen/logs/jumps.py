@@ -1,7 +1,8 @@
 """Detection of jumps of logged signals: lost samples, outliers, wrapped angles, register words, repeated rows.
 
-The functions apply to one signal (T,) or to the columns of a log (T, C), for logs of any format and any robot. A step
-is the difference between neighbouring samples; the typical step is the median magnitude of the nonzero steps.
+The functions apply to one signal (T,) or to a log of C columns (T, C), of any format and any robot. A step is the
+difference between neighbouring samples; the typical step is the median magnitude of the nonzero steps. Register words
+are the raw integers of a drive's register: they overflow at a period, or have a bit for the sign.
 """
 
 from itertools import pairwise

@@ -16,11 +16,11 @@ from spelgen.logs.values import foreign_rows, is_split
 from spelgen.settings.log_mapping import LogMapping
 
 Repaired = tuple[np.ndarray, tuple[str, ...]]
-"""Rows of a log (T, C) after a repair, and messages about the changes."""
+"""Rows of a log, (T, C) with C columns, after a repair, and messages about the changes."""
 
 
 def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:
-    """Return the trajectory of the rows `data` (T, C) in SI units, whose columns the layout describes.
+    """Return the trajectory of the rows `data`, (T, C) in SI units, with the C columns of the layout.
 
     First wrapped angles and overflowed registers are unwrapped, and repeated rows are removed; with the setting
     'dropouts: dropped' lost rows and outliers are removed, too. Then the signals are shifted by the mapping's delays,
@@ -49,9 +49,10 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
 
 
 def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> Repaired:
-    """Return rows (T, C) in which the signals with a period in the mapping are unwrapped, and remarks about them.
+    """Return the rows `data`, (T, C) with C columns, after unwrapping of signals, and remarks about the wraps.
 
-    signals: quantity and joint of each column after the times.
+    Signals are unwrapped if the mapping states a period for them. signals: quantity and joint of each column after the
+    times.
     """
     remarks: list[str] = []
     if not any(mapping.word("period", *signal) for signal in signals):
@@ -80,7 +81,7 @@ def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping
 
 
 def _without_repeats(data: np.ndarray, positions: int, mapping: LogMapping) -> Repaired:
-    """Return rows (T, C) without repeated rows, and a message about the repeats.
+    """Return the rows `data`, (T, C) with C columns, without repeated rows, and a message about the repeats.
 
     Repeats are removed if every row is written several times, or with the setting 'dropouts: dropped'; otherwise they
     are only reported. positions: number of columns of positions.
@@ -105,7 +106,11 @@ def _without_repeats(data: np.ndarray, positions: int, mapping: LogMapping) -> R
 
 
 def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> Repaired:
-    """Return rows (T, C) without lost samples, outliers and stale values, and a message that lists the removed rows."""
+    """Return the rows `data`, (T, C) with C columns, without rows that contain lost samples, outliers or stale values.
+
+    The second result is a message that lists the removed rows. signals: quantity and joint of each column after the
+    times.
+    """
     outliers = np.zeros(len(data), bool)
     dropped = []
     columns = dict(zip(signals, data[:, 1:].T, strict=True))
@@ -124,7 +129,7 @@ def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> R
 
 
 def _without_delays(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> np.ndarray:
-    """Return rows (T, C) in which the signals are shifted back by their delays in the mapping.
+    """Return the rows `data`, (T, C) with C columns, in which signals are shifted back by their delays in the mapping.
 
     Rows near the ends of a gap-free piece, for which a delayed signal was not logged, are removed.
     """
@@ -174,15 +179,15 @@ def listed_times(t: np.ndarray) -> str:
 
 
 def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaired:
-    """Return the rows (T, C) with increasing times, and messages about repairs.
+    """Return the rows `data`, (T, C) with C columns, with increasing times, and messages about repairs.
 
     Signals in separate rows are joined, and rows of another topic or publisher are removed. Rows are sorted by time,
     unless positions are then less smooth. Of several rows with equal times only the first is kept. If many of them
     differ, the resolution of the clock is too low, and evenly spaced times are reconstructed. With the setting
     `sample_rate`, the logged times are replaced by evenly spaced times.
 
-    data: (T, C) values in SI units. rows: (T,) row numbers in the file, for errors. Raises LogError for a clock that
-    restarts, and for times that cannot be reconstructed.
+    data: values in SI units, with times in the first column. rows: (T,) row numbers in the file, for errors. Raises
+    LogError for a clock that restarts, and for times that cannot be reconstructed.
     """
     repairs: tuple[str, ...] = ()
     if is_split(data):
@@ -222,7 +227,7 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
 
 
 def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:
-    """Return rows (T, C) with values of all signals, from signals that are logged in separate rows, and a message.
+    """Return rows (T, C) that contain all C columns, from signals that are logged in separate rows, and a message.
 
     The times are the times of the signal with the fewest samples. If more than 90 % of its rows contain all signals,
     the complete rows are returned. Otherwise the other signals are interpolated at these times. Rows within a gap of a
@@ -242,7 +247,7 @@ def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:
         rows = finite[:, k]
         t, values = data[rows, 0], data[rows, k]
         period = abs(mapping.scale(*signal)) * (mapping.word("period", *signal) or 0.0)
-        if period:  # Interpolation across a wrap would be wrong.
+        if period:  # interpolated angles are wrong across a wrap
             values = unwrapped(values, period)
         joined[:, k] = np.interp(times, t, values, left=np.nan, right=np.nan)
         after = np.clip(np.searchsorted(t, times), 1, len(t) - 1)

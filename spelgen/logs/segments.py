@@ -15,7 +15,7 @@ from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import clock_start, values_in_si
 
 Piece = tuple[int, str, np.ndarray]
-"""Number of a recording, its name, and the row numbers (T,) of a part of the recording."""
+"""Number and name of a recording, and the row numbers (T,) of a part of the recording."""
 
 
 class Segment(NamedTuple):
@@ -26,7 +26,7 @@ class Segment(NamedTuple):
         name: name of the recording.
         layout: columns of the file, with their units.
         rows: (T,) row numbers in the file, from 0.
-        values: (T, C) columns of the layout in SI units.
+        values: (T, C) values of the C columns of the layout, in SI units.
     """
 
     recording: int

@@ -45,12 +45,8 @@ UNITS = {
     "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
-BARE = {
-    "s",
-    "n",
-    "a",
-    "m",
-}  # Letters that are units only in brackets: without brackets they may be part of a name.
+# Letters that are units only in brackets: without brackets they may be part of a name.
+BARE = {"s", "n", "a", "m"}
 CURRENT = {"current", "currents", "curr", "cur"}
 
 

@@ -34,8 +34,8 @@ class Layout:
 
     Attributes:
         file: path of the log, for errors and trajectories.
-        columns: names of the columns of t, then of q, qd and tau for each joint; without qd if velocities are
-            differentiated, and with u instead of qd and tau for logs of commands.
+        columns: names of the columns of t, of q of all joints, of qd of all joints, and of tau of all joints; without
+            qd if velocities are differentiated, and with u instead of qd and tau for logs of commands.
         labels: column with the names of recordings; None if the table has none.
         joints: names of the joints in the URDF.
         mapping: mapping of the columns, with units, signs and offsets.
@@ -69,7 +69,7 @@ class LogFormat(NamedTuple):
     """Format of logs: its files, and its reader.
 
     Attributes:
-        read: function of a path, the joint names and the mapping that returns tables, or raises LogError.
+        read: reader (path, joint names, mapping) -> tables of a log; it raises LogError for a damaged log.
         suffixes: suffixes of files in this format.
         columns: function that returns all columns of a file, for a draft of a mapping; None if the format itself
             defines the columns.

@@ -22,7 +22,7 @@ Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 
 
 def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows: Rows) -> np.ndarray:
-    """Return the columns of a layout as numbers (T, C) in SI units.
+    """Return the C columns of a layout as numbers (T, C) in SI units.
 
     Absent values are NaN in rows of another topic or publisher (see `foreign_rows`), and in logs whose signals are in
     separate rows (see `is_split`). Raises LogError, with row and column, for values that are absent elsewhere, that are
