@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, URDF, observed, share, thousandths
 from spelgen.listing import Listing, number
 
-if TYPE_CHECKING:  # `spelgen --help` lists the figures; an import at run time would load torch
+# `spelgen --help` imports this module for LIMITS. An import of the measurements would also load torch.
+if TYPE_CHECKING:
     from spelgen.evaluation.measurements import Measurements
 
 OBSERVER = (
@@ -52,7 +53,7 @@ class Row:
 class Table:
     """Table with a row per quantity and a column per predictor or model.
 
-    title: explains the numbers. note: explains the rows.
+    title: title that states the quantity and unit of the numbers. note: explanation of the rows, "" if not needed.
     """
 
     title: str
@@ -132,7 +133,10 @@ def csv_text(results: Measurements) -> str:
 
 
 def summary(results: Measurements) -> Listing | None:
-    """Return the figures of URDF, least squares and model in one small table; None without torques."""
+    """Return a small table that compares the URDF, least squares and the model; None without torque errors.
+
+    Its rows are the unexplained fraction of the torque variance and, if the true M is known, the error of M.
+    """
     if MODEL not in results.torque:
         return None
     errors = {name: x.mean_nmse for name, x in results.torque.items()}
@@ -198,7 +202,7 @@ def _replay_tables(results: Measurements) -> list[Table]:
         rows: dict[str, Numbers] = {}
         for log in replay.errors[MODEL].trajectories:
             rows[log] = {name: 1000 * errors.trajectories[log] for name, errors in replay.errors.items()}
-        # The mean is the last row, as a sum is written below its terms.
+        # The mean of all logs is the last row of the table.
         rows["mean of all"] = {name: 1000 * errors.mean for name, errors in replay.errors.items()}
         joints = {name: [1000 * rms for rms in errors.joints] for name, errors in replay.errors.items()}
         title = f"Commands replayed, {replay.name}: RMS"
@@ -234,8 +238,8 @@ def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | Non
 class Figure:
     """One of the few figures that summarise an evaluation.
 
-    unit: a unit; or "variance", for a fraction of the variance of the torque; or "motion", for a fraction of the RMS
-    change of q and qd over the horizon.
+    unit: unit of the value. The value of unit "variance" is a fraction of the variance of the torque; the value of unit
+    "motion" is a fraction of the RMS change of q and qd over the horizon.
     """
 
     name: str

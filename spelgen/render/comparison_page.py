@@ -73,7 +73,8 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
     if examples:
         prediction = trajectory_panels(examples, styles, named_joints(arm.joint_names, arm.joint_types))
         learned = {name: figures.mass for name, figures in first.items() if figures.mass is not None}
-        # All presets have the same test logs, so the examples have the same measured motion: any of them will do.
+        # All presets are evaluated on the same test logs, so the measured motion of the first example is the motion of
+        # every example.
         along = next(iter(examples.values()))
         true = true_mass(truth, torch.from_numpy(along.q), arm.joint_names).numpy()
         # Only the lower triangle is shown, since M is symmetric.
