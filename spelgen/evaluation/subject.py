@@ -124,7 +124,7 @@ def read_test_logs(
 
     Args:
         folder: Run folder.
-        paths: Log files, and folders with log files. If a folder contains files named test.*, only these are read.
+        paths: Log files, and folders with log files. If a folder contains files test.*, its other files are ignored.
         mapping: Mapping of the log columns; None: the mapping of the training logs.
     """
     run = RunFolder(folder)

@@ -212,7 +212,8 @@ def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Traj
     # The grid is finer near zero, where the sign of friction changes.
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)
     speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n): 81 speeds of each joint
-    alone = torch.diag_embed(speeds)  # (81, n, n): `alone[k, j]` is a velocity at which only joint j moves.
+    # (81, n, n): entry [k, j] is a velocity vector at which only joint j moves.
+    alone = torch.diag_embed(speeds)
     positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)
     curves = {}
     for name, predictor in dynamics.items():

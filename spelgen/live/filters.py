@@ -244,8 +244,8 @@ class PayloadEstimate:
     def step(self) -> None:
         """Process the next updates of the current block.
 
-        It is called at each sample, and processes so many updates that all are finished before the next block is
-        complete.
+        It is called at each sample. The number of updates per call is chosen so that all updates are finished before
+        the next block is complete.
         """
         self.samples += 1
         for _ in range(self.per_sample):

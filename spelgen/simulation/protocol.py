@@ -53,7 +53,7 @@ def sample_times(simulation: SimulationSettings) -> np.ndarray:
 def make_friction(arm: Chain, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
     """Return the friction of the drives.
 
-    The friction of a joint is specified by its settings or, if these have none, by <dynamics> in the URDF.
+    The friction of a joint is specified by its settings or, if the settings have none, by <dynamics> in the URDF.
 
     Args:
         arm: The arm.
