@@ -40,10 +40,13 @@ LinearServoRecord = Mapping[str, Any]
 class EvaluatedArm:
     """The information about an arm under torques that baselines may use.
 
-    joints: names of the joints in the order of q. urdf: path of the URDF, None if unknown. fitted: baselines fitted to
-    the training logs. fitted_arm: arm for which these baselines were fitted; None without fitted baselines. probe:
-    windows from which the number of integrator steps is chosen. notes: list to which a baseline appends diagnostics,
-    for example the reason of its absence.
+    Attributes:
+        joints: Names of the joints in the order of q.
+        urdf: Path of the URDF; None if unknown.
+        fitted: Content of least_squares.json: baselines that were fitted to the training logs.
+        fitted_arm: Arm of the fitted baselines; None if there are none.
+        probe: Windows from which the number of integrator steps is chosen.
+        notes: List to which a baseline appends diagnostics, for example the reason why it is absent.
     """
 
     joints: Sequence[str]

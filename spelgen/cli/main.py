@@ -31,7 +31,7 @@ class Command(TyperCommand):
     """A command whose help shows arguments by name only, without the type that typer adds."""
 
     def get_help(self, ctx: Any) -> str:
-        """Return the help text."""
+        """Return the help text of the command."""
         # Typer would add the type, such as `PATH`, to arguments whose metavar states it already.
         for parameter in self.params:
             if isinstance(parameter, TyperArgument):

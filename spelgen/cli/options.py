@@ -189,7 +189,7 @@ class ArmOptions:
     angle_tolerance: float = ANGLE_TOLERANCE
 
     def load(self) -> Arm:
-        """Return the arm."""
+        """Return the arm that these options select."""
         from spelgen.arm.configured_arm import load_arm
 
         return load_arm(self.robot, names(self.joints), self.tip, self.angle_tolerance)

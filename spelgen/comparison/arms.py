@@ -129,7 +129,7 @@ def _is_file(preset: str) -> bool:
 
 
 def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Location, str, str]]:
-    """Yield location, error and advice for each unknown preset and for each absent file."""
+    """Yield (location in the YAML file, error, advice) for each unknown preset and for each absent file."""
     for number, preset in enumerate(comparison.presets or ()):
         if preset not in (*PRESET_NAMES, *ablation_designs()) and not _is_file(preset):
             yield ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)

@@ -1,7 +1,7 @@
 """Selection of the motions that charts show.
 
-Of all predicted windows, of all torque curves and of all replayed logs, the one of median error and the one of largest
-error are selected.
+Charts show two predicted windows, two torque curves and two replayed logs: in each case the motion of median error and
+the motion of largest error.
 """
 
 import math

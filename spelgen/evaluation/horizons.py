@@ -22,7 +22,10 @@ from spelgen.logs.windows import Windows, cut_windows, joined
 
 
 def past_steps(rate: float) -> int:
-    """Return the number of steps that the observer runs before a prediction, at a sample rate [Hz]."""
+    """Return the number of sample intervals before a prediction in which the momentum observer runs.
+
+    rate: sample rate [Hz].
+    """
     return max(1, round(TUNING.observed_past * rate))
 
 
@@ -131,10 +134,13 @@ class Horizon:
 class EvaluatedLogs:
     """Test logs, cut at gaps and filtered.
 
-    pieces: segments without gaps, from which windows are cut. samples: filtered torques and accelerations of the logs
-    whose sample rate is high enough to differentiate twice (see `dynamics_samples`). used: preprocessing (filter and
-    torque delay) of these logs. reach: break-away displacements of the K friction bristles of each joint, (n, K) [rad,
-    m].
+    Attributes:
+        pieces: Segments without gaps, from which windows are cut.
+        samples: Filtered torques and accelerations of the logs whose sample rate is high enough to differentiate
+            positions twice (see `dynamics_samples`).
+        used: Preprocessing of the logs: filter and torque delay.
+        reach: Break-away displacements of the K friction bristles of each joint, (n, K) [rad, m].
+        joint_types: Types of the joints.
     """
 
     pieces: Sequence[Trajectory]
@@ -229,7 +235,8 @@ def predict(
     windows = logs.windows(past + steps, window_count)
     ahead = without_past(windows, past)
     states = {}
-    # Both rollouts of a predictor start from the friction state at the end of the observer's steps.
+    # The open-loop rollout and the rollout with the observed disturbance start from the same friction state, the state
+    # at the end of the observer's steps.
     for predictor in predictors:
         if not past or not isinstance(predictor.solver, Solver):
             states[predictor.name] = predictor.solver(ahead)

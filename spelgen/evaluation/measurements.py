@@ -23,7 +23,8 @@ SCHEMA = 11
 class Verdict:
     """An assessment in words.
 
-    sentence: suitable uses, failures, and motions to record. because: figures that support the sentence.
+    sentence: suitable and unsuitable uses of the model, and motions to record next. because: errors and reasons that
+    support the sentence.
     """
 
     sentence: str

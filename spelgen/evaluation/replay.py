@@ -21,8 +21,8 @@ from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split
 class ReplayErrors:
     """Root mean square position errors of one predictor [rad, m].
 
-    trajectories: error per log, over time and joints. mean: mean of the errors of all logs. joints: error per joint
-    (n,), over time and all logs.
+    trajectories: {log: error over time and joints}. mean: mean of these errors. joints: error of each joint over time
+    and all logs, (n,).
     """
 
     trajectories: dict[str, float]

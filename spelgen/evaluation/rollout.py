@@ -119,10 +119,10 @@ def mass_error(learned: Tensor, true: Tensor) -> float:
 def mass_errors(
     dynamics: Mapping[str, RigidDynamics], truth: Arm | Path | str, joints: Sequence[str], q: Tensor
 ) -> dict[str, float]:
-    """Return the relative error of M of each predictor, at a subset of the test positions.
+    """Return {predictor: relative error of M [1]}, see `mass_error`, at a subset of the test positions.
 
     Args:
-        dynamics: The model and the baselines, by name.
+        dynamics: {name of the model or of a baseline: dynamics}.
         truth: The true arm, or the path of its URDF.
         joints: Names of the n joints.
         q: Positions (T, n) [rad; m] of the test logs.

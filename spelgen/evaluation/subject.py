@@ -84,7 +84,7 @@ class Subject:
         if self.spec is not None:
             depends = {*self.spec.potential, *(k for entry in self.spec.entries for k in entry[3])}
             for k, joint in enumerate(self.spec.joints):
-                # A joint with only one limit has no range.
+                # A joint with only one limit is treated as a joint without limits.
                 bound = None if joint.lower is None or joint.upper is None else (joint.lower, joint.upper)
                 limits.append(bound)
                 if k not in depends:
@@ -93,7 +93,7 @@ class Subject:
 
 
 def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = None) -> Subject:
-    """Return the subject of an evaluation.
+    """Return the model to be evaluated, with data about its fit.
 
     tested: a model, a fit or the folder of a run. arm: arm, or path of its URDF; None: the arm of the fit.
     """

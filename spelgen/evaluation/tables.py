@@ -42,7 +42,7 @@ class Row:
 
     @property
     def best(self) -> list[str]:
-        """Return the columns that contain the smallest number; [] if there is only one column."""
+        """Return the names of the columns with the smallest number; [] for a row of one column or without ranking."""
         if not self.ranked or len(self.values) < 2:
             return []
         smallest = min((value for value in self.values.values() if value is not None), default=None)
@@ -219,7 +219,11 @@ def _by_joint(
     errors: Mapping[str, Sequence[float | None]],
     note: str = "",
 ) -> Table:
-    """Return a table with a row for each joint; the unit is in the title if all joints have the same."""
+    """Return a table of the errors of all predictors, with one row per joint.
+
+    title: title with the placeholder {} for the unit. quantity: position, velocity or torque, for the unit. errors:
+    {predictor: errors of all joints}.
+    """
     units = [asdict(UNITS[joint_type])[quantity] for joint_type in results.joint_types]
     # If all joints have the same unit, it is in the title: a unit in each row would widen the first column.
     labels, common = results.joints, f" [{units[0]}]"
@@ -230,7 +234,7 @@ def _by_joint(
 
 
 def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | None]]) -> dict[str, Numbers]:
-    """Return a row per label with the errors of all predictors. errors: errors of all joints per predictor."""
+    """Return {label of a joint: {predictor: error}}. errors: {predictor: errors of all joints}."""
     return {label: {name: values[k] for name, values in errors.items()} for k, label in enumerate(labels)}
 
 

@@ -21,10 +21,15 @@ from spelgen.logs.trajectory import Trajectory, joined_column
 class TorqueErrors:
     """Errors of the inverse dynamics of one predictor on `dynamics_samples`.
 
-    The nMSE is the mean squared error divided by the variance of the torque. nmse: nMSE per trajectory, mean over
-    joints. All other errors are pooled over the samples of all trajectories, so that a short log has little weight.
-    joint_nmse: nMSE per joint, None for a joint of constant torque. rmse: RMS error per joint [Nm, N].
-    mean_nmse: mean nMSE over joints. nmse_with_pauses: mean nMSE over joints, pauses between motions included.
+    The nMSE is the mean squared error divided by the variance of the torque. All errors except `nmse` are computed from
+    the samples of all trajectories together, so that a short log has little weight.
+
+    Attributes:
+        nmse: {trajectory: mean nMSE over joints}.
+        joint_nmse: nMSE of each joint; None for a joint of constant torque.
+        rmse: RMS error of each joint [Nm, N].
+        mean_nmse: Mean nMSE over joints.
+        nmse_with_pauses: Mean nMSE over joints, with the samples of pauses between motions.
     """
 
     nmse: dict[str, float | None]

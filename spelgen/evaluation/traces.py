@@ -92,7 +92,16 @@ class FrictionTrace:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """All curves of an evaluation. coverage: ranges of motion in the test logs, see `logs.trajectory.coverage`."""
+    """All curves of an evaluation.
+
+    Attributes:
+        coverage: Ranges of motion in the test logs, see `logs.trajectory.coverage`.
+        growth: Growth of the prediction error over time.
+        trajectories: Predicted windows or replayed logs, of median and of largest error.
+        torques: Torques along logs, of median and of largest error.
+        mass: M of all predictors along a motion.
+        friction: Friction of all predictors over velocity.
+    """
 
     coverage: dict[str, object]
     growth: Growth | None = None

@@ -12,7 +12,7 @@ class EvaluationTuning:
     observed_past: float = 0.1
     # [s] 1 / K of the momentum observer; 0.02 to 0.1 s differ by 3 % on the UR10e of `benchmarks/arms.py`.
     observer_time_constant: float = 0.05
-    # [1] Largest number of windows per horizon, evenly spread.
+    # [1] Largest number of windows per horizon. The windows are evenly spread over the logs.
     most_windows: int = 1000
     # [1] Largest number of predicted steps per predictor and horizon. A horizon of k steps has this number / k windows,
     # but at least `fewest_windows`.

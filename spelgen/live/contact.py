@@ -80,8 +80,8 @@ class ContactObserver:
         largest = TUNING.outlier * self.levels.drift.disturbance
         disturbance = np.clip(disturbance, -largest, largest)
         if self.t is None:
-            # Start at a torque residual of zero. The steady state of the filters for constant inputs would show an
-            # external torque if the arm accelerates.
+            # The filters start in the states for which the torque residual is zero. In their steady state for constant
+            # inputs, the residual of an accelerating arm would not be zero.
             self.low = inputs.copy()
             self.low[0], self.low[1], self.low[5:] = rate * at.momentum, 0.0, rate * at.load_momentum.T
             self.baseline = disturbance
@@ -98,8 +98,8 @@ class ContactObserver:
             self.baseline = self.baseline + gain * (disturbance - self.baseline)
         self.t, self.inputs = t, inputs
         torque, friction, uncertainty, slow, fast = self.low[:5]
-        # Filtered regressor of the payload, (n, 10). Its product with the inertial parameters of the payload is the
-        # contribution of the payload to the residual.
+        # `regressor` is the filtered regressor of the payload, (n, 10). Its product with the inertial parameters of the
+        # payload is the torque of the payload in the residual.
         regressor = rate * at.load_momentum - self.low[5:].T
         signal = (
             torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline

@@ -1,9 +1,14 @@
 """Kalman filters of the momentum balance, averaged over blocks of time: y = Phi theta + f a + b + d + w per joint.
 
-y: torque residual of the model. Phi, theta (10): regressor and inertial parameters of the payload, which is constant.
-f, a (n): friction of the model, and friction scale minus one, which is a random walk. b (n): torque offset, constant.
-d (n): disturbance, an Ornstein-Uhlenbeck process. w: white noise. The rows of a block are processed one after the
-other, so that a control loop can distribute them over its samples.
+- y: measured torque residual of the model.
+- Phi, theta: regressor and constant inertial parameters of the payload, (10,) each.
+- f, a: friction torque of the model, and friction scale minus one; a is a random walk.
+- b: constant torque offset.
+- d: disturbance, an Ornstein-Uhlenbeck process.
+- w: white noise.
+
+The equations of the joints are processed one after the other, so that a control loop can distribute them over its
+samples.
 """
 
 from __future__ import annotations
@@ -114,7 +119,7 @@ class LoadFilter:
         self.P[:10, :10] = np.diag(TUNING.load_prior**2)
 
     def predict(self, duration: float) -> None:
-        """Predict the state after a time [s]."""
+        """Replace the state and its covariance by their predictions for a time later by `duration` [s]."""
         decay, growth = np.ones_like(self.x), np.zeros_like(self.x)
         decay[10 + 2 * self.n :] = np.exp(-duration / self.noise.time_constant)
         growth[10 : 10 + self.n] = TUNING.friction_walk * duration

@@ -20,9 +20,13 @@ IGNORED: tuple[Refusal, ...] = ("not finite", "repeated", "reversed", "jump")
 class Intake:
     """Checks of samples one after the other, and bounds of the friction state.
 
-    counts: number of samples for each result of the check. low, high: bounds of the friction state, (n, K) [rad, m].
-    The initial bounds are minus and plus the break-away displacements. Motion of a joint makes both bounds equal: the
-    friction state of the joint is then known.
+    The initial bounds of the friction state are minus and plus the break-away displacements. After a sufficient motion
+    of a joint both bounds are equal, and its friction state is known.
+
+    Attributes:
+        counts: {result of the check: number of samples}.
+        low: Lower bound of the friction state of each of K bristles, (n, K) [rad, m].
+        high: Upper bound, (n, K) [rad, m].
     """
 
     def __init__(self, levels: NoiseLevels, bristles: BristleReach) -> None:

@@ -65,7 +65,11 @@ def stored_levels(fit: Fit) -> NoiseLevels | None:
 
 
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
-    """Return the noise levels by cross-validation: each fold of the logs is held out of a fit."""
+    """Return the noise levels of a fit, estimated by cross-validation.
+
+    For each fold of the logs a model is fitted to the other folds, and the noise is estimated from its residual on this
+    fold.
+    """
     logs, count = list(fit.logs), TUNING.folds
     if len(logs) == 1:
         # A single log is divided into parts, so that a part can be held out.
@@ -91,11 +95,11 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
 
 
 def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
-    """Return a new model of the same kind as the model of a fit, fitted to other logs from the initial parameters.
+    """Return a new model with the specification of the model of a fit, fitted to other logs.
 
-    The new model is used to estimate the error on held-out logs. For that purpose a subset of the samples suffices, at
-    most ``max_samples``. Residual terms are selected only if the model of the fit has some. Raises LogError for too
-    little motion.
+    The new model is used to estimate the error on held-out logs. For this, at most ``TUNING.max_samples`` samples of
+    the other logs suffice. Residual terms are selected only if the model of the fit has some. Raises LogError if the
+    logs have too little motion.
     """
     model = assemble(required_spec(fit.model)).double()
     if residual_terms(without_idle_residuals(fit.model)) is None:

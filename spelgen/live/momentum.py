@@ -45,9 +45,9 @@ class Balance(NamedTuple):
 
 
 def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the terms P and N of a payload, and the Jacobian of a point of the last body, (T, 3, n), in root axes.
+    """Return P and N, (T, n, 10) each, and the Jacobian of a point of the last body, (T, 3, n), in root axes.
 
-    P and N, (T, n, 10), are the momentum and the torque per inertial parameter of the payload in the momentum balance.
+    P is the generalised momentum and N the torque in the momentum balance, per inertial parameter of a payload.
 
     Args:
         chain: kinematics of the bodies.
@@ -58,7 +58,7 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
     # contains the whole homogeneous transform of each body.
     pose = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
     velocities, _, turning = chain.motion(pose, qd)
-    frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(-2, -3)  # (T, 1, 4, 4)
+    frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(-2, -3)  # (T, 1, 4, 4), last body
     velocity = velocities[..., -1, :]  # Time derivative of the frame of the last body, (T, 3, 4).
     axes, turned = (torch.unflatten(x.mT @ chain.motions, -1, (3, 4)) for x in (pose.axes, turning))
     # `jacobian` is the derivative of the frame of the last body with respect to q, and `rate` its time derivative,

@@ -90,7 +90,7 @@ class LiveTuning:
     # body at this distance from the origin.
     radius: float = 0.2
     distance: float = 0.05
-    # [kg] Masses of the prior means, of which the evidence is compared.
+    # [kg] Masses of the prior means of a payload. Each has the same prior probability.
     scales: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
     # [1] Limits of the log odds of "no payload" against a payload. A payload is reported if they are at most
     # `payload_odds`, and "no payload" if they are greater than `no_payload_odds`. Between these limits, the status is
@@ -109,8 +109,8 @@ class LiveTuning:
 
     # Constants of the estimation of noise levels (`live.levels`).
 
-    # [1] The logs are divided into `folds`, which are held out one at a time. A fit to the other folds needs at least
-    # `min_samples` samples of motion, and uses at most `max_samples`.
+    # [1] The logs are divided into `folds` parts, which are held out one at a time. A fit to the other parts needs at
+    # least `min_samples` samples of motion, and uses at most `max_samples`.
     folds: int = 3
     min_samples: int = 300
     max_samples: int = 2**11

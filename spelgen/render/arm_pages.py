@@ -84,7 +84,7 @@ def identification_page(identification: Identification, arm: Arm) -> str:
 def motion_page(excitation: Excitation, arm: Arm) -> str:
     """Return the page about a proposed motion of `arm`, including the approach to its first position."""
     motion = excitation.approach.then(excitation.motion)
-    # Charts subsample each line themselves. The animation does not, so it gets at most twice as many points as a line.
+    # Charts subsample their lines, but the animation does not subsample a motion, so it gets fewer points.
     step = -(-len(motion.t) // (2 * TUNING.points))  # The quotient is rounded up.
     t, q, qd = (x[::step] for x in (motion.t, motion.q, motion.qd))
     drawn = AnimatedMotion("motion", "approach and motion", t.round(3), q.round(4))
@@ -127,7 +127,7 @@ def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
     t, q = joined_column(segments, "t"), joined_column(segments, "q")
     position = [("logged", q, "truth")]
     rows = [JointRow("position", "position", "position", position)]
-    # Logs of position servos contain commands and no torques.
+    # Logs of position servos contain commands and no torques, so charts of velocity and torque are omitted.
     if log.u is not None:
         position.append(("commanded", joined_column(segments, "u"), "predicted"))
     else:

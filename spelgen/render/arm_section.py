@@ -26,7 +26,8 @@ from spelgen.templates import json_data
 class Cell:
     """Cell of the table of M, for one entry of M.
 
-    style: zero, constant or varying. joints: indices of the joints on whose positions the entry depends.
+    style: zero, constant or varying. text: short formula. joints: indices of the joints on whose positions the entry
+    depends. explanation: reason for the structure of the entry.
     """
 
     style: str
@@ -70,7 +71,7 @@ class AnimatedArm:
 
 
 def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
-    """Return all entries of M, (n, n) cells: each with the joints it depends on, the reason and a short formula."""
+    """Return the table of M: n rows of n cells, one cell per entry of M."""
     explanations = _explanations(arm, structure)
     cells = {}
     for entry in structure.entries:
@@ -86,7 +87,7 @@ def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
 
     The explanation states the joints that the entry depends on, the facts that mention the entry, and its formula.
     """
-    # `spelgen inspect` prints the same facts, so that pages and the terminal explain an entry equally.
+    # `spelgen inspect` prints the same facts, so that pages and the terminal give the same explanation of an entry.
     every_fact = facts(arm, structure)
     closed = {formula.name: formula for formula in formulas(arm, structure).rows}
     explanations = {}
@@ -112,7 +113,10 @@ def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
 
 
 def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) -> AnimatedArm:
-    """Return the animated arm with its motions; if there are none, with a motion through the joint ranges."""
+    """Return the animated picture of an arm with the given motions.
+
+    Without motions the arm moves through its joint ranges.
+    """
     shapes = scene(urdf, arm.joint_names)
     motions = motions or [_sweep(arm)]
     data = record(shapes) | {"motions": list(map(record, motions))}
@@ -140,7 +144,7 @@ def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
 
 
 def _colour(error: np.ndarray) -> np.ndarray:
-    """Return the positions on the colour scale, (T, n), for relative errors (T, n): 0 for no error, 1 for 0.5."""
+    """Return colour values (T, n) for relative errors (T, n): 0 for no error, 1 for an error of 0.5 or -0.5."""
     return np.asarray((np.abs(error) / 0.5).round(3))
 
 

@@ -35,7 +35,7 @@ class RenderTuning:
 
     # [1] Largest number of points of a line: on 400 pixels more points are not visible, and the page becomes larger.
     points: int = 300
-    # [1] Largest number of decades of a logarithmic axis, counted from its largest value.
+    # [1] Largest number of decades of a logarithmic axis. Values that are smaller by more decades are cut off.
     decades: float = 8.0
     # [1] Errors of baselines above this multiple of the model's largest error do not extend the axis of the prediction
     # errors: otherwise one diverged baseline would compress all other lines.
@@ -46,7 +46,7 @@ class RenderTuning:
     # [1] The axis of the friction chart ends at this quantile of the measured friction, so that outliers do not
     # extend it.
     bulk: float = 0.995
-    # [1] An entry of M below this fraction of the largest entry is treated as a rounding error of zero.
+    # [1] An entry of M below this fraction of the largest entry is treated as zero, with a rounding error.
     zero: float = 1e-9
     # [1] Largest number of faces of all links together, for pages below 1 MB.
     faces: int = 4000

@@ -87,12 +87,12 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
 def _losses(folders: Mapping[str, Path], styles: Mapping[str, str]) -> Chart:
     """Return the chart of the best validation loss of each preset over the training steps.
 
-    folders: preset -> run folder. styles: preset -> CSS class.
+    folders: {preset: run folder}. styles: {preset: CSS class}.
     """
     lines = []
     for name, style in styles.items():
         records = RunFolder(folders[name]).read_metrics()
-        # A preset whose run failed has no metrics.
+        # A preset whose run failed has no metrics, and so no line in the chart.
         if records:
             steps, losses = array([(record["step"], record["best"]) for record in records]).T
             lines.append(Line(name, steps, losses, style))

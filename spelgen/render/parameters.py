@@ -128,7 +128,7 @@ def _number(value: float) -> str:
 
 
 def _interval(parameter: Content) -> str:
-    """Return the value of a base parameter with its confidence interval, if it has one."""
+    """Return the value of a base parameter as text, with its confidence interval if it has one."""
     if parameter["deviation"] is None:
         return _number(parameter["value"])
     return Interval("", parameter["value"], parameter["deviation"]).text
@@ -163,7 +163,7 @@ def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None
 
 def _about_center(body: np.ndarray) -> tuple[str, str, str]:
     """Return mass, centre of mass and principal moments about the centre as text. body: inertial parameters (10,)."""
-    # A body in a URDF may have no mass, and then has no centre of mass.
+    # A body in a URDF may have no mass. The cells of its centre of mass and principal moments are then empty.
     if body[0] <= 0:
         return f"{body[0]:.4g}", "", ""
     mass, center, tensor = about_center(body)
@@ -175,7 +175,10 @@ def _listed(values: np.ndarray) -> str:
 
 
 def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) -> Listing:
-    """Return the table of armature, friction and torque offset of each joint of a model, with 95 % intervals."""
+    """Return the table of armature, friction and torque offset of each joint of a model.
+
+    The values have 95 % intervals if there is a posterior.
+    """
     units = [UNITS[joint_type] for joint_type in model.joint_types]
     torques = [unit.torque for unit in units]
     dampings = [f"{unit.torque} s/{unit.position}" for unit in units]

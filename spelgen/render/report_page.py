@@ -37,7 +37,8 @@ def write_report(
 
     Args:
         folder: Run folder.
-        output: File of the page, report.html in the run folder by default; .json writes the data of the page.
+        output: File of the page; default: report.html in the run folder. A file with the suffix .json gets the data
+            of the page instead.
         robot: URDF with its meshes, for the picture of the arm; default: the URDF in the run folder.
 
     Raises:
@@ -182,7 +183,7 @@ def _verdict(runs: Mapping[str, Results]) -> str:
         if len(of_runs) == len(runs):
             _, name, text = min(of_runs)
             smallest.setdefault(name, []).append(text)
-    # Runs without a common figure, for example with other horizons, cannot be ranked.
+    # Runs that have no error in common, for example runs with different horizons, cannot be compared.
     if not smallest:
         return "These runs have no common horizons or logs."
     sentences = [f"{name} has the smallest {listed(labels)}." for name, labels in smallest.items()]

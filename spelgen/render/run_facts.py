@@ -149,7 +149,7 @@ def training_facts(run: Run, record: Record) -> dict[str, str]:
         "windows": f"{record.training_windows:,} for training, {record.validation_windows:,} for validation",
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
-    # Least squares uses only samples with accelerations, so their number may be smaller than for the model.
+    # Least squares uses only samples with accelerations, so it may use fewer samples than the fit of the model.
     if "samples" in run.baselines:
         count = f"{run.baselines['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"

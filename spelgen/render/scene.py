@@ -30,9 +30,19 @@ if TYPE_CHECKING:
 class SceneLink:
     """A link and its motion relative to its parent.
 
-    rotation (3, 3) and position (3,) [m] are the pose of the joint frame in the parent's frame. The link rotates about
-    axis (3,) in the joint frame by ratio * q[joint] + offset [rad]; if `slides`, it moves along the axis by this
-    distance [m]. parent: index of the parent link, -1 for the root. joint: index of the joint, -1 for a fixed link.
+    The displacement of the joint is ratio * q[joint] + offset [rad, m].
+
+    Attributes:
+        name: Name of the link.
+        parent: Index of the parent link; -1 for the root.
+        rotation: Rotation from the joint frame to the parent's frame, (3, 3).
+        position: Origin of the joint frame in the parent's frame, (3,) [m].
+        axis: Joint axis in the joint frame, (3,).
+        slides: Whether the link moves along the axis; otherwise it rotates about the axis.
+        joint: Index of the joint in q; -1 for a link that does not move relative to its parent.
+        ratio: Displacement per displacement of q[joint].
+        offset: Displacement for q[joint] = 0 [rad, m].
+        shape: Triangles of the link.
     """
 
     name: str
@@ -114,8 +124,8 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
     """Return the names of the drawn links, parents first.
 
-    Drawn are the links from the root to each of the `joints`, all links that move with the joints, and links that are
-    fixed to another drawn link.
+    The drawn links are the links from the root to each of the `joints`, all links that move with the joints, and links
+    that are fixed to another drawn link.
     """
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
     carried: set[str] = set()

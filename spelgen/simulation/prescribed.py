@@ -79,7 +79,7 @@ def prescribed(
         settings: `simulation` and `tracking` are used.
         drives: Input matrix and couplings of motors; None: each motor moves its own joint.
         motions: Positions with two derivatives, (T, n) each; if empty, the motions of `tracking.paths`.
-        progress: Called with (recordings done, all) after each recording.
+        progress: Function called after each recording with the number of finished and the number of all recordings.
     """
     protocol = settings.simulation
     passive = [joint.name for joint in arm.coordinates if joint.passive]

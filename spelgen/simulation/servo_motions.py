@@ -29,7 +29,7 @@ def servo_motions(
         arm: The arm.
         settings: `simulation` and `joints` are used.
         drives: Not used: each servo moves its own joint.
-        progress: Called with (trajectories done, all) after each trajectory.
+        progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     protocol = settings.simulation
     lowest, highest = initial_range(arm, settings)

@@ -44,7 +44,7 @@ def random_inputs(
         settings: `simulation` and `joints` are used.
         drives: Matrices of coupled motors: inputs are motor torques tau, the joint torques are G tau, and friction acts
             on the motors. None: each motor moves its own joint.
-        progress: Called with (trajectories done, all) after each trajectory.
+        progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     protocol = settings.simulation
     dynamics = arm_dynamics(arm, settings, make_friction(arm, settings, drives and drives.speeds))
@@ -102,7 +102,7 @@ def simulate(
             trajectory, at its end.
         seed: Seed of all random numbers.
         motions: Motions that the arm performs exactly, (T, n) each; they replace the protocol of the settings.
-        progress: Called with (trajectories done, all) after each trajectory.
+        progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     arguments = {
         "trajectories": trajectories, "duration": duration, "sample_rate": sample_rate,

@@ -68,7 +68,7 @@ def track(
         arm: The arm.
         settings: `simulation`, `tracking` and `joints` are used.
         drives: Input matrix and couplings of motors; None: each motor moves its own joint.
-        progress: Called with (trajectories done, all) after each trajectory.
+        progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     protocol = settings.simulation
     friction = make_friction(arm, settings, drives and drives.speeds)
