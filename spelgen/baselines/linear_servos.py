@@ -30,7 +30,7 @@ class LinearServos:
         damping: Damping ratio of each joint, (n,) [1].
         delay: Delay of the command of each joint, (n,) [s].
         offset: Offset of the position of each joint, (n,) [rad, m].
-        late: Delay of the other baseline, `DelayedCommand`, [s]; it is stored here because both are fitted together.
+        late: Delay of the other baseline, `DelayedCommand`, which is the same for all joints [s].
     """
 
     frequency: Sequence[float]

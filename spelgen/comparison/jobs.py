@@ -129,7 +129,7 @@ class Job(Group):
         return result if result.key == self.key else None
 
     def config(self, model: ArmModel) -> FitConfig | FitOptions:
-        """Return the options of the fit: one configuration for all simulated logs, or the user's options for logs."""
+        """Return the configuration of the fit: the same for all models of a simulated arm, else from the settings."""
         if self.inputs.truth is not None:
             return self.equal_steps()
         objective = self.training.objective
@@ -141,7 +141,7 @@ class Job(Group):
     def equal_steps(self) -> Rollout:
         """Return the configuration of a rollout fit to simulated logs.
 
-        All models of a comparison take the same number of training steps, and no parameter has a prior from the URDF.
+        All models of a comparison take the same number of training steps, without regularization towards the URDF.
         """
         epochs, decay = -(-self.protocol.steps // WINDOWS.epoch_steps), self.protocol.weight_decay
         options = self.training.options | {"urdf_weight": 0.0, "epochs": epochs, "patience": epochs}

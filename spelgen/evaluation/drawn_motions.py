@@ -144,8 +144,8 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
     The middle is used because logs begin and end at rest.
     """
     motions = []
-    # The accelerations of a log of low sample rate cannot be computed by a filter. For such a log the means of
-    # acceleration and torque over each sample interval are shown.
+    # A log of low sample rate does not show the acceleration at a sample. For such a log, the mean acceleration and the
+    # mean torque of each sample interval are shown.
     slow = [piece for piece in logs.pieces if not shows_accelerations(piece.sample_rate)]
     for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)

@@ -30,7 +30,7 @@ def past_steps(rate: float) -> int:
 
 
 def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor]:
-    """Estimate a constant disturbance torque from the first `past` steps of W windows, without accelerations.
+    """Estimate a constant disturbance torque from the first `past` steps of W windows by a momentum observer.
 
         r(t) = K (p(t) - p(0) - integral from 0 to t of (G tau + C^T qd - g - friction + r)),    r(0) = 0
 
@@ -172,7 +172,7 @@ class EvaluatedLogs:
         return [(piece, k) for piece in self.pieces for k in range(0, len(piece) - span, stride)]
 
     def windows(self, span: int, window_count: int) -> Windows:
-        """Return about `window_count` windows of `span` steps, or of the longest piece if it has fewer steps."""
+        """Return about `window_count` windows of `span` steps; if no piece has `span` steps, windows are shorter."""
         span = min(span, self.longest)
         stride, measured = self.stride(span, window_count), self.used.filtered
         return cut_windows(self.pieces, span + 1, stride, measured=measured, reach=self.reach)

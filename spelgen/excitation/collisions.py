@@ -116,8 +116,8 @@ class Collisions:
         """Return the first contact of a motion; None if there is none.
 
         Distances are computed at selected positions of the motion. From one selected position to the next, a distance
-        changes by at most 1.5 times the clearance. Between both it is therefore at most 0.75 times the clearance
-        smaller than at one of them, so no objects touch during a motion without a contact.
+        changes by at most 1.5 times the clearance, so it differs by at most 0.75 times the clearance from its value at
+        the nearer of both. Therefore no objects touch if all computed distances are at least the clearance.
         """
         lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
         path = np.concatenate([[0.0], np.cumsum(lengths)])

@@ -119,7 +119,7 @@ class LoadFilter:
         self.P[:10, :10] = np.diag(TUNING.load_prior**2)
 
     def predict(self, duration: float) -> None:
-        """Replace the state and its covariance by their predictions for a time later by `duration` [s]."""
+        """Replace the state and its covariance by their prediction after a time `duration` [s]."""
         decay, growth = np.ones_like(self.x), np.zeros_like(self.x)
         decay[10 + 2 * self.n :] = np.exp(-duration / self.noise.time_constant)
         growth[10 : 10 + self.n] = TUNING.friction_walk * duration

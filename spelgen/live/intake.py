@@ -43,8 +43,8 @@ class Intake:
         Return "used", or the reason why the sample is refused or only partly used. t: time [s]. q, qd, tau: (n,) each.
         """
         refusal = self._check(t, q, qd, tau)
-        # After several consecutive refused samples the clock or the positions have changed permanently, so the checks
-        # restart with the current sample.
+        # After `TUNING.restart` consecutive samples with such a refusal, a permanent change of the clock or of the
+        # positions is assumed, and the checks restart with the current sample.
         self.ignored += refusal in ("reversed", "jump")
         restarts = self.ignored >= TUNING.restart
         if refusal == "gap" or restarts or self.t == -np.inf:

@@ -267,12 +267,14 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
 
 
 def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
-    """Return the exponential tail of the peaks of all logs, multiplied by a factor for the differences between logs.
+    """Return the exponential tail of the peaks of all logs, as fields of `NoiseLevels`.
 
-    The factor is determined by cross-validation: thresholds from all other logs, multiplied by the factor, give at most
-    the number of alarms in the held-out logs that the default rate of false alarms allows. The factor is the same for
-    all joints, because the joint that needs the largest factor differs between logs. peaks: peaks of each log in W time
-    windows, (W, n) [1].
+    The peaks are multiplied by a factor for the differences between logs, determined by cross-validation: for each log,
+    thresholds are computed from all other logs. With the factor on these thresholds, all held-out logs together have no
+    more alarms than the default rate of false alarms allows. The factor is the same for all joints, because the joint
+    that needs the largest factor differs between logs.
+
+    peaks: peaks of each log in W time windows, (W, n) [1].
     """
     excess: list[float] = []
     for k, peaks_of_log in enumerate(peaks):

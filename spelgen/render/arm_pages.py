@@ -84,7 +84,7 @@ def identification_page(identification: Identification, arm: Arm) -> str:
 def motion_page(excitation: Excitation, arm: Arm) -> str:
     """Return the page about a proposed motion of `arm`, including the approach to its first position."""
     motion = excitation.approach.then(excitation.motion)
-    # Charts subsample their lines, but the animation does not subsample a motion, so it gets fewer points.
+    # Charts subsample their lines, but the animation shows every point. Therefore the motion is subsampled here.
     step = -(-len(motion.t) // (2 * TUNING.points))  # The quotient is rounded up.
     t, q, qd = (x[::step] for x in (motion.t, motion.q, motion.qd))
     drawn = AnimatedMotion("motion", "approach and motion", t.round(3), q.round(4))

@@ -26,8 +26,11 @@ from spelgen.templates import json_data
 class Cell:
     """Cell of the table of M, for one entry of M.
 
-    style: zero, constant or varying. text: short formula. joints: indices of the joints on whose positions the entry
-    depends. explanation: reason for the structure of the entry.
+    Attributes:
+        style: "zero", "constant" or "varying".
+        text: "0" for a zero entry, "C" for a constant entry, otherwise the joints on which the entry depends.
+        joints: Indices of the joints on whose positions the entry depends.
+        explanation: Reason for the structure of the entry, and its formula.
     """
 
     style: str
@@ -45,7 +48,7 @@ class AnimatedMotion:
         label: Text in the list of motions.
         t: Times, (T,) [s].
         q: Joint positions, (T, n) [rad, m].
-        error: Positions on the colour scale of the links, (T, n); None: the links have no error colours.
+        error: Colour values of the links, (T, n), see `_colour`; None: the links have no error colours.
         predicted: Predicted joint positions, (T, n) [rad, m], drawn as a second arm; None: no second arm.
     """
 

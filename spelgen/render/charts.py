@@ -46,7 +46,7 @@ class RenderTuning:
     # [1] The axis of the friction chart ends at this quantile of the measured friction, so that outliers do not
     # extend it.
     bulk: float = 0.995
-    # [1] An entry of M below this fraction of the largest entry is treated as zero, with a rounding error.
+    # [1] An entry of M below this fraction of the largest entry is treated as zero: it is a rounding error.
     zero: float = 1e-9
     # [1] Largest number of faces of all links together, for pages below 1 MB.
     faces: int = 4000

@@ -185,8 +185,8 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
     columns = {"joint": list(model.joint_names)}
     note = "Viscous and Coulomb friction are fitted to the model's friction law."
     if posterior is not None:
-        # The posterior contains friction parameters and their intervals. Without a posterior, viscous and Coulomb
-        # friction are fitted to the friction torque of the model below.
+        # The posterior contains friction parameters and their intervals. Without a posterior, `nearest_friction` fits
+        # viscous and Coulomb friction to the friction torque of the model.
         columns |= posterior.drive_columns
         note += " Intervals are of 95 %."
     else:
@@ -196,7 +196,8 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
         joints = arm.chain.coordinates
         if posterior is None:
             friction = nearest_friction(arm.chain, model, sampled_positions(arm.chain))
-            # A model of position servos has no viscous friction of its own: the damping gain of the servo includes it.
+            # A model of position servos has no column of viscous friction, because the damping gain of the servo
+            # includes it.
             if not parameters_of_kind(model, "damping"):
                 columns["viscous"] = _with_units(friction.viscous, dampings)
             columns["coulomb"] = _with_units(friction.coulomb, torques)

@@ -81,7 +81,7 @@ class Run:
         if self.model is None or self.config is None or not self.folder.checkpoint.is_file():
             return None
         content = self.folder.load_checkpoint().posterior
-        # The delay is passed to the posterior, which shows it: the fit has shifted the logged torques by this time.
+        # The tables of the posterior state the torque delay, by which the fit has shifted the logged torques.
         delay = self.config.preprocessing.torque_delay or 0.0
         return None if content is None else posterior_of(self.model, content, delay, self.folder.checkpoint)
 
@@ -108,7 +108,7 @@ def head_numbers(run: Run) -> list[tuple[str, str]]:
     summary = None if run.config is None else servo_summary(run.config.servo)
     if summary is not None:
         numbers.append(summary.headline)
-    # The count excludes parameters of terms that the fit did not select.
+    # The number of parameters excludes residual terms that the fit did not select.
     elif run.model is not None:
         numbers.append((f"{used_parameter_count(run.model):,}", "trained parameters"))
     for last in run.metrics[-1:]:
