@@ -58,9 +58,8 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
     # contains the whole homogeneous transform of each body.
     pose = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
     velocities, _, turning = chain.motion(pose, qd)
-    frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(
-        -2, -3
-    )  # (T, 1, 4, 4): the last body
+    # `frame` is the homogeneous transform of the last body, (T, 1, 4, 4).
+    frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(-2, -3)
     velocity = velocities[..., -1, :]  # Time derivative of the frame of the last body, (T, 3, 4).
     axes, turned = (torch.unflatten(x.mT @ chain.motions, -1, (3, 4)) for x in (pose.axes, turning))
     # `jacobian` is the derivative of the frame of the last body with respect to q, and `rate` its time derivative,
