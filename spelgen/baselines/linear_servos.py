@@ -17,7 +17,10 @@ class DelayedCommand:
     about = "the commands themselves, after the delay by which they are nearest to the positions of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the delayed commands as predicted positions, see `CommandFollower.positions`."""
+        """Return the delayed commands as predicted positions, (K, n) [rad, m] per segment of K sample intervals.
+
+        parts, q, qd: see `CommandFollower.positions`.
+        """
         return [delayed_commands(log, rows, self.delay, 1)[:, 0] for log, rows in parts]
 
 
@@ -41,7 +44,10 @@ class LinearServos:
     about = "a linear second-order servo at each joint, fitted to windows of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the predicted positions, see `CommandFollower.positions`."""
+        """Return the predicted positions, (K, n) [rad, m] per segment of K sample intervals.
+
+        parts, q, qd: see `CommandFollower.positions`.
+        """
         frequency, damping, result = np.array(self.frequency), np.array(self.damping), []
         for start, speed, (log, rows) in zip(q, qd, parts, strict=True):
             # All sample intervals are replaced by their mean, so that one transition matrix serves for all intervals.
