@@ -74,7 +74,7 @@ def evaluate(
         note(diagnostic)
     forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
     options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
-    # Limits are tested after the result is printed, so that a script gets the figures in any case.
+    # Limits are tested after the result is printed, so that a script gets the errors also if one exceeds its limit.
     values = {figure.name: figure.value for figure in figures(results)}
     exceeded = []
     for name, limit_value in limits:

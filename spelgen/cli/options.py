@@ -105,7 +105,7 @@ def result_format() -> Declared:
 def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
     """Return the format of a result: `format`, else the format for the suffix of the output file, else text.
 
-    formats: formats of the command. Raises a usage error for a suffix of another format.
+    formats: formats of the command. Raises a usage error if the suffix belongs to none of these formats.
     """
     if format or output is None:
         return format or "text"

@@ -58,7 +58,7 @@ def train(
     request = Request(objective, read_assignments(assignments or []))
     if source is not None:
         if module is not None:
-            # With --from there is no argument MODULE, so the first argument is a log, too.
+            # With --from there is no argument MODULE, so the first argument is also a log.
             extra_logs = [module, *(extra_logs or [])]
         robot = robot or _urdf_of_run(source)
         request = _warm_start(request)

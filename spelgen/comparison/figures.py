@@ -129,7 +129,10 @@ def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, d
 
 
 def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
-    """Return windows that are evenly spread over the logs, about `TUNING.windows` at most."""
+    """Return windows that are evenly spread over the logs, about `TUNING.windows` at most.
+
+    A window contains `samples` samples: every `decimation`-th sample of a log.
+    """
     # The simulated controller changes its torque only at samples that are multiples of the decimation, so a window
     # starts at such a sample.
     starts = sum(max(0, len(log) - (samples - 1) * decimation) for log in logs)
@@ -142,8 +145,8 @@ def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> tuple[f
 
     The position error is the squared error of q, summed over joints and averaged over windows and samples; the error of
     a revolute position is the geodesic distance. The velocity error is computed from qd in the same way. The total is
-    the sum of both (eq. 8 of the paper). Units are rad, m and s. An error that is not finite is None. substeps:
-    integrator steps per sample.
+    the sum of the position and the velocity error (eq. 8 of the paper). Units are rad, m and s. An error that is not
+    finite is None. substeps: integrator steps per sample.
     """
     with torch.no_grad():
         q, qd = roll_out(model, windows, substeps)

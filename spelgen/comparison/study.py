@@ -50,7 +50,10 @@ class Study:
         return arms
 
     def announcement(self, parallel: int) -> str:
-        """Return the number of runs, and an estimate of the time of the unfinished ones."""
+        """Return a text with the number of runs, and the estimated duration of the unfinished runs.
+
+        parallel: number of runs at the same time.
+        """
         dimensions = zip(*((job.arm, job.design, job.seed, job.split) for job in self.jobs), strict=True)
         nouns = ("arm", "preset", "seed", "split")
         counts = [counted(len(set(values)), noun) for values, noun in zip(dimensions, nouns, strict=True)]

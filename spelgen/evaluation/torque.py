@@ -93,7 +93,7 @@ def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """Return the nMSE of each joint, (n,), for residual and torque (T, n); NaN for a joint of constant torque."""
     deviation = torque.std(axis=0)
     largest = np.abs(torque).max(axis=0, initial=0.0)
-    # A torque whose standard deviation is at the level of rounding errors counts as constant.
+    # A torque is treated as constant if its standard deviation is at the level of rounding errors.
     varies = deviation > LEAST_SQUARES.negligible * largest
     # A residual that is not finite gives an infinite nMSE, because NaN is reserved for joints of constant torque.
     squares = np.nan_to_num(np.square(residual).mean(axis=0), nan=np.inf, posinf=np.inf)

@@ -96,7 +96,7 @@ class Collisions:
 
     @property
     def statement(self) -> str:
-        """Text for users: which collisions are checked, and which are not."""
+        """Text for users that lists the pairs that are checked for collisions and the pairs that are not."""
         pairs = counted(self.pairs, "pair")
         clearance = f"approach included; all keep {1e3 * self.clearance:g} mm"
         text = f"Checked: {pairs} of links{self._surroundings}, {clearance}."
@@ -116,8 +116,9 @@ class Collisions:
         """Return the first contact of a motion; None if there is none.
 
         Distances are computed at selected positions of the motion. From one selected position to the next, a distance
-        changes by at most 1.5 times the clearance, so it differs by at most 0.75 times the clearance from its value at
-        the nearer of both. Therefore no objects touch if all computed distances are at least the clearance.
+        changes by at most 1.5 times the clearance. Between two selected positions it therefore differs by at most 0.75
+        times the clearance from its value at the nearer one, and is positive if all computed distances are at least
+        the clearance.
         """
         lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
         path = np.concatenate([[0.0], np.cumsum(lengths)])

@@ -70,7 +70,7 @@ class ExcitationTrajectory:
 
     Any real parameters (size,) give a valid motion, so the design needs no constraints. The parameters of a joint are:
 
-    - H sine and H cosine coefficients, which give the shape of the motion: its amplitude does not depend on them.
+    - H sine and H cosine coefficients. Only their ratios are used: they give the shape of the motion.
     - The offset of the motion within the position range.
     - The reduction of the amplitude, relative to the largest amplitude within the bounds.
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ExcitationTuning:
-    """Design of the motion that `spelgen excite` proposes."""
+    """Constants of the design of the motion that `spelgen excite` proposes."""
 
     # [1] Number of random motions. L-BFGS starts from the best one.
     starts: int = 40

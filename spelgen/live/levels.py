@@ -89,8 +89,8 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
         tested.append((fitted_to(fit, others), fold))
     levels = find_levels(tested, effort, point)
-    # Serialization rounds the numbers. The rounded numbers are returned, so that a later read of the run folder gives
-    # the same ones.
+    # Serialization rounds the numbers. The rounded numbers are returned, so that they are equal to the numbers that are
+    # later read from the run folder.
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
 
@@ -182,8 +182,9 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
     The factor is the mean normalised squared error of estimated payloads. The logs are without payload, so each
     estimated payload is an error. Each window of consecutive blocks gives one estimate (a trial), with two errors: the
     error of the mass, and the error of mass and first moments. A prior value is included in the mean, with the weight
-    of `prior_trials` trials. The factor is the largest mean of both errors and all lengths of windows: in longer
-    windows the normalised error may be larger, because the errors of the model are correlated over time.
+    of `prior_trials` trials. Means are computed for the two errors and for each length of windows, and the factor is
+    the largest mean: in longer windows the normalised error may be larger, because the errors of the model are
+    correlated over time.
     """
     factors = []
     for window in TUNING.trial_blocks:

@@ -62,7 +62,7 @@ def inspection_page(
 def identification_page(identification: Identification, arm: Arm) -> str:
     """Return the page about an identification: base parameters with intervals, the arm, and the torque residual."""
     record: Content = identification.to_dict()
-    # The page is made from the content of the JSON output, so that both agree.
+    # The page is made from the content of the JSON output, so that page and JSON agree.
     words = [parameter["determined"] for parameter in record["base_parameters"]]
     never = [name for name, visibility in record["identifiability"].items() if visibility == "never"]
     return render_page(

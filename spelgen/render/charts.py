@@ -109,7 +109,7 @@ class Line:
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
         """Return the SVG path of the segments between gaps; coordinates are rounded to tenths of a pixel."""
         x, y = _floats(self.x), _floats(self.y)
-        # Evenly spaced samples include the last one, so that the line ends at the last value.
+        # The samples are evenly spaced and include the last sample, so that the line ends at the last value.
         rows = np.linspace(0, len(x) - 1, min(len(x), TUNING.points)).round().astype(int)
         x, y = x[rows], y[rows]
         gaps = ~(np.isfinite(x) & np.isfinite(y))

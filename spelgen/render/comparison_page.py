@@ -27,7 +27,7 @@ STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 class SimulatedCurves:
     """Charts of a simulated arm: validation losses, predictions, and entries of M.
 
-    They show only the first run of each preset, as lines of several seeds would overlap.
+    The charts show only the first run of each preset, as lines of several seeds would overlap.
     """
 
     losses: Chart

@@ -317,8 +317,8 @@ class LogMapping(Group):
 
         `input` and `accept` are unchanged. The positions of a joint with a period have the period of one turn.
         """
-        # A file that spelgen writes may also contain positions that wrap around after one turn, so the joints with a
-        # period of positions have one in the new mapping, too.
+        # A file that spelgen writes may also contain positions that wrap around after one turn. Joints with a period of
+        # positions therefore have a period in the new mapping.
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 

@@ -210,7 +210,7 @@ def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) 
             # The content is checked again without the group, whose errors may have hidden errors of other groups.
             content.pop(group, None)
     update: dict[str, object] = {group: Unusable(group_errors) for group, group_errors in unusable.items()}
-    # `input` of the arm applies to the logs too, so that a settings file states it only once.
+    # `input` of the arm also applies to the logs, so that a settings file states it only once.
     if settings.input == "position" and "logs" not in unusable:
         update["logs"] = settings.logs.model_copy(update={"input": "position"})
     return settings.model_copy(update=update)

@@ -1,6 +1,6 @@
 """Read YAML files, validate each key, and report errors with their lines.
 
-Unsafe or ambiguous constructs are errors, too.
+Unsafe or ambiguous constructs of YAML are errors.
 """
 
 from collections.abc import Iterable, Mapping
