@@ -107,7 +107,7 @@ def fit_options(request: Request, defaults: TrainingSettings | None) -> FitOptio
         # In a warm start no torque fit precedes the rollout: it would discard the source run's parameters.
         settings["torque_first"] = False
     if objective is None and TIME_LIMIT in options:
-        # The logs determine the objective later, and some objectives have no time limit. For them the option would be an
-        # error, but as a default value it is ignored.
+        # The logs determine the objective later, and some objectives have no time limit. For these objectives an option
+        # would be an error, but a default value is ignored.
         settings[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return FitOptions(objective, options, settings)
