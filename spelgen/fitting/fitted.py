@@ -56,7 +56,7 @@ class Fit:
 
     @property
     def config(self) -> FitConfig:
-        """The configuration with all defaults set: the options that apply to the model."""
+        """The options of the fit that apply to the model, with all defaults set."""
         return self.record.config
 
     @property
@@ -95,7 +95,7 @@ class Fit:
 
     @property
     def result(self) -> str:
-        """Text with the nMSE of the fitted torques; for objectives other than torque, with the validation loss."""
+        """Text with the mean and worst nMSE of the fitted torques or, without a torque fit, the validation loss."""
         nmse = self.torque_nmse
         if not nmse:
             return f"validation loss {self.best_validation:.3g}"
@@ -112,7 +112,7 @@ class Fit:
 
     @property
     def substeps(self) -> int:
-        """Number of rk4 steps per sample interval that the model needs."""
+        """Number of rk4 steps per sample interval that makes the integration error of rollouts small."""
         return self.checkpoint.substeps
 
     @property
@@ -135,14 +135,14 @@ class Fit:
     @overload
     def predict(self, trajectory: Trajectory, *, std: Literal[True]) -> Uncertain: ...
     def predict(self, trajectory: Trajectory, *, std: bool = False) -> np.ndarray | Uncertain:
-        """Return joint torques (T, n) [Nm, N] of the model's inverse dynamics at the samples of a trajectory.
+        """Return the torques (T, n) [Nm, N] of the model's inverse dynamics at the samples of a trajectory.
 
-        The velocity is filtered as in the fit, and differentiated. The torque is NaN at a single sample between two
-        gaps in the sample times, since such a sample has no acceleration.
+        The acceleration is the derivative of the velocity, which is filtered as in the fit. The torque is NaN at a
+        single sample between two gaps in the sample times, since such a sample has no acceleration.
 
         Args:
             trajectory: trajectory of the arm.
-            std: return the torques with their standard deviations (see `Posterior.torque`).
+            std: if True, return the pair `Uncertain` of torques and standard deviations (see `Posterior.torque`).
         """
         reach = bristle_reach(self.model)
         tau, deviation = np.full_like(trajectory.q, np.nan), np.full_like(trajectory.q, np.nan)
@@ -151,7 +151,7 @@ class Fit:
             if stop - start < 2:
                 continue
             piece = trajectory[start:stop]
-            # The zero-phase filter needs a few samples for its transient.
+            # The zero-phase filter extends the signal at both ends, which requires more than three samples.
             if self.preprocessing.cutoff and len(piece) > 3:
                 piece = low_pass(piece, self.preprocessing.cutoff)
             # Accelerations are not logged, so they are the derivative of the filtered velocity.
@@ -204,12 +204,13 @@ class Fit:
         return run.path
 
     def _torque(self, *motion: np.ndarray | None) -> np.ndarray:
-        """Return the joint torques (T, n) [Nm, N] of the model's inverse dynamics.
+        """Return the torques (T, n) [Nm, N] of the model's inverse dynamics for arrays of motion.
 
-        motion: q, qd, qdd (T, n), and the friction state z and direction, None if unknown (see `DynamicsSamples`).
+        motion: q, qd, qdd, (T, n) each, then the friction state z and the direction of motion (see `DynamicsSamples`),
+        None if unknown.
         """
         like = next(self.model.parameters())
-        # Arrays are copied, since filters return negative strides, which torch does not accept.
+        # Filters return views with negative strides, which torch does not accept: these are copied.
         inputs = [torch.as_tensor(np.ascontiguousarray(x)).to(like) for x in motion if x is not None]
         with torch.no_grad():
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()
@@ -251,7 +252,7 @@ def load_run(folder: Path | str) -> Fit:
     run = RunFolder(folder)
     # The record is read first, so that a missing run is reported before its model is assembled.
     record = run.read_record()
-    # Gradients are disabled, because a loaded model is used for predictions, and derivatives would need memory.
+    # A loaded model is used for predictions only. With gradients enabled, each prediction would store its graph.
     return Fit(
         model=fitted_model(run).requires_grad_(False).eval(),
         history=run.read_metrics(),

@@ -23,8 +23,8 @@ class RunFolder:
     spec: specification of the model. urdf, settings: URDF and settings of the robot, if known. mapping: names and units
     of the columns of the logs, in the format of --mapping. config: record of the fit. metrics: one line per epoch.
     checkpoint: state from which the fit is resumed. weights: the best state_dict so far. evaluation: results of
-    `evaluate`. baseline: baselines fitted to the training logs, and the coverage of the training logs. estimator: noise
-    levels of the state estimator.
+    `evaluate`. baseline: least-squares baselines, and the coverage of the logs. estimator: noise levels of the state
+    estimator.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -52,8 +52,8 @@ class RunFolder:
     def start(self, spec: ModelSpec, urdf: Path | None, *, force: bool) -> None:
         """Make the folder, write the specification, and copy the URDF and the settings of the robot.
 
-        A folder contains a run if it contains config.json, which the caller writes last. Raises RunError if the folder
-        contains a run, unless ``force``.
+        Files of a previous run are removed. A folder contains a run if it contains config.json, which the caller writes
+        last. Raises RunError if the folder contains a run and ``force`` is False.
         """
         self.require_free(force=force)
         content = {self.spec: f"{spec.to_json()}\n".encode()}
@@ -62,8 +62,8 @@ class RunFolder:
             content[self.urdf] = urdf_bytes(urdf)  # a xacro file is expanded
         if urdf is not None and (settings := urdf.with_suffix(".yaml")).is_file():
             content[self.settings] = settings.read_bytes()
-        # config.json, the first of the files, is removed first. A folder without this file is not treated as a run if
-        # the removal is interrupted.
+        # config.json is the first attribute and is removed first: if the removal is interrupted, the folder is not
+        # treated as a run.
         for file in vars(self).values():
             if file != self.path:
                 remove(file)
