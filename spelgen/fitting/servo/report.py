@@ -33,7 +33,7 @@ RATIOS = {
 }
 """Label and unit of each ratio to kp.
 
-lag: kd / kp plus the delay. dry: mean dry friction in motion, divided by kp. static_error: dry plus half the dead zone."""
+lag: kd / kp plus the delay. dry: mean dry friction in motion / kp. static_error: dry plus half the dead zone."""
 ABOUT = (
     "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "
     "sum of kd and viscous friction, which such logs do not distinguish. lag: the sum of kd/kp and the delay, one "
