@@ -79,10 +79,11 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     A drive may add a torque that compensates friction after the torque was measured. The residual then decreases with
     velocity, which friction cannot explain. Criteria for a joint:
 
-    - The residual is regressed on velocity. The slope is negative and significant. - Before this, both are regressed on
-    position: in a motion that does not return to its first position, the torque of a spring is correlated with
-    velocity. - The torque of the regression line is a visible part of the measured torque: a delay of some milliseconds
-    between torque and motion causes a smaller negative slope.
+    - The residual is regressed on velocity. The slope is negative and significant.
+    - Before this, both are regressed on position: in a motion that does not return to its first position, the torque
+      of a spring is correlated with velocity.
+    - The torque of the regression line is a visible part of the measured torque: a delay of some milliseconds between
+      torque and motion causes a smaller negative slope.
 
     The drives of an arm are similar. If one of them is known to compensate friction, a negative slope of more than one
     standard deviation, without the regression on position, suffices for the others: their parameters may have absorbed
