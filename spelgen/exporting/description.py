@@ -97,8 +97,8 @@ class TrainedModel:
     constant residual terms of M. motors: C, (n, n), motor velocities = C qd. friction: the ``FrictionConstants`` of the
     runtime, as arrays. breakaway: (n, K) [rad, m], break-away displacements of K bristles per joint. inputs: G, (n, n),
     joint torques = G times motor torques. actuated: (n,), 0 for a passive joint, otherwise 1. torque_offset: (n,),
-    measured torque at zero torque. friction_compensation: (n,), torque divided by velocity that the drives add without
-    measuring it.
+    measured torque at zero torque. friction_compensation: (n,) [Nm s/rad, N s/m], coefficient of a torque proportional
+    to qd that the drives add without measuring it.
     """
 
     name: str

@@ -57,7 +57,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
 
 
 def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
-    """Return a symmetric matrix, (n, n), whose nonzero entries are those of R, with the given values (m, 1)."""
+    """Return the symmetric matrix (n, n) with the given values (m, 1) at the nonzero entries of R."""
     matrix = ca.SX(model.n, model.n)
     for k, (row, column) in enumerate(model.residuals.entries):
         matrix[row, column] = matrix[column, row] = values[k]

@@ -210,7 +210,7 @@ class Fit:
         None if unknown.
         """
         like = next(self.model.parameters())
-        # Filters return views with negative strides, which torch does not accept: these are copied.
+        # Filters return views with negative strides. They are copied, since torch does not accept them.
         inputs = [torch.as_tensor(np.ascontiguousarray(x)).to(like) for x in motion if x is not None]
         with torch.no_grad():
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()

@@ -1,4 +1,4 @@
-"""Result of a servo fit: parameters divided by kp, with 95 % intervals.
+"""Result of a servo fit: ratios of the parameters to kp, with 95 % intervals.
 
 The covariance is a jackknife over logs (see `jackknife_covariance`): errors that the model cannot represent are
 correlated over a whole log, so a log is one independent block. The interval of a parameter that the logs do not
@@ -126,7 +126,7 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
 
 
 def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
-    """Return {key of `RATIOS`: (n,)}, the servo and friction parameters of all joints divided by kp.
+    """Return {key of `RATIOS`: (n,)}, the ratios of servo and friction parameters to kp for all joints.
 
     Args:
         model: model with position servos.
