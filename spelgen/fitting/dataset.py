@@ -45,7 +45,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """The arguments of `fit`, with the configuration chosen and all logs in a list.
+    """The arguments of `fit`, with all defaults replaced by values.
 
     validation: fraction of the logs that is set aside for validation, or the validation trajectories. urdf: URDF file
     of the robot, None if unknown. began: start of the time limit, as a value of `time.monotonic` [s]. folder: run
@@ -187,7 +187,8 @@ class Validation:
         self.solver, self.prescribed = solver, substeps
         self.size = len(data.validation)
         self.scales = data.scales.to(device)
-        # Validation needs less memory per window than training, since no derivatives are computed.
+        # Validation batches are four times as large as training batches: no derivatives are computed, which saves
+        # memory.
         self.batches = data.validation.to(device).split(4 * batch)
         # The windows are evenly spread, so that the probe contains fast and slow motion.
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)

@@ -164,7 +164,7 @@ class Fit:
         return Uncertain(tau, deviation) if std else tau
 
     def score(self, logs: Trajectory | Sequence[Trajectory]) -> float:
-        """Return 1 - nMSE of the torque on the samples of ``logs`` in motion: 1 is perfect, 0 as good as a constant.
+        """Return 1 - nMSE of the torque on samples of ``logs`` in motion: 1: perfect, 0: as good as a constant torque.
 
         The score is the mean over trajectories of the mean over joints. Samples are selected and filtered by
         `dynamics_samples`. Raises LogError if no log is sampled densely enough for accelerations.

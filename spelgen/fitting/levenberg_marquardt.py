@@ -35,7 +35,7 @@ class NormalEquations(NamedTuple):
     descent: Tensor
 
     def step(self, damping: float | Tensor = 0.0) -> Tensor:
-        """Return the damped step (..., k); damping: one number, or (...), one per system of equations."""
+        """Return the damped steps (..., k). damping: a number for all systems of equations, or (...), one for each."""
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
         # Marquardt's scaling by diag H instead of Levenberg's identity: steps are independent of the parameters' units.
         diagonal = torch.diag_embed(self.curvature.diagonal(dim1=-2, dim2=-1))
@@ -43,7 +43,7 @@ class NormalEquations(NamedTuple):
         return result
 
     def predicted_decrease(self, step: Tensor) -> float:
-        """Return the decrease of the quadratic model of the cost after a step (k,): -g^T s - s^T H s / 2."""
+        """Return the decrease of the cost that its quadratic model predicts for a step s (k,): -g^T s - s^T H s / 2."""
         return float(step @ (self.descent - self.curvature @ step / 2))
 
 

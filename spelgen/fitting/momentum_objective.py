@@ -45,7 +45,7 @@ class MomentumObjective(Objective):
         self.notes: list[Diagnostic] = []
         self.epoch = self.step = self.best_epoch = 0
         minutes = self.config.max_minutes
-        self.allowed = math.inf if minutes is None else 60 * minutes  # [s]
+        self.allowed = math.inf if minutes is None else 60 * minutes  # time limit [s]
 
     def prepare(self) -> PreparedLogs:
         """Check, split and filter the logs, cut windows, and make the regularizer. Raises LogError."""

@@ -95,8 +95,9 @@ def _adaptive_step(
 def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequence[str]) -> Tensor:
     """Return predicted minus measured positions, (..., n) [rad, m]; for revolute joints wrapped to +-pi.
 
-    For a revolute joint, the wrapped difference is the geodesic distance of the two rotations on SO(3). The loss (eq.
-    8) of the paper whose model is the preset `spel` uses this distance; here it is computed without matrices.
+    For a revolute joint, the magnitude of the wrapped difference is the geodesic distance of the two rotations on
+    SO(3). The loss (eq. 8) of the paper whose model is the preset `spel` uses this distance; here it is computed
+    without matrices.
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured

@@ -73,7 +73,7 @@ class FittingTuning:
 
     # [1] Relative tolerance of a step.
     adaptive_rtol: float = 1e-7
-    # [rad, m, and momenta] Absolute tolerance of a step.
+    # [rad, m, Nm s, N s] Absolute tolerance of a step, for positions and momenta.
     adaptive_atol: float = 1e-9
 
     # Optimizers of networks (`fitting.optimizers`).

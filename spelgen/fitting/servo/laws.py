@@ -1,4 +1,4 @@
-"""Selection of the joints that have a dead zone, by the maximum posterior of each joint with and without one.
+"""Selection of the joints that have a dead zone: the posterior maxima with and without one are compared.
 
 Each joint is fitted twice, from initial parameters with and without a dead zone. The dead zone is kept if it lowers the
 joint's negative log posterior by more than significance^2 / 2. Load, delay and likelihood are fixed at their values in

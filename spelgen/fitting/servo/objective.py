@@ -41,7 +41,7 @@ OUTER_ITERATIONS = 3
 
 
 class ServoObjective(Objective):
-    """A fit to all logs, without validation logs; it can be resumed at the start of each outer iteration.
+    """The servo fit. It uses all logs, without validation, and can be resumed at the start of each outer iteration.
 
     A checkpoint contains the initial weights and the parameters at the start of each outer iteration. The load and the
     scale of the errors are recomputed from them.
@@ -104,7 +104,7 @@ class ServoObjective(Objective):
         return "finished"
 
     def _minimized(self, progress: TrainingProgress) -> ServoParameters:
-        """Return the parameters that minimize the cost of the current outer iteration."""
+        """Minimize the cost of the current outer iteration; return the parameters."""
         problem, number = self._problem, len(self._iterates)
         show = partial(_show_progress, progress, number)
         # The damping is smaller in the second and third outer iteration, which start near the minimum.

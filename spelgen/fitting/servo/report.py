@@ -98,7 +98,8 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # The step is the effect of the integration error. It is added to the covariance as one standard deviation.
+    # The step is an estimate of the integration error. It is added to the covariance as an error of one standard
+    # deviation.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
@@ -108,7 +109,7 @@ def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
 
 
 def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
-    """Return booleans (m,): whether the logs distinguish each of m parameters from all other parameters.
+    """Return a mask (m,), True for parameters that the logs distinguish from all other parameters.
 
     A parameter is distinguished if an upper bound of its variance inflation factor is below
     `ServoTuning.variance_inflation`. Example: dead zone and dry friction of a joint without gravity load are not

@@ -35,8 +35,8 @@ class ServoTuning:
     dead_zone: float = 0.02
     # [s] Prior standard deviation of the delay of the commands.
     delay: float = 0.1
-    # [1] Prior standard deviation of the log-Cholesky parameters of the bodies, along a direction; about 30 % of a
-    # length.
+    # [1] Prior standard deviation of the log-Cholesky parameters of the bodies, along a direction; 0.3 is about 30 % of
+    # a mass.
     bodies: float = 0.3
     # [1] Largest number of directions of the body parameters that are fitted: the directions with the largest effect on
     # gravity. Other directions remain at the prior mean.

@@ -1,4 +1,4 @@
-"""Windows of logs of commanded positions, and the load on the drives by the arm's bodies along a motion.
+"""Windows of logs of commanded positions, and the load of the arm's bodies on the drives along a motion.
 
 The load is evaluated at measured instead of predicted positions, so that a fit can integrate each joint independently.
 The error is small: measured and predicted positions differ by about 0.01 rad, which changes the load by about 1 %.
@@ -136,7 +136,7 @@ def servo_windows(
 
 
 class BodyLoad(NamedTuple):
-    """The load on the drives by the bodies, at the midpoints between the samples of windows.
+    """The load of the bodies on the drives, at the midpoints between the samples of windows.
 
     inertia: (W, K-1, n), diagonal of M without armature [kg m^2, kg]. bias: (W, K-1, n) [Nm, N], Coriolis, centrifugal
     and gravity torque, plus the inertial torque of the off-diagonal entries of M. gravity: (W, K-1, n), gravity torque

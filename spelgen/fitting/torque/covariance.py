@@ -50,8 +50,8 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
     For 47 arms of `benchmarks/truth.py`, the 95 % intervals contain 97 % of the base parameters and 95 % of g(q). The
     intervals of the posterior covariance contain only 93 % and 89 %.
 
-    No fit is repeated for the held-out residual of a block. It is residual - J step, with the Jacobian J of the block
-    and the Newton step of the parameters that the removal of the block causes.
+    The held-out residual of a block is computed without another fit: it is residual - J step, with the Jacobian J of
+    the block and the Newton step of the parameters for the removal of the block.
     """
     problem, x, free = estimate.problem, estimate.state.x, estimate.problem.free
     model, change = problem.jacobian.model, problem.jacobian.theta_jacobian(x)

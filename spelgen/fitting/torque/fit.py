@@ -125,7 +125,7 @@ def fit_torque(
     estimate, state = fitted.estimate, fitted.estimate.state
     jacobian, estimator = estimate.problem.jacobian, estimate.problem.noise_estimator
     scale = jacobian.logged_scale(state.x)
-    error = fitted.jackknife.held_out.sum(dim=0) / samples.count  # (n,)
+    error = fitted.jackknife.held_out.sum(dim=0) / samples.count  # mean squared, (n,) [Nm^2, N^2]
     return TorqueSolution(
         rms_residual=((state.residual / samples.count).sqrt() / scale).numpy(),
         steps=state.steps,

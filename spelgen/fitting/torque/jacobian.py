@@ -130,8 +130,7 @@ class TorqueJacobian:
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the Gauss-Newton Hessian J^T W J (K, K) and the negative gradient J^T W r (K,) at x (K,).
 
-        J is the Jacobian of the modelled torque, r the torque residual, and W = 1 / noise^2 with the noise (n,) [Nm,
-        N].
+        J is the Jacobian of the modelled torque, r the torque residual, W = 1 / noise^2. noise: (n,) [Nm, N].
         """
         rows: Iterable[JointRows] = self.joint_rows(x)
         if self.terms:
@@ -301,7 +300,7 @@ class TorqueJacobian:
     def _compressed_jacobian(
         self, parameters: NamedTensors, block: _RegressorBlock
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-        """Return the torque residual and the compressed Jacobian of the modelled torque.
+        """Return the torque residual times `logged_scale`, and minus its derivatives, compressed over joints.
 
         Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive may
         have the same colour. Each parameter then affects at most one joint of a colour. Therefore the gradient of the
@@ -310,9 +309,9 @@ class TorqueJacobian:
         the gradients of all samples.
 
         Returns:
-            Residual, (T, n) [Nm, N]. Two lists with a matrix per colour: minus the derivatives with respect to the K'
-                parameters that are not of bodies, (T, K'), and with respect to the gravity torques on the drives, (T,
-                n).
+            Residual, (T, n) [Nm, N]. Two lists with one matrix per colour: derivatives with respect to the K'
+                parameters that are not of bodies, (T, K'), and with respect to the gravity torques on the drives,
+                (T, n).
         """
         copies = {}
         for name, tensor in parameters.items():

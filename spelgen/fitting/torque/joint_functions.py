@@ -49,9 +49,10 @@ class JointFunction:
     trends: (W, L) changes of the entries per unit weight of each trend.
     groups: (P,) index of the group of each weight; a group has one prior precision.
     friction: (T,) friction torque with the current factor, if the term is a friction factor; None: the term is a
-    torque. The weights of a friction factor determine its logarithm, and columns @ weights is the linearized change of
-    the friction torque. visit_length: mean number of samples of a visit. A visit of a position is a run of samples in
-    which the joint moves by the knot spacing of the splines.
+        torque. The weights of a friction factor determine its logarithm, and columns @ weights is the linearized change
+        of the friction torque.
+    visit_length: mean number of samples of a visit. A visit of a position is a run of samples in which the joint moves
+        by the knot spacing of the splines.
     """
 
     parameter: str

@@ -32,7 +32,7 @@ from spelgen.logs.windows import thinned
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import TorqueFit
 
-SAMPLES = 5  # number of samples of a window
+SAMPLES = 5  # number of samples of a window for validation and loss scales
 FITTED = {
     "load": "only a load at the tip fitted",
     "friction": "only friction and torque offsets fitted",
@@ -132,8 +132,8 @@ def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Pre
 def couple_motors(model: ArmModel, coupling: Coupling, remaining: float) -> Diagnostic:
     """Add a motor coupling to a model and its specification, and return the warning about the coupling.
 
-    Without the coupling, the bodies would absorb the friction of a coupled wrist. Example: for a Stäubli TX40, the
-    torque nMSE is 1.1 without and 0.02 with the coupling.
+    Without the coupling, the bodies would absorb the friction of a coupled wrist. Example: for a TX40 arm, the torque
+    nMSE is 1.1 without and 0.02 with the coupling.
 
     Args:
         model: model in which the motor of `coupling.joint` drives this joint only.

@@ -32,7 +32,7 @@ RIGID_GROUPS = (
 """Groups of parameters (see `ParameterInfo`) of bodies, drives and friction; all others are of residual terms."""
 DAY_GROUPS = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
 """Groups that differ from day to day."""
-NEGLIGIBLE = -30.0  # logarithm of a negligible friction coefficient
+NEGLIGIBLE = -30.0  # logarithm of a negligible friction coefficient, relative to nominal friction
 
 
 class ParameterVector:
@@ -74,14 +74,14 @@ class ParameterVector:
                 self._tensors[name].copy_(values)
 
     def mask(self, *groups: str) -> torch.Tensor:
-        """Return a mask (K,) of the parameters of the given groups."""
+        """Return a mask (K,), True for the parameters of the given groups."""
         tensors = self.initial.items()
         return (
             self.flatten({name: torch.full_like(x, self.groups[name] in groups) for name, x in tensors}) > 0
         )
 
     def free_mask(self, adapt: Adaptation | None, compensated: torch.Tensor) -> torch.Tensor:
-        """Return a mask (K,) of the parameters that a fit estimates.
+        """Return a mask (K,), True for the parameters that a fit estimates.
 
         Args:
             adapt: "load": only the last body is free; "friction": only friction parameters and torque offsets, which
@@ -290,7 +290,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 
     mask = prior.rigid.mask("bodies")
-    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # (B,)
+    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # one sum per body, (B,)
     gamma = 10 - covariance.diagonal()[mask].view(-1, 10).sum(dim=1) / prior.body_widths.square()
     relative = (current["bodies"] / prior.body_widths).square()
     updated = {"bodies": float(width((relative * squares).sum(), gamma.sum(), "bodies", initial["bodies"]))}

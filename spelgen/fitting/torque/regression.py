@@ -44,9 +44,9 @@ class Regression(NamedTuple):
 
 
 def best_regression(model: ArmModel, blocks: Sequence[TorqueSamples], torque_std: np.ndarray) -> Regression:
-    """Return the ridge regression with the smaller held-out error of two with different Coulomb friction.
+    """Return the better one of two ridge regressions, which has the smaller held-out error.
 
-    Coulomb friction depends on the velocity in one of them, and on the friction state z in the other.
+    In one of them, Coulomb friction depends on the velocity, in the other on the friction state z.
 
     Args:
         model: model whose arm, drives and gains are used.
@@ -110,7 +110,7 @@ def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) ->
     """
     with torch.no_grad():
         body = pseudo_inertia(torch.tensor([DEFAULT_BODY]).double())
-        relative = torch.linalg.solve(model.bodies.factors, body)  # C^-1 J
+        relative = torch.linalg.solve(model.bodies.factors, body)  # C^-1 J, with the pseudo-inertia J
         relative = torch.linalg.solve(model.bodies.factors, relative.mT)  # C^-1 J C^-T
         model.bodies.raw.copy_(log_cholesky_parameters(upper_cholesky((relative + relative.mT) / 2)))
         inputs = torch.linalg.pinv(model.input_matrix(samples.columns.q[:1])[0])

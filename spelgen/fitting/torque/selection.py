@@ -57,7 +57,7 @@ def can_split(count: int, correlation_length: float) -> bool:
 
 
 def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
-    """Return two slices of `count` samples: the first half without a gap at its end, and the last half."""
+    """Return two slices of `count` samples: the first half, shortened by a gap at its end, and the last half."""
     middle = count // 2
     return slice(0, max(0, middle - _gap(correlation_length))), slice(middle, count)
 
@@ -68,7 +68,7 @@ def _gap(correlation_length: float) -> int:
 
 
 def within_range(position: torch.Tensor, fitted: torch.Tensor) -> torch.Tensor:
-    """Return a mask of the positions (T, ...) within the range of fitted positions (T', ...)."""
+    """Return a mask (T, ...), True for positions within the range of the fitted positions (T', ...)."""
     return (position >= fitted.amin(dim=0)) & (position <= fitted.amax(dim=0))
 
 

@@ -21,8 +21,8 @@ DAY_TO_DAY = {
 class TorqueTuning:
     """Constants of fits of rigid-body models to torques (`fitting.torque`)."""
 
-    # [1] Only every second sample (100 Hz) is used: after the low-pass filter at 8 Hz, 50 samples per second contain
-    # all information.
+    # [1] Only every second sample is used. After the low-pass filter at 8 Hz, 50 of 100 samples per second contain all
+    # information.
     decimation: int = 2
     # [s] Prior mean of the correlation time of torque errors, from recordings of arms. Samples within a correlation
     # time count as one independent error.
@@ -83,8 +83,8 @@ class TorqueTuning:
     body_step: float = 0.3
     # [1] A warning names inertias whose relative standard deviation exceeds this value.
     undetermined: float = 0.5
-    # [1] A warning names motor gains whose relative standard deviation exceeds this value: the 95 % interval is then
-    # wider than +-20 %, which is the difference between two datasheets.
+    # [1] A warning names motor gains whose relative standard deviation exceeds this value. The 95 % interval is then
+    # wider than +-20 %, a typical difference between two datasheets.
     undetermined_gain: float = 0.1
     # [1] A warning names joints whose nMSE of held-out blocks exceeds this value.
     unsupported: float = 0.5
