@@ -59,7 +59,7 @@ class Axes:
         return max(self._cosines(a, b)) < 0
 
     def same_twist(self, a: int, b: int) -> bool:
-        """Whether two joints have equal or opposite twists (are coaxial, or parallel if prismatic).
+        """Whether two joints have equal or opposite twists: they are coaxial or, if prismatic, parallel.
 
         A body that both joints carry then has equal or opposite velocities for unit velocities of the two joints.
         """

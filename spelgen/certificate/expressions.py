@@ -203,7 +203,7 @@ def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
 
 class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
-        """Print a long sum as one call, because Python cannot nest thousands of additions."""
+        """Print a long sum as one call of ``Add``, because Python cannot parse thousands of nested additions."""
         if len(expression.args) <= 20:
             result: str = super()._print_Add(expression, order)
             return result

@@ -147,7 +147,7 @@ class _Sentences:
 
 
 def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason for an entry of M that is zero."""
+    """Return the reason why an entry of M is zero at all configurations."""
     later, earlier = entry.row, entry.column
     slider = later if axes.prismatic[later] else earlier
     if axes.prismatic[later] != axes.prismatic[earlier] and axes.parallel(later, earlier):
@@ -159,7 +159,7 @@ def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason for an entry of M that is constant."""
+    """Return the reason why an entry of M is constant."""
     later, earlier = entry.row, entry.column
     if later == earlier:
         return _diagonal_reason(axes, later)

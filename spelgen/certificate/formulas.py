@@ -219,7 +219,10 @@ class _Writer:
         return Formula(entry, terms, grouped(functions))
 
     def _polynomials(self, entry: Entry, budget: Budget) -> dict[str, fmpq_mpoly]:
-        """Return {base parameter: its polynomial coefficient in an entry}. Raises TooLarge if it exceeds the budget."""
+        """Return {base parameter: its polynomial coefficient in an entry}, without the constant of V.
+
+        Raises TooLarge if the expansion exceeds the budget.
+        """
         energies = self._expansion.energies
         element = energies.potential if entry == "V" else energies.mass[entry[0] - 1, entry[1] - 1]
         polynomials = {}

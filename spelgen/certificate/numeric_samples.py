@@ -54,7 +54,7 @@ class NumericSamples:
 def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:
     """Return samples at ``count`` random configurations.
 
-    random_inertials: True: each sample has its own random inertial parameters; False: all have the URDF's.
+    random_inertials: True: each sample has its own random inertial parameters; False: all have the ones of the URDF.
     """
     n = len(arm.coordinates)
     rows, columns = np.tril_indices(n)

@@ -55,7 +55,7 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
 
 
 def network_source(model: TrainedModel) -> list[str]:
-    """Return [C source of all networks]; [] if the model has no networks."""
+    """Return a list with the C source of all networks; [] if the model has no networks."""
     n, residuals = model.n, model.residuals
     named = {"mass": residuals.mass, "potential": residuals.potential}
     networks = {name: network for name, network in named.items() if network is not None}
@@ -104,7 +104,7 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
 
 
 def joint_function_source(model: TrainedModel) -> list[str]:
-    """Return [C source of the residual terms of single joints]; [] if the model has none.
+    """Return a list with the C source of the residual terms of single joints; [] if the model has none.
 
     These terms are torque splines, torque ripple, and friction factors.
     """

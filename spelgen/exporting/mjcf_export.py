@@ -126,8 +126,7 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         controls: inputs of the actuators, (states, n).
     """
     model = mujoco.MjModel.from_xml_string(text.decode())
-    # Torque limits and friction are switched off: the forces are compared without them, and MuJoCo has
-    # another friction model.
+    # Torque limits and friction are switched off, since the reference has none: MuJoCo has another friction model.
     model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0

@@ -70,7 +70,7 @@ def require_parity(differences: dict[str, float], tolerance: float, states: int)
     differences: {entry point: largest relative difference}. states: number of random states, for the summary.
     """
     for name, difference in differences.items():
-        if not difference <= tolerance:  # True for NaN, too
+        if not difference <= tolerance:  # The negated comparison is True for NaN, too.
             raise RunError(
                 f"{name} differs from the model by {difference:.1e}",
                 element="parity check",
@@ -149,7 +149,7 @@ def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
 
 
 def relative(values: np.ndarray, expected: np.ndarray) -> float:
-    """Return the largest difference of arrays (...,) divided by the largest expected value; NaN if any is NaN."""
+    """Return max |values - expected| / max |expected| of two arrays (...,); NaN if a value is NaN."""
     if not expected.size:
         return 0.0
     # The difference is absolute if all expected values are zero.

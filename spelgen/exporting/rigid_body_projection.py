@@ -144,7 +144,7 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
 
 
 def _relative_rms(values: Tensor, expected: Tensor) -> float:
-    """Return the root mean square of values - expected, divided by the root mean square of expected, (...,) each."""
+    """Return RMS(values - expected) / RMS(expected) for two tensors (...,)."""
     size = expected.square().mean().sqrt().clamp(min=1e-12)
     return float((values - expected).square().mean().sqrt() / size)
 

@@ -61,7 +61,10 @@ class RigidBodies:
             self.inertias.append((ten[0], ten[1:4], tensor))
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
-        """Return M qdd + h without armature, (n, 1) [Nm, N]; structural zeros of qd cause no operations."""
+        """Return M qdd + h without armature, (n, 1) [Nm, N], with h: Coriolis, centrifugal and gravity torque.
+
+        Structural zeros of qd cause no operations.
+        """
         # The list has the motion of the base, then of each body, in the frame of the body: angular velocity w, angular
         # acceleration w', acceleration of the frame's origin, and the matrix skew(w') + w w^T - |w|^2 1 (`spin`).
         # Gravity is represented by an upward acceleration of the base.

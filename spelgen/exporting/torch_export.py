@@ -65,7 +65,7 @@ def program_names(trained: Trained) -> list[str]:
 def check_programs(called: Called, trained: Trained, names: Sequence[str], tolerance: float) -> Parity:
     """Compare programs with the torch model; return the differences. Raises RunError if one is too large.
 
-    tolerance: of float64 programs; float32 programs have `ExportTuning.float32_tolerance`.
+    tolerance: largest allowed difference of float64 programs; for float32 it is `ExportTuning.float32_tolerance`.
     """
     if trained.float32:
         return check_parity(called, trained, names, TUNING.float32_tolerance, dtype=np.float32)

@@ -17,12 +17,14 @@ class ExportTuning:
     # [1] Largest allowed difference between results of C, CasADi or torch programs and of the model, divided by the
     # largest value of the result. `benchmarks/deploy.py` measures 4e-14.
     tolerance: float = 1e-12
-    # [1] The same for ONNX programs. It is larger because they solve linear systems without pivoting, and M may be
-    # ill-conditioned.
+    # [1] Largest allowed difference of ONNX programs, relative like `tolerance`. It is larger because they solve linear
+    # systems without pivoting, and M may be ill-conditioned.
     onnx_tolerance: float = 1e-10
-    # [1] The same for float32 programs. Solving with an ill-conditioned M loses digits.
+    # [1] Largest allowed difference of float32 programs, relative like `tolerance`. Solving with an ill-conditioned M
+    # loses digits.
     float32_tolerance: float = 1e-3
-    # [1] The same for MuJoCo's dynamics. `benchmarks/deploy.py` measures 9e-15.
+    # [1] Largest allowed difference of MuJoCo's dynamics, relative like `tolerance`. `benchmarks/deploy.py` measures
+    # 9e-15.
     mujoco_tolerance: float = 1e-9
     # [1] Number of random positions at which the nearest rigid bodies are fitted to a model.
     positions: int = 512

@@ -119,8 +119,8 @@ class ResidualTuning:
     # [1] Smallest t value of the mean error reduction over the blocks: p = 0.01 for Student's t with nine degrees of
     # freedom.
     standard_errors: float = 2.82
-    # [1] The same t value for p = 0.001, used with one or two recordings: their motion may repeat the errors of the
-    # model.
+    # [1] Smallest t value of the mean error reduction with one or two recordings, for p = 0.001. It is larger than
+    # `standard_errors`, since their motion may repeat the errors of the model.
     standard_errors_of_one: float = 4.30
     # [1] Largest standard deviation of a position-dependent torque that is selected on one or two recordings, as a
     # fraction of the standard deviation of the joint's torque.
