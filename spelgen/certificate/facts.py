@@ -27,8 +27,11 @@ EntryReason = Callable[[Axes, MassEntry], Reason]
 class Fact:
     """A property of M or V at all configurations.
 
-    statement: sentence with the property. means: sentence with its consequence for the model. reason: None if the
-    geometry gives no simple reason, or if the arm has branches or mimic joints; the property is nevertheless exact.
+    Attributes:
+        statement: sentence with the property.
+        means: sentence with its consequence for the model.
+        reason: None if the geometry gives no simple reason, or if the arm has branches or mimic joints; the property is
+            nevertheless exact.
     """
 
     statement: str

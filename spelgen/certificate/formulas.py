@@ -41,9 +41,11 @@ Entry = tuple[int, int] | Literal["V"]
 class Formula:
     """Closed form of an entry of the lower triangle of M, or of V.
 
-    entry: (row, column) counted from 1, or "V". terms: number of products of a base parameter and a monomial in
-    cosines, sines and distances; None if the expansion exceeds its budget. expression: SymPy expression; None if the
-    entry is too long.
+    Attributes:
+        entry: (row, column) counted from 1, or "V".
+        terms: number of products of a base parameter and a monomial in cosines, sines and distances; None if the
+            expansion exceeds its budget.
+        expression: SymPy expression; None if the entry is too long.
     """
 
     entry: Entry
@@ -67,8 +69,10 @@ class Formula:
 class Formulas:
     """Closed forms of M, and of V up to a constant, in the base parameters of an arm.
 
-    assume: with ``inertials``, terms that are zero for the inertials of the URDF are omitted. base: base parameters.
-    rows: one closed form per entry of the lower triangle of M, then V.
+    Attributes:
+        assume: with ``inertials``, terms that are zero for the inertials of the URDF are omitted.
+        base: base parameters.
+        rows: one closed form per entry of the lower triangle of M, then V.
     """
 
     arm: Chain

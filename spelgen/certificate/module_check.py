@@ -14,8 +14,11 @@ from spelgen.structure.structure import derive
 class CheckResult:
     """Result of ``check``.
 
-    urdf: path of the URDF. fresh: True if the module is up to date and the verification finds no error. reasons: the
-    differences and errors, if any. proof: numerical verification of the structure.
+    Attributes:
+        urdf: path of the URDF.
+        fresh: True if the module is up to date and the verification finds no error.
+        reasons: the differences and errors, if any.
+        proof: numerical verification of the structure.
     """
 
     urdf: Path

@@ -34,10 +34,11 @@ TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 class NumericSamples:
     """Samples of M and of the gravity torque at S random configurations.
 
-    mass: (1 + n, S, n(n+1)/2), entries of the lower triangle of M, divided by ``scale``. mass[0] is M at the S
-    configurations; for mass[1 + k], coordinate k has another random position. scale: (n(n+1)/2,),
-    sqrt(mean M_ii * mean M_jj) for the entry (i, j), with means over the samples. gravity: (S, n), gravity torque dV/dq
-    divided by its largest magnitude.
+    Attributes:
+        mass: (1 + n, S, n(n+1)/2), entries of the lower triangle of M, divided by ``scale``. mass[0] is M at the S
+            configurations; for mass[1 + k], coordinate k has another random position.
+        scale: (n(n+1)/2,), sqrt(mean M_ii * mean M_jj) for the entry (i, j), with means over the samples.
+        gravity: (S, n), gravity torque dV/dq divided by its largest magnitude.
     """
 
     mass: np.ndarray

@@ -36,8 +36,11 @@ _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 class FactCheck:
     """Result of the verification of one derived fact.
 
-    fact: name of the fact. derived: result of the derivation. found: result of the independent computation. verdict:
-    "agrees", "differs", or "undecided" if rounding errors are too large or Pinocchio cannot read the file.
+    Attributes:
+        fact: name of the fact.
+        derived: result of the derivation.
+        found: result of the independent computation.
+        verdict: "agrees", "differs", or "undecided" if rounding errors are too large or Pinocchio cannot read the file.
     """
 
     fact: str
@@ -53,8 +56,11 @@ class FactCheck:
 class Verification:
     """Result of the verification of an arm's structure.
 
-    means: text that states the program, the number of configurations and the inertial values. samples: number of random
-    configurations. seed: seed of the configurations. checks: one result per fact.
+    Attributes:
+        means: text that states the program, the number of configurations and the inertial values.
+        samples: number of random configurations.
+        seed: seed of the configurations.
+        checks: one result per fact.
     """
 
     means: str
@@ -108,8 +114,11 @@ Magnitude = tuple[str, float, bool]
 class _DerivedFact:
     """A derived fact, with the sampled numbers that confirm or refute it.
 
-    fact: name of the fact. derived: result of the derivation, as text. magnitudes: list of (name, number, is_nonzero).
-    The fact is true if the numbers with is_nonzero = True are nonzero and all others are zero.
+    Attributes:
+        fact: name of the fact.
+        derived: result of the derivation, as text.
+        magnitudes: list of (name, number, is_nonzero). The fact is true if the numbers with is_nonzero = True are
+            nonzero and all others are zero.
     """
 
     fact: str

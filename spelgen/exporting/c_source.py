@@ -43,8 +43,11 @@ _FORMS = {
 class CFunction:
     """C code of an entry point.
 
-    symbol: name of the C function. shapes: {output: (rows,) or (rows, columns)}. about: text of the comment above the
-    function. operations: upper bound of the number of arithmetic operations of a call, without networks.
+    Attributes:
+        symbol: name of the C function.
+        shapes: {output: (rows,) or (rows, columns)}.
+        about: text of the comment above the function.
+        operations: upper bound of the number of arithmetic operations of a call, without networks.
     """
 
     entry: EntryPoint

@@ -45,10 +45,11 @@ if TYPE_CHECKING:
 class Trained:
     """A trained model, its arm, and options of the export.
 
-    entries: names of the functions to export, for formats that consist of functions; empty: all except derivatives.
-    intervals: tables of the fitted parameters with 95 % intervals, for the README. float32: whether ONNX and torch
-    programs compute in float32; otherwise in float64. levels: noise levels of the estimator of payload and external
-    torques; None: the estimator is not exported.
+    Attributes:
+        entries: names of the functions to export, for formats that consist of functions; empty: all except derivatives.
+        intervals: tables of the fitted parameters with 95 % intervals, for the README.
+        float32: whether ONNX and torch programs compute in float32; otherwise in float64.
+        levels: noise levels of the estimator of payload and external torques; None: the estimator is not exported.
     """
 
     model: ArmModel

@@ -38,12 +38,15 @@ class Harmonics:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """The residual terms of a model that are not zero.
+    """The residual terms of a model that are not zero. Splines are cubic, and zero outside of their knots.
 
-    mass: network whose outputs are added to M. entries: (row, column) in the lower triangle of M to which each output
-    is added. potential: network whose output is added to V. torque: {joint: spline of q that is added to dV/dq
-    [Nm, N]}. ripple: further terms of dV/dq [Nm]. friction: {joint: spline of q, logarithm of the factor on the
-    friction of the joint's drive}. Splines are cubic, and zero outside of their knots.
+    Attributes:
+        mass: network whose outputs are added to M.
+        entries: (row, column) in the lower triangle of M to which each output is added.
+        potential: network whose output is added to V.
+        torque: {joint: spline of q that is added to dV/dq [Nm, N]}.
+        ripple: further terms of dV/dq [Nm].
+        friction: {joint: spline of q, logarithm of the factor on the friction of the joint's drive}.
     """
 
     entries: tuple[tuple[int, int], ...]
@@ -77,8 +80,11 @@ def spline_energy(spline: BSpline) -> BSpline:
 class Servos:
     """Constants of position servos, (n,) each, as in ``runtime.PositionServo``.
 
-    kp [Nm/rad, N/m], kd [Nm s/rad, N s/m]: gains. limit: largest torque [Nm, N]; infinite for a servo without a limit.
-    dead_zone: half the width of the dead zone [rad, m]. delay: delay of the commands [s], one number.
+    Attributes:
+        kp, kd: gains [Nm/rad, N/m] and [Nm s/rad, N s/m].
+        limit: largest torque [Nm, N]; infinite for a servo without a limit.
+        dead_zone: half the width of the dead zone [rad, m].
+        delay: delay of the commands [s], one number.
     """
 
     kp: np.ndarray
@@ -92,13 +98,19 @@ class Servos:
 class TrainedModel:
     """A trained model of an arm with n joints: rad and Nm for revolute joints, m and N for prismatic joints.
 
-    name: identifier of the robot in code. joint_labels: names of the joints for comments, only letters, digits and _.
-    inertias: (bodies, 10), inertial parameters in the frames of the joints. constant_mass: (n, n), armature and
-    constant residual terms of M. motors: C, (n, n), motor velocities = C qd. friction: the ``FrictionConstants`` of the
-    runtime, as arrays. breakaway: (n, K) [rad, m], break-away displacements of K bristles per joint. inputs: G, (n, n),
-    joint torques = G times motor torques. actuated: (n,), 0 for a passive joint, otherwise 1. torque_offset: (n,),
-    measured torque at zero torque. friction_compensation: (n,) [Nm s/rad, N s/m], coefficient of a torque proportional
-    to qd that the drives add without measuring it.
+    Attributes:
+        name: identifier of the robot in code.
+        joint_labels: names of the joints for comments, only letters, digits and _.
+        inertias: (bodies, 10), inertial parameters in the frames of the joints.
+        constant_mass: (n, n), armature and constant residual terms of M.
+        motors: C, (n, n), motor velocities = C qd.
+        friction: the ``FrictionConstants`` of the runtime, as arrays.
+        breakaway: (n, K) [rad, m], break-away displacements of K bristles per joint.
+        inputs: G, (n, n), joint torques = G times motor torques.
+        actuated: (n,), 0 for a passive joint, otherwise 1.
+        torque_offset: (n,), measured torque at zero torque.
+        friction_compensation: (n,) [Nm s/rad, N s/m], coefficient of a torque proportional to qd that the drives add
+            without measuring it.
     """
 
     name: str
@@ -137,8 +149,11 @@ class TrainedModel:
 class EntryPoint:
     """A function that exports contain, with the names of its arguments and results.
 
-    about: description. inputs: names of the arguments, among q, qd, qdd, tau, u (command of servos), dq (displacement),
-    n numbers each, and z, the friction state. outputs: {name of a result: unit}.
+    Attributes:
+        about: description.
+        inputs: names of the arguments, among q, qd, qdd, tau, u (command of servos), dq (displacement), n numbers each,
+            and z, the friction state.
+        outputs: {name of a result: unit}.
     """
 
     name: str

@@ -22,10 +22,13 @@ UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 class Exporter:
     """A format of exports.
 
-    function_name: "module:function" of the function that returns the ``Exported`` for a ``Trained``. It is imported on
-    use, because most formats need optional packages. title: last words of the README's title. suffix: file name
-    extension; empty for a format that is a folder. choice: whether a user can select functions. float32: whether the
-    exported programs can compute in float32.
+    Attributes:
+        function_name: "module:function" of the function that returns the ``Exported`` for a ``Trained``. It is imported
+            on use, because most formats need optional packages.
+        title: last words of the README's title.
+        suffix: file name extension; empty for a format that is a folder.
+        choice: whether a user can select functions.
+        float32: whether the exported programs can compute in float32.
     """
 
     function_name: str
@@ -58,8 +61,11 @@ else:
 class Exported:
     """A trained model in the format of another tool.
 
-    to: name of the format. files: {path in the folder: content}. For a format that is a single file, the keys are
-    extensions such as ``.urdf``, which replace the extension of the file name. summary: sentences for the user.
+    Attributes:
+        to: name of the format.
+        files: {path in the folder: content}. For a format that is a single file, the keys are extensions such as
+            ``.urdf``, which replace the extension of the file name.
+        summary: sentences for the user.
     """
 
     to: str

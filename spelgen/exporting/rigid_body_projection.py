@@ -30,9 +30,11 @@ if TYPE_CHECKING:
 class NearestFriction(NamedTuple):
     """Viscous and Coulomb friction that approximate the friction of a model best, (n,) each.
 
-    viscous: coefficients [Nm s/rad, N s/m]. forward, backward: Coulomb torques [Nm, N] in both directions of motion,
-    backward <= 0 <= forward. error: RMS difference between this friction and the model's friction over positions and
-    speeds, divided by the RMS of the model's friction [1].
+    Attributes:
+        viscous: coefficients [Nm s/rad, N s/m].
+        forward, backward: Coulomb torques [Nm, N] in both directions of motion, backward <= 0 <= forward.
+        error: RMS difference between this friction and the model's friction over positions and speeds, divided by the
+            RMS of the model's friction [1].
     """
 
     viscous: np.ndarray
@@ -50,12 +52,16 @@ class NearestFriction(NamedTuple):
 class RigidBodyProjection:
     """Parameters of an arm of n joints in the form that a URDF and a settings file can contain.
 
-    inertias: (bodies, 10), inertial parameters in the frames of the joints. armature: (n,) [kg m^2, kg], rotor inertia
-    of the motors. motors: C, (n, n), motor velocities = C qd. inputs: G at q = 0, (n, n), joint torques = G times motor
-    torques. exact: True if the trained model consists of rigid bodies, which are used; False if rigid bodies were
-    fitted to it. mass_error, gravity_error: RMS difference between the rigid bodies and the trained model, of M and of
-    the gravity torque, divided by the RMS of the trained model [1]. bodies: float64 model that consists of the rigid
-    bodies only.
+    Attributes:
+        inertias: (bodies, 10), inertial parameters in the frames of the joints.
+        armature: (n,) [kg m^2, kg], rotor inertia of the motors.
+        motors: C, (n, n), motor velocities = C qd.
+        inputs: G at q = 0, (n, n), joint torques = G times motor torques.
+        exact: True if the trained model consists of rigid bodies, which are used; False if rigid bodies were fitted to
+            it.
+        mass_error, gravity_error: RMS difference between the rigid bodies and the trained model, of M and of the
+            gravity torque, divided by the RMS of the trained model [1].
+        bodies: float64 model that consists of the rigid bodies only.
     """
 
     arm: Arm

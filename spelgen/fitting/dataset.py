@@ -26,11 +26,16 @@ from spelgen.settings.log_mapping import LogMapping
 class RunOptions:
     """Options of the run of a fit: resources, files, messages.
 
-    device: torch device. threads: number of threads of torch. resume: continue from the checkpoint of the run folder;
-    the result is the same as without an interruption. force: replace a run in the folder. progress: show the progress
-    on stderr. mapping: names and units of the columns of the logs; the run folder gets a copy. notes: diagnostics of
-    the caller, for example of reading the logs; they are reported with the diagnostics of the fit. began: start of the
-    time limit, as a value of `time.monotonic` [s]; None: the call of `fit`.
+    Attributes:
+        device: torch device.
+        threads: number of threads of torch.
+        resume: continue from the checkpoint of the run folder; the result is the same as without an interruption.
+        force: replace a run in the folder.
+        progress: show the progress on stderr.
+        mapping: names and units of the columns of the logs; the run folder gets a copy.
+        notes: diagnostics of the caller, for example of reading the logs; they are reported with the diagnostics of the
+            fit.
+        began: start of the time limit, as a value of `time.monotonic` [s]; None: the call of `fit`.
     """
 
     device: str = "cpu"
@@ -47,9 +52,11 @@ class RunOptions:
 class FitRequest:
     """The arguments of `fit`, with all defaults replaced by values.
 
-    validation: fraction of the logs that is set aside for validation, or the validation trajectories. urdf: URDF file
-    of the robot, None if unknown. began: start of the time limit, as a value of `time.monotonic` [s]. folder: run
-    folder, None if the fit writes no files.
+    Attributes:
+        validation: fraction of the logs that is set aside for validation, or the validation trajectories.
+        urdf: URDF file of the robot, None if unknown.
+        began: start of the time limit, as a value of `time.monotonic` [s].
+        folder: run folder, None if the fit writes no files.
     """
 
     model: ArmModel
@@ -73,11 +80,14 @@ class FitRequest:
 class PreparedLogs:
     """Properties of the checked logs that are written to the run folder.
 
-    preprocessing: filter, gaps and delay, with all automatic values resolved. digest: SHA-256 of all numbers of the
-    logs; a fit resumes only on logs with the same digest. training_names, validation_names: names of the trajectories.
-    window_counts: number of training windows and of validation windows. diagnostics: messages about the logs for the
-    user. scales: divisors of the errors of q, qd and tau in the validation loss; None if the objective has no
-    validation loss.
+    Attributes:
+        preprocessing: filter, gaps and delay, with all automatic values resolved.
+        digest: SHA-256 of all numbers of the logs; a fit resumes only on logs with the same digest.
+        training_names, validation_names: names of the trajectories.
+        window_counts: number of training windows and of validation windows.
+        diagnostics: messages about the logs for the user.
+        scales: divisors of the errors of q, qd and tau in the validation loss; None if the objective has no validation
+            loss.
     """
 
     preprocessing: Preprocessing

@@ -47,9 +47,11 @@ Rates = Callable[[], Sequence[float]]
 class FitOptions:
     """Options of a fit by name, checked when the objective is known.
 
-    objective: name of the objective; None: `default_objective` chooses it from the model and the logs. options: values
-    of options by name; an option that does not apply to the objective is an error. defaults: values by name for options
-    that are not given; defaults that do not apply to the objective are ignored.
+    Attributes:
+        objective: name of the objective; None: `default_objective` chooses it from the model and the logs.
+        options: values of options by name; an option that does not apply to the objective is an error.
+        defaults: values by name for options that are not given; defaults that do not apply to the objective are
+            ignored.
     """
 
     objective: str | None = None

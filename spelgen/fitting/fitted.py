@@ -36,11 +36,16 @@ from spelgen.spec import ModelSpec
 class Fit:
     """A fitted model, the record of its fit, and the baselines that were fitted to the same logs.
 
-    history: lines of metrics.jsonl, one per epoch. diagnostics: messages about the logs and the fit. status: how the
-    fit ended; None for a run that was loaded. record: content of config.json. checkpoint: content of checkpoint.pt.
-    baselines: content of least_squares.json, {} without baselines. urdf: URDF file of the robot, None if unknown.
-    folder: run folder, None if the fit wrote no files. logs: trajectories for training and validation; () for a run
-    that was loaded.
+    Attributes:
+        history: lines of metrics.jsonl, one per epoch.
+        diagnostics: messages about the logs and the fit.
+        status: how the fit ended; None for a run that was loaded.
+        record: content of config.json.
+        checkpoint: content of checkpoint.pt.
+        baselines: content of least_squares.json, {} without baselines.
+        urdf: URDF file of the robot, None if unknown.
+        folder: run folder, None if the fit wrote no files.
+        logs: trajectories for training and validation; () for a run that was loaded.
     """
 
     model: ArmModel

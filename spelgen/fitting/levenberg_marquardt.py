@@ -51,8 +51,10 @@ class NormalEquations(NamedTuple):
 class SolverState(Generic[Parameters]):
     """Iterate of the solver.
 
-    residual: residual of the problem at x, from which the normal equations are computed. damping: damping of the next
-    step. steps: number of accepted steps, including earlier calls of the solver.
+    Attributes:
+        residual: residual of the problem at x, from which the normal equations are computed.
+        damping: damping of the next step.
+        steps: number of accepted steps, including earlier calls of the solver.
     """
 
     x: Parameters

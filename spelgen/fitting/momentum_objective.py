@@ -28,9 +28,12 @@ from spelgen.settings.fits import DEFAULTS, Rollout, WindowConfig
 class MomentumObjective(Objective):
     """Minimization of `momentum_loss`. The initial weights are restored if they have a lower validation loss.
 
-    best_loss, best_weights: lowest validation loss so far, and the weights of the model with this loss. substeps:
-    number of integration steps per sample interval. seconds: elapsed time of the fit [s]. allowed: time limit of the
-    fit [s]. epoch_steps: number of optimizer steps per epoch.
+    Attributes:
+        best_loss, best_weights: lowest validation loss so far, and the weights of the model with this loss.
+        substeps: number of integration steps per sample interval.
+        seconds: elapsed time of the fit [s].
+        allowed: time limit of the fit [s].
+        epoch_steps: number of optimizer steps per epoch.
     """
 
     name: ClassVar[str] = "momentum"

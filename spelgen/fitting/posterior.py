@@ -64,9 +64,11 @@ class Propagated(NamedTuple):
 class Posterior:
     """Posterior of a model that was fitted to torques.
 
-    covariance: (K, K), covariance of the rigid-body, drive and friction parameters. torque_std: (n,) [Nm, N], RMS of
-    the low-pass filtered torque residual on blocks of samples that were not fitted. delay: delay of the torques
-    relative to the positions [s]; None if there is no delay.
+    Attributes:
+        covariance: (K, K), covariance of the rigid-body, drive and friction parameters.
+        torque_std: (n,) [Nm, N], RMS of the low-pass filtered torque residual on blocks of samples that were not
+            fitted.
+        delay: delay of the torques relative to the positions [s]; None if there is no delay.
     """
 
     model: ArmModel

@@ -76,9 +76,13 @@ def _adaptive_step(
     """Return q, p, z at the end of one interval, integrated with adaptive steps, and dq/dt at its start.
 
     The solver is dopri5 (Dormand and Prince, J. Comput. Appl. Math. 6, 1980); gradients are propagated through its
-    steps. All W windows are integrated together, with time divided by the duration of the window's interval. rhs:
-    function of (q, p, z) that returns dq/dt and dp/dt. q, p: positions and momenta, (W, n). z: friction state of K
-    bristles per joint, (W, n, K). step: duration of the interval [s].
+    steps. All W windows are integrated together, with time divided by the duration of the window's interval.
+
+    Args:
+        rhs: function of (q, p, z) that returns dq/dt and dp/dt.
+        q, p: positions and momenta, (W, n).
+        z: friction state of K bristles per joint, (W, n, K).
+        step: duration of the interval [s].
     """
     from torchdiffeq import odeint  # imported only if needed, since the import takes half a second
 
@@ -110,8 +114,10 @@ def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequen
 class LossScales(NamedTuple):
     """Divisors of the errors of q, qd and tau in the losses.
 
-    q: (K-1, n) [rad, m], RMS over all windows of the position change from sample 0 to each of the samples 1 to K-1. qd:
-    (K-1, n) [rad/s, m/s], the same for the velocity. tau: (n,) [Nm, N], standard deviation of the torque.
+    Attributes:
+        q: (K-1, n) [rad, m], RMS over all windows of the position change from sample 0 to each of the samples 1 to K-1.
+        qd: (K-1, n) [rad/s, m/s], the same for the velocity.
+        tau: (n,) [Nm, N], standard deviation of the torque.
     """
 
     q: Tensor

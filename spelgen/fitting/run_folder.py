@@ -20,11 +20,17 @@ from spelgen.urdf.document import urdf_bytes
 class RunFolder:
     """The files of one training run.
 
-    spec: specification of the model. urdf, settings: URDF and settings of the robot, if known. mapping: names and units
-    of the columns of the logs, in the format of --mapping. config: record of the fit. metrics: one line per epoch.
-    checkpoint: state from which the fit is resumed. weights: the best state_dict so far. evaluation: results of
-    `evaluate`. baseline: least-squares baselines, and the coverage of the logs. estimator: noise levels of the state
-    estimator.
+    Attributes:
+        spec: specification of the model.
+        urdf, settings: URDF and settings of the robot, if known.
+        mapping: names and units of the columns of the logs, in the format of --mapping.
+        config: record of the fit.
+        metrics: one line per epoch.
+        checkpoint: state from which the fit is resumed.
+        weights: the best state_dict so far.
+        evaluation: results of `evaluate`.
+        baseline: least-squares baselines, and the coverage of the logs.
+        estimator: noise levels of the state estimator.
     """
 
     def __init__(self, path: Path | str) -> None:

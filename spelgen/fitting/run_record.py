@@ -35,12 +35,17 @@ MAY_CHANGE = ("epochs", "patience", "max_minutes")  # options that may differ wh
 class Record(BaseModel):
     """The record of a fit in config.json: the data, the settings with all defaults resolved, and the results.
 
-    config: the options that apply to the model; the type depends on the objective. joints: names in the order of q.
-    validation_fraction: None if validation logs were given. data_digest: SHA-256 of all numbers of the logs. training,
-    validation: names of the trajectories. scales: divisors of the errors in the validation loss. mapping: names and
-    units of the columns of the logs. servo: parameters of position servos with intervals; None unless a fit of servos
-    has finished. notes: messages of the torque fit for the user. warnings: warnings about the logs and the links of the
-    URDF.
+    Attributes:
+        config: the options that apply to the model; the type depends on the objective.
+        joints: names in the order of q.
+        validation_fraction: None if validation logs were given.
+        data_digest: SHA-256 of all numbers of the logs.
+        training, validation: names of the trajectories.
+        scales: divisors of the errors in the validation loss.
+        mapping: names and units of the columns of the logs.
+        servo: parameters of position servos with intervals; None unless a fit of servos has finished.
+        notes: messages of the torque fit for the user.
+        warnings: warnings about the logs and the links of the URDF.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -127,11 +132,17 @@ class Record(BaseModel):
 class Checkpoint(BaseModel):
     """The content of checkpoint.pt: the progress of a fit, and the state from which its objective resumes.
 
-    seconds: duration of the fit [s]. substeps: integrator steps per sample interval. torque_nmse: mean squared torque
-    error divided by the variance of the torque, per joint. posterior: covariance of the parameters and RMS torque
-    residual (see `posterior_of`), only for rigid bodies fitted to torques. rollbacks: number of repeated epochs of a
-    fit to windows. learning_rate_factor: factor on the learning rate after these repetitions. momentum_done: whether
-    the momentum stage has ended. Further keys are states of an objective; torch checks their content.
+    Attributes:
+        seconds: duration of the fit [s].
+        substeps: integrator steps per sample interval.
+        torque_nmse: mean squared torque error divided by the variance of the torque, per joint.
+        posterior: covariance of the parameters and RMS torque residual (see `posterior_of`), only for rigid bodies
+            fitted to torques.
+        rollbacks: number of repeated epochs of a fit to windows.
+        learning_rate_factor: factor on the learning rate after these repetitions.
+        momentum_done: whether the momentum stage has ended.
+
+    Further keys are states of an objective; torch checks their content.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -158,8 +169,12 @@ class Checkpoint(BaseModel):
 class Epoch(BaseModel):
     """A line of metrics.jsonl: the state of a fit after an epoch.
 
-    step: number of optimizer steps so far. loss: mean training loss. validation: validation loss. best: lowest
-    validation loss so far. seconds: duration of the fit so far [s].
+    Attributes:
+        step: number of optimizer steps so far.
+        loss: mean training loss.
+        validation: validation loss.
+        best: lowest validation loss so far.
+        seconds: duration of the fit so far [s].
     """
 
     epoch: Count

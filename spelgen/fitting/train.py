@@ -37,12 +37,16 @@ def train(
 
     A resumed run uses the recorded options and the recorded mapping of the logs, unless the arguments replace them.
 
-    module: the built module; None: the fit continues from the model of ``source``. data: log files. config: a
-    configuration, or options by name; the default objective depends on the logs. urdf: URDF that the module was built
-    from, for the regularizer and the baselines; by default, the file with the URDF's original name in the module's
-    folder. source: run folder with a fitted model, by default ``folder``. of_logs: dict with fields of `Preprocessing`,
-    validation_fraction and seed. require: function that checks the logs before the fit: it raises an error for unusable
-    logs and returns diagnostics.
+    Args:
+        module: the built module; None: the fit continues from the model of ``source``.
+        data: log files.
+        config: a configuration, or options by name; the default objective depends on the logs.
+        urdf: URDF that the module was built from, for the regularizer and the baselines; by default, the file with the
+            URDF's original name in the module's folder.
+        source: run folder with a fitted model, by default ``folder``.
+        of_logs: dict with fields of `Preprocessing`, validation_fraction and seed.
+        require: function that checks the logs before the fit: it raises an error for unusable logs and returns
+            diagnostics.
 
     Raises ModuleError, LogError, and RunError if the folder contains a run or cannot be resumed with these arguments.
     """

@@ -21,9 +21,12 @@ from spelgen.logs.windows import Windows
 class UrdfRegularizer(NamedTuple):
     """Mass matrices and gravity torques of a URDF at S positions, to which a model is compared.
 
-    q: (S, n), positions [rad, m]. whitening: (n, n), W = inverse Cholesky factor of the model's mean M before the fit.
-    variation: (S, n, n) [1], W (M - mean M) W^T for the M of the URDF. gravity: (S, n), gravity torque [Nm, N].
-    gravity_scale: (n,), divisor of the errors of the gravity torque [Nm, N].
+    Attributes:
+        q: (S, n), positions [rad, m].
+        whitening: (n, n), W = inverse Cholesky factor of the model's mean M before the fit.
+        variation: (S, n, n) [1], W (M - mean M) W^T for the M of the URDF.
+        gravity: (S, n), gravity torque [Nm, N].
+        gravity_scale: (n,), divisor of the errors of the gravity torque [Nm, N].
     """
 
     q: Tensor

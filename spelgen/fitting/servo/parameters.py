@@ -24,9 +24,12 @@ STRIBECK_VELOCITY = "friction.raw_stribeck_velocity"
 class ServoParameters:
     """Values of the k = p n + r + 1 parameters of a servo fit.
 
-    joints: (p, n), p parameters of each joint. bodies: (r,), r coordinates of the body parameters along
-    `ParameterMap.directions`, in prior standard deviations. delay: delay of the commands [s]. active: (p, n), True for
-    joint parameters that are fitted; a dead zone is fitted only at joints that have one.
+    Attributes:
+        joints: (p, n), p parameters of each joint.
+        bodies: (r,), r coordinates of the body parameters along `ParameterMap.directions`, in prior standard
+            deviations.
+        delay: delay of the commands [s].
+        active: (p, n), True for joint parameters that are fitted; a dead zone is fitted only at joints that have one.
     """
 
     joints: Tensor
@@ -54,10 +57,13 @@ class ServoParameters:
 class ParameterMap:
     """The map between `ServoParameters` and the tensors of a model, and the prior.
 
-    names: names of the p rows of `ServoParameters.joints`; a parameter with K values per joint has K rows of the same
-    name. tensors: {name: joint parameter of the model}. directions: (10 B, r), r directions in the space of the
-    log-Cholesky parameters of B bodies; only steps along these directions are fitted. prior_mean: parameters of the
-    model when the map is made.
+    Attributes:
+        names: names of the p rows of `ServoParameters.joints`; a parameter with K values per joint has K rows of the
+            same name.
+        tensors: {name: joint parameter of the model}.
+        directions: (10 B, r), r directions in the space of the log-Cholesky parameters of B bodies; only steps along
+            these directions are fitted.
+        prior_mean: parameters of the model when the map is made.
 
     Args:
         model: the model, which `write` changes.

@@ -46,8 +46,10 @@ ABOUT = (
 class FitSummary:
     """Summary of a fit for the user.
 
-    text: summary for a terminal. listing: table of the parameters with intervals. headline: (value, name) of the delay
-    of the commands, the most important result.
+    Attributes:
+        text: summary for a terminal.
+        listing: table of the parameters with intervals.
+        headline: (value, name) of the delay of the commands, the most important result.
     """
 
     text: str
@@ -59,9 +61,12 @@ class FitSummary:
 class ServoSolution:
     """Normal equations and covariance of the k parameters at the end of a fit.
 
-    The dead zones of all joints are free parameters here. blocks: normal equations of B blocks of windows, (B, k, k)
-    and (B, k); a block is a log or a segment of a log. precision: (k,), precision of the prior. covariance: (k, k),
-    jackknife covariance of the parameters.
+    The dead zones of all joints are free parameters here.
+
+    Attributes:
+        blocks: normal equations of B blocks of windows, (B, k, k) and (B, k); a block is a log or a segment of a log.
+        precision: (k,), precision of the prior.
+        covariance: (k, k), jackknife covariance of the parameters.
     """
 
     blocks: NormalEquations

@@ -27,8 +27,11 @@ class ServoRollouts:
     joints. A parameter that joints share (body parameters, delay) needs a rollout of its own. All these rollouts form
     one batch.
 
-    motion: the fixed motion. load: load along this motion for x0. inertial: phi(x0), (10 B,). difference_step: step of
-    the finite differences.
+    Attributes:
+        motion: the fixed motion.
+        load: load along this motion for x0.
+        inertial: phi(x0), (10 B,).
+        difference_step: step of the finite differences.
     """
 
     model: ArmModel
@@ -107,8 +110,10 @@ class ServoRollouts:
     def _rollout(self, joints: Tensor, bodies: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
         """Return predicted q and qd, (P, W, K, n) each, for P sets of parameters and W windows of K samples.
 
-        joints: (P, p, n), joint parameters. bodies: (P, r), body coordinates. commands: (P, W, K-1, S, n) [rad, m],
-        commands at the S integration steps of each sample interval.
+        Args:
+            joints: (P, p, n), joint parameters.
+            bodies: (P, r), body coordinates.
+            commands: (P, W, K-1, S, n) [rad, m], commands at the S integration steps of each sample interval.
         """
         tensors = {name: tensor.detach() for name, tensor in self.parameters.named(joints).items()}
         # Inference mode saves 10 % of the time, since there are many small operations.
@@ -125,9 +130,11 @@ class ServoRollouts:
     ) -> tuple[Tensor, Tensor]:
         """Integrate all joints of W windows for P sets of parameters; return q and qd, (P, W, K, n) each.
 
-        drives: servos and friction of the P sets. armature: (P, 1, n). added: (P, W, K-1, n) [Nm, N], change of the
-        load due to changed body parameters. commands: (P, W, K-1, S, n) [rad, m], commands at the S integration steps
-        of each sample interval.
+        Args:
+            drives: servos and friction of the P sets.
+            armature: (P, 1, n).
+            added: (P, W, K-1, n) [Nm, N], change of the load due to changed body parameters.
+            commands: (P, W, K-1, S, n) [rad, m], commands at the S integration steps of each sample interval.
         """
         windows, load = self.windows, self.load
         h = windows.dt.unsqueeze(-1) / commands.shape[3]

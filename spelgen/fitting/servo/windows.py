@@ -35,9 +35,14 @@ class MidpointMotion(NamedTuple):
 class ServoWindows:
     """W windows of K samples, cut from logs of commanded and measured positions.
 
-    rows: (log, slice of its samples) of each window. q: (W, K, n) [rad, m]. qd: (W, K, n) [rad/s, m/s], smoothed. dt:
-    (W, K-1), sample intervals [s]. burn_in: number of samples at the start of each window whose errors are ignored,
-    since the initial friction state is unknown. steps: number of integration steps per sample interval.
+    Attributes:
+        rows: (log, slice of its samples) of each window.
+        q: (W, K, n) [rad, m].
+        qd: (W, K, n) [rad/s, m/s], smoothed.
+        dt: (W, K-1), sample intervals [s].
+        burn_in: number of samples at the start of each window whose errors are ignored, since the initial friction
+            state is unknown.
+        steps: number of integration steps per sample interval.
     """
 
     rows: tuple[LogRows, ...]
@@ -138,10 +143,13 @@ def servo_windows(
 class BodyLoad(NamedTuple):
     """The load of the bodies on the drives, at the midpoints between the samples of windows.
 
-    inertia: (W, K-1, n), diagonal of M without armature [kg m^2, kg]. bias: (W, K-1, n) [Nm, N], Coriolis, centrifugal
-    and gravity torque, plus the inertial torque of the off-diagonal entries of M. gravity: (W, K-1, n), gravity torque
-    [Nm, N]. regressor: (W, K-1, n, 10 B), derivatives of the inverse-dynamics torque with respect to the inertial
-    parameters of B bodies.
+    Attributes:
+        inertia: (W, K-1, n), diagonal of M without armature [kg m^2, kg].
+        bias: (W, K-1, n) [Nm, N], Coriolis, centrifugal and gravity torque, plus the inertial torque of the
+            off-diagonal entries of M.
+        gravity: (W, K-1, n), gravity torque [Nm, N].
+        regressor: (W, K-1, n, 10 B), derivatives of the inverse-dynamics torque with respect to the inertial parameters
+            of B bodies.
     """
 
     inertia: Tensor

@@ -44,9 +44,12 @@ from spelgen.settings.fits import Adaptation, GaussianPrior
 class RegressionComparison(NamedTuple):
     """Held-out errors of a torque fit and of ridge regression, see `Regression`.
 
-    fit, regression: mean squared error of held-out blocks divided by the variance of the torque, averaged over joints.
-    behind: True if the regression is significantly better than the fit. replaced: the error of the first fit, whose
-    initial guess was the URDF, if it was replaced by a fit whose initial guess is the regression; otherwise None.
+    Attributes:
+        fit, regression: mean squared error of held-out blocks divided by the variance of the torque, averaged over
+            joints.
+        behind: True if the regression is significantly better than the fit.
+        replaced: the error of the first fit, whose initial guess was the URDF, if it was replaced by a fit whose
+            initial guess is the regression; otherwise None.
     """
 
     fit: float
@@ -59,12 +62,18 @@ class RegressionComparison(NamedTuple):
 class TorqueSolution:
     """Result of a torque fit.
 
-    rms_residual: root mean square torque residual, (n,) [Nm, N]. steps: number of accepted steps of the
-    Levenberg-Marquardt solver. cost: final cost. prior: prior with the estimated standard deviations. covariance:
-    covariance of the parameters x, (K, K). torque_std: root mean square torque error of held-out blocks, (n,) [Nm, N].
-    compensated: joints whose drives compensate friction, (n,). correlation_time: correlation time of the torque errors,
-    (n,) [s]. held_out_nmse: mean squared error of held-out blocks divided by the variance of the torque, (n,).
-    selected_terms: the selected residual terms. comparison: comparison with ridge regression; None for an adapted fit.
+    Attributes:
+        rms_residual: root mean square torque residual, (n,) [Nm, N].
+        steps: number of accepted steps of the Levenberg-Marquardt solver.
+        cost: final cost.
+        prior: prior with the estimated standard deviations.
+        covariance: covariance of the parameters x, (K, K).
+        torque_std: root mean square torque error of held-out blocks, (n,) [Nm, N].
+        compensated: joints whose drives compensate friction, (n,).
+        correlation_time: correlation time of the torque errors, (n,) [s].
+        held_out_nmse: mean squared error of held-out blocks divided by the variance of the torque, (n,).
+        selected_terms: the selected residual terms.
+        comparison: comparison with ridge regression; None for an adapted fit.
     """
 
     rms_residual: np.ndarray

@@ -30,9 +30,12 @@ LOGARITHMIC_GROUPS = ("armature", "sizes", "effects", "load_dependence")
 class _RegressorBlock(NamedTuple):
     """T samples with all factors of the modelled torque that do not depend on the parameters x.
 
-    speed, acceleration: speeds and accelerations of the drives, (T, n). regressor: of the joint torque, (T, n, 10 B).
-    load_regressor: regressor of the gravity torque on the drives, (T, n, 10 B). residual_torque: torque of the residual
-    terms, (T, n) [Nm, N]. friction_factor: factor of the residual terms on friction, (T, n).
+    Attributes:
+        speed, acceleration: speeds and accelerations of the drives, (T, n).
+        regressor: of the joint torque, (T, n, 10 B).
+        load_regressor: regressor of the gravity torque on the drives, (T, n, 10 B).
+        residual_torque: torque of the residual terms, (T, n) [Nm, N].
+        friction_factor: factor of the residual terms on friction, (T, n).
     """
 
     samples: SampleBlock

@@ -12,8 +12,10 @@ import torch.nn.functional as F
 class JointRows(NamedTuple):
     """Linearized torque residual of one joint: residual(theta + s) = residual - jacobian @ s[columns].
 
-    columns: (C,), indices of the C entries of theta on which the torque of the joint depends. jacobian: (T, C),
-    derivatives of the modelled torque with respect to these entries. residual: (T,) [Nm, N], torque residual at theta.
+    Attributes:
+        columns: (C,), indices of the C entries of theta on which the torque of the joint depends.
+        jacobian: (T, C), derivatives of the modelled torque with respect to these entries.
+        residual: (T,) [Nm, N], torque residual at theta.
     """
 
     joint: int
@@ -172,10 +174,14 @@ def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
 class BayesianRidge(NamedTuple):
     """Result of `bayesian_ridge` for P weights in G groups.
 
-    coef: (P,), weights, the ridge solution for `penalty`. penalty: (P,), penalty on the squared weights: lambda / alpha
-    times the correlation length. alpha: precision of the noise. lambda_: (G,), prior precision of the weights of each
-    group. gamma: (G,), effective number of weights of each group. n_iter: number of fixed-point iterations. converged:
-    True if the iterations have converged.
+    Attributes:
+        coef: (P,), weights, the ridge solution for `penalty`.
+        penalty: (P,), penalty on the squared weights: lambda / alpha times the correlation length.
+        alpha: precision of the noise.
+        lambda_: (G,), prior precision of the weights of each group.
+        gamma: (G,), effective number of weights of each group.
+        n_iter: number of fixed-point iterations.
+        converged: True if the iterations have converged.
     """
 
     coef: torch.Tensor

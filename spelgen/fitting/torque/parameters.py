@@ -197,9 +197,12 @@ class ParameterPrior:
     would keep wrong values, or would widen the prior of all links. The t distribution is represented as a Gaussian with
     an estimated width for each body.
 
-    rigid: `ParameterVector` of the parameters x. widths: current standard deviation of each group; for bodies, the
-    scale of the t distribution. hyperprior: the initial standard deviations, about which the estimates have a
-    hyperprior. mean: prior mean of x, (K,). body_widths: current standard deviation of each body, (B,).
+    Attributes:
+        rigid: `ParameterVector` of the parameters x.
+        widths: current standard deviation of each group; for bodies, the scale of the t distribution.
+        hyperprior: the initial standard deviations, about which the estimates have a hyperprior.
+        mean: prior mean of x, (K,).
+        body_widths: current standard deviation of each body, (B,).
     """
 
     rigid: ParameterVector
@@ -283,8 +286,12 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
     def width(squares: torch.Tensor, gamma: torch.Tensor, group: str, center: float) -> torch.Tensor:
         """Return sqrt((squares + c center^2) / (gamma + c)), limited by the upper bound of the group's width.
 
-        c: degrees of freedom of the hyperprior. center: its width. squares: sum of squared offsets from the prior mean.
-        gamma: effective number of parameters, same shape as squares.
+        c is the number of degrees of freedom of the hyperprior.
+
+        Args:
+            center: width about which the hyperprior is.
+            squares: sum of squared offsets from the prior mean.
+            gamma: effective number of parameters, same shape as squares.
         """
         square = (squares + freedom * center**2) / (gamma.clamp(min=0.0) + freedom)
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))

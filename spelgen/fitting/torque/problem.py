@@ -100,10 +100,12 @@ class NoiseEstimator:
 class TorqueProblem:
     """Negative log posterior of x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
-    noise: (n,) [Nm, N], scaled such that the errors of all samples can be treated as independent (see
-    `NoiseEstimator`). adapt: group of parameters to estimate, "load", "friction" or "unit"; None: all parameters.
-    compensated: (n,), True for joints whose drives compensate friction (see `stages.find_compensation`).
-    correlation_time: (n,) [s], correlation time of the torque errors.
+    Attributes:
+        noise: (n,) [Nm, N], scaled such that the errors of all samples can be treated as independent (see
+            `NoiseEstimator`).
+        adapt: group of parameters to estimate, "load", "friction" or "unit"; None: all parameters.
+        compensated: (n,), True for joints whose drives compensate friction (see `stages.find_compensation`).
+        correlation_time: (n,) [s], correlation time of the torque errors.
     """
 
     jacobian: TorqueJacobian

@@ -35,8 +35,10 @@ class SampleBlock(NamedTuple):
 class TorqueSamples:
     """Concatenated samples of all trajectories.
 
-    original_count: number of samples before decimation and subsampling. interval: time between successive samples [s].
-    recordings: (T,), index of the recording to which each sample belongs.
+    Attributes:
+        original_count: number of samples before decimation and subsampling.
+        interval: time between successive samples [s].
+        recordings: (T,), index of the recording to which each sample belongs.
     """
 
     columns: SampleBlock

@@ -40,9 +40,11 @@ from spelgen.fitting.torque.tuning import SELECTION
 class SelectedTerm:
     """A selected residual term.
 
-    name: name of the parameter of the term, or `residual_potential` or `residual_mass`. joint: index of the joint; None
-    for networks. error_reduction: relative reduction of the held-out squared torque residual at the joints on which the
-    term acts.
+    Attributes:
+        name: name of the parameter of the term, or `residual_potential` or `residual_mass`.
+        joint: index of the joint; None for networks.
+        error_reduction: relative reduction of the held-out squared torque residual at the joints on which the term
+            acts.
     """
 
     name: str
@@ -134,9 +136,13 @@ def _best(
 ) -> SelectedTerm | None:
     """Return the accepted candidate with the largest error reduction; None if no candidate is accepted.
 
-    candidates: residual terms of one joint. torque_residual: (T, n) [Nm, N]. noise: (n,) [Nm, N]. correlation_length:
-    number of samples per independent error. recordings: (T,), index of the recording of each sample. limits: result of
-    `max_torques` for one or two recordings; None: no bounds.
+    Args:
+        candidates: residual terms of one joint.
+        torque_residual: (T, n) [Nm, N].
+        noise: (n,) [Nm, N].
+        correlation_length: number of samples per independent error.
+        recordings: (T,), index of the recording of each sample.
+        limits: result of `max_torques` for one or two recordings; None: no bounds.
     """
     significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
     # The second test is on halves: of all divisions, they have the largest distance in time between fitted and held-out
