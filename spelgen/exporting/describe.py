@@ -188,8 +188,8 @@ def _network(
     """Return a network of tanh units as a network of sigmoids; None if it has no layers or a zero last layer.
 
     The result computes y(q), the outputs of the given network, or tanh(y(q)) @ functions. Sigmoids take less time in C.
-    In tanh(x) = 2 sigmoid(2 x) - 1, the factor of x is included in the weights and biases of the layer before the unit,
-    the other factor and the shift in the layer after it.
+    The factors and the shift in tanh(x) = 2 sigmoid(2 x) - 1 are included in the weights and biases of the adjacent
+    layers.
 
     Args:
         layers: weights and biases of the layers of tanh units, and of the last layer, which is linear.

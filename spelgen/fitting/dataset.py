@@ -50,7 +50,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """The arguments of `fit`, with all defaults replaced by values.
+    """The arguments of `fit` after its default values have been resolved.
 
     Attributes:
         validation: fraction of the logs that is set aside for validation, or the validation trajectories.

@@ -168,8 +168,8 @@ class LBFGS(WindowOptimizer):
         except torch.linalg.LinAlgError:
             return math.nan
         loss, (last, last_penalised) = total.item(), group["last"]
-        # The optimizer lowers the penalised loss, so the loss may rise meanwhile: a decrease of either counts as
-        # progress.
+        # A decrease of the loss or of the penalised loss counts as progress: a decrease of the penalty may raise the
+        # loss.
         progress = loss <= TUNING.lbfgs_stalled * last or penalised <= TUNING.lbfgs_stalled * last_penalised
         group["last"], group["waits"] = (loss, penalised), 0 if progress else group["waits"] + 1
         return loss

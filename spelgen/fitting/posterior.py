@@ -120,8 +120,8 @@ class Posterior:
         """Return the torques (T, n) [Nm, N] that would be logged, with standard deviations.
 
         motion: q, qd, qdd, (T, n) each and, if known, the friction state z and the direction of motion (see
-        `DynamicsSamples`). The variance is the sum of the parameters' uncertainty and of `torque_std` squared, which
-        includes noise and model errors.
+        `DynamicsSamples`). The variance is the sum of two variances: the one due to errors of the parameters, and
+        `torque_std` squared, which includes noise and model errors.
         """
         q, *motion_and_state = (torch.as_tensor(np.ascontiguousarray(x)) for x in motion)
         model, root, of_bodies = self.model, self._root.clone(), self._vector.mask("bodies")

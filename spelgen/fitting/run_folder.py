@@ -48,7 +48,7 @@ class RunFolder:
         self.estimator = self.path / "estimator.json"
 
     def require_free(self, *, force: bool) -> None:
-        """Raise RunError if the folder contains a run, unless ``force`` is true and the run may be replaced."""
+        """Raise RunError if the folder contains a run, unless ``force`` permits to replace it."""
         if self.path.exists() and not self.path.is_dir():
             raise RunError("a file", file=self.path, expected="a folder or a new name")
         if self.config.exists() and not force:

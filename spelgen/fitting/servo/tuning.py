@@ -51,8 +51,8 @@ class ServoTuning:
 
     # [s] Largest correlation time of the position errors; most measured correlation times are above 0.2 s.
     correlation_time: float = 0.5
-    # [1] Finite-difference step of the parameters. It must be far above the rounding errors of rollouts, about half the
-    # digits of double precision.
+    # [1] Finite-difference step of the parameters. It must be far above the rounding errors of rollouts, which lose
+    # about half the digits of double precision.
     difference_step: float = 1e-4
     # [1] Largest change of any parameter in a solver step; most parameters are logarithms, for which 1 is a factor of
     # e.

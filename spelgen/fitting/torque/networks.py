@@ -149,7 +149,7 @@ def _fit_network(
         minimise(network, lambda: [cost()], evaluations, weight_decay=1.0)
 
     first, last = split_halves(len(samples.q), correlation_length)
-    # A few evaluations of the loss show whether the network explains anything; most networks do not.
+    # Most networks explain nothing, which a few evaluations of the loss show: they are rejected without a full fit.
     for evaluations in (SELECTION.network_probe_evaluations, SELECTION.network_evaluations):
         fit(first, evaluations)
         error = _remaining_residual(model, samples)

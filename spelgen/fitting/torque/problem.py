@@ -89,7 +89,9 @@ class NoiseEstimator:
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] for an iteration of noise annealing: a fraction of the noise of the residual.
+        """Return the noise (n,) [Nm, N] for an iteration of noise annealing.
+
+        It is `annealing_fraction` times the noise that is estimated from the residual.
 
         squared_residual: (n,) sum over all samples [Nm^2, N^2].
         """
