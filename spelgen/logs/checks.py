@@ -69,7 +69,7 @@ class Check(Generic[Subject]):
     do: str | None = None
 
 
-# `LogChecks` collects findings of two types of checks in one dict: checks of a trajectory and checks of a joint.
+# Check of a trajectory or of a joint: `LogChecks` collects the findings of both in one dict.
 AnyCheck = Check[Any]
 
 

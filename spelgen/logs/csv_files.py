@@ -41,7 +41,7 @@ class Beginning(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with the only table of a CSV file; an incomplete last line is omitted, with a remark."""
+    """Return a list with one table, the content of a CSV file; an incomplete last line is omitted, with a remark."""
     table, header, cut = _csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
     return [

@@ -68,8 +68,11 @@ def dynamics_samples(
     of 8 Hz; its transients at both ends of a piece are removed. qdd is the central difference of the filtered qd.
     Trajectories sampled below 24 Hz are omitted, since their accelerations are unknown.
 
-    pauses: if True, samples at standstill between the first and the last motion of a piece are returned, too. reach:
-    break-away displacements of the friction bristles; None: bristle states z are not computed.
+    Args:
+        trajectories: logs with torques.
+        pauses: if True, samples at standstill between the first and the last motion of a piece are returned, too.
+        preprocessing: cutoff of the filter, time steps that count as gaps, and delay of the torques.
+        reach: break-away displacements (n, K) of the friction bristles; None: bristle states z are not computed.
     """
     samples = []
     for trajectory in preprocessing.moved(trajectories):

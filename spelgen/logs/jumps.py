@@ -142,8 +142,8 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
 
     Equal rows are repeats of the first of them if the arm moved while they were written: the step at the end of a block
     of k equal rows is then about as large as k steps of the following motion. Equal rows of an arm at rest are not
-    repeats. The exception is a logger that writes each row m times during motion: at rest, too, only every m-th row is
-    then not a repeat. positions: number of leading columns that are positions.
+    repeats. The exception is a logger that writes each row m times during motion: at rest, too, one of m rows is
+    original, and the others are repeats. positions: number of leading columns that are positions.
     """
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
     lengths = np.diff(np.append(starts, len(columns)))

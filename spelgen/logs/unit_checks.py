@@ -232,7 +232,7 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
     message = find_held(signals)
     if message is None or shows_accelerations(rate / max(repeated.values())):
         return None
-    # If only velocities keep their values, they can be computed from the positions instead.
+    # If only velocities are repeated in several rows, they can be computed from the positions instead.
     is_mended = all(often == 1 for name, often in repeated.items() if name != "qd")
     return Advice(message, keys={"velocity": "differentiated"}) if is_mended else message
 
