@@ -19,13 +19,17 @@ UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
 
 
 class WrongOrder(Fault):
-    """Joints in another order.
-
-    description: the exchanged columns. rows: rows of `Hypothesis.source` that are permuted, 0 for the motion and 1 for
-    the torques. starts: number of orders from which the search for the best order starts.
-    """
+    """Columns of the joints in another order."""
 
     def __init__(self, code: str, description: str, rows: tuple[int, ...], starts: int = 9) -> None:
+        """Define the columns that are in another order.
+
+        Args:
+            code: code of the finding.
+            description: text about the exchanged columns.
+            rows: rows of `Hypothesis.source` that are permuted, 0 for the motion and 1 for the torques.
+            starts: number of orders from which the search for the best order starts, at most 9.
+        """
         self.code, self.description = code, description
         self._rows, self._starts = rows, starts
 

@@ -23,10 +23,11 @@ Vector3 = tuple[float, float, float]
 class MotionSamples:
     """S samples of motion and joint torques of n joints.
 
-    values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at E times around each sample, see `DriveSamples`;
-    E = 1 for samples without their neighbours. bent: (S, n, K) bristle deflections of the unchanged log; K = 0 for
-    samples without a history of motion. times: (S,) [s] times of the samples, see `DriveSamples`; 0 for samples without
-    their neighbours.
+    Attributes:
+        values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at E times around each sample, see
+            `DriveSamples`; E = 1 for samples without their neighbours.
+        bent: (S, n, K) bristle deflections of the unchanged log; K = 0 for samples without a history of motion.
+        times: (S,) times of the samples [s], see `DriveSamples`; 0 for samples without their neighbours.
     """
 
     values: np.ndarray
@@ -90,13 +91,17 @@ class Hypothesis:
     """Hypothesis about a log: columns, scales, offsets and delays of n joints, and gravity.
 
     Arrays of shape (2, n) have a row for the motion (position and velocity) and a row for the torque of each joint. The
-    position of joint k is scale[0, k] times the logged position of joint source[0, k], plus offset[k] [rad, m]. The
-    torque of joint k is scale[1, k] times the logged torque of joint source[1, k].
+    position of joint k is scale[0, k] times the logged position of joint source[0, k], plus offset[k]. The torque of
+    joint k is scale[1, k] times the logged torque of joint source[1, k].
 
-    faults: kinds of the faults that the hypothesis assumes; empty for the unchanged log. source: (2, n) indices of
-    joints. scale: (2, n) factors. offset: (n,) [rad, m]. delay: (2, n) [s] delays of the logged signals at time 0.
-    drift: (2, n) [1] derivative of the delays with respect to time. gravity: vector of gravity in the frame of the root
-    link [m/s^2].
+    Attributes:
+        faults: kinds of faults that the hypothesis assumes; empty for the unchanged log.
+        source: (2, n) indices of the joints under which the signals are logged.
+        scale: (2, n) factors from logged signals to SI units.
+        offset: (n,) zero offsets of the positions [rad, m].
+        delay: (2, n) delays of the logged signals at time 0 [s].
+        drift: (2, n) derivatives of the delays with respect to time [1].
+        gravity: vector of gravity in the frame of the root link [m/s^2].
     """
 
     faults: tuple[Fault, ...]

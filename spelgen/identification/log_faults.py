@@ -25,8 +25,12 @@ from spelgen.settings.log_mapping import LogMapping
 class Correction:
     """Correction of the settings of a log of n joints: the difference between a hypothesis and the unchanged log.
 
-    unchanged: hypothesis of the log with its current mapping. by_name: True if the log consists of messages that
-    contain joint names, as in ROS bags, and not of columns.
+    Attributes:
+        arm: arm of the log.
+        mapping: current mapping of the log.
+        by_name: True if the log consists of messages that contain joint names, as in ROS bags, and not of columns.
+        unchanged: hypothesis without faults, with the signs, scales and offsets of the current mapping.
+        hypothesis: hypothesis that explains the log better.
     """
 
     arm: Chain
@@ -68,10 +72,14 @@ class Correction:
 class Fault(ABC):
     """Kind of fault of a log.
 
-    code: code of the finding. description: description of the fault, if it is constant. rarity: penalty on the cost of
-    a correction, for faults that are rarer than a wrong sense or order; it decides between corrections that explain the
-    torques equally well. needed: smallest cost decrease of an accepted correction. evidence: sentence with the evidence
-    for the fault; "" if the evidence is the torque residual. advice: what to do about a fault that no setting corrects.
+    Attributes:
+        code: code of the finding.
+        description: text about the fault, for faults with a constant text.
+        rarity: penalty on the cost of hypotheses with this fault, 0 for the most frequent faults. The penalty decides
+            between hypotheses that explain the torques equally well.
+        needed: smallest cost decrease of an accepted hypothesis.
+        evidence: sentence with the evidence for the fault; "" if the evidence is the torque residual.
+        advice: remedy of a fault that no setting corrects.
     """
 
     code: str
