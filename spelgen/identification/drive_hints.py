@@ -49,11 +49,14 @@ OFFSETS = np.arange(-HINTS.longest_offset, HINTS.longest_offset + 1, 2)
 class DriveSamples(NamedTuple):
     """S samples of a moving arm with n joints, and time-shifted signals.
 
-    around: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and joint torques [Nm, N] at each of the E times `OFFSETS` after the
-    sample; beyond the ends of a recording its first or last value. times: (S,) [s] times of the samples since the start
-    of the first recording, without the pauses between recordings. bent: (S, n, K) bristle deflections, divided by the
-    break-away displacements. direction: (S, n) direction of dry friction, see `DynamicsSamples`. torques: (S, n, D)
-    [Nm, N] joint torques, shifted in time by each of the D `SHIFTS`.
+    Attributes:
+        around: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and joint torques [Nm, N] at each of the E times `OFFSETS` after
+            the sample; beyond the ends of a recording its first or last value.
+        times: (S,) times of the samples since the start of the first recording [s], without the pauses between
+            recordings.
+        bent: (S, n, K) bristle deflections, divided by the break-away displacements.
+        direction: (S, n) direction of dry friction, see `DynamicsSamples`.
+        torques: (S, n, D) joint torques [Nm, N], shifted in time by each of the D `SHIFTS`.
     """
 
     around: np.ndarray
@@ -328,8 +331,11 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
 def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
     """Return True if a candidate lowers the errors per block (B,) significantly, and their mean by the factor `gain`.
 
-    logged: (B,) errors without the candidate. mended: (B,) errors with it. candidates: number of candidates of which
-    this is the best.
+    Args:
+        logged: (B,) errors without the candidate.
+        mended: (B,) errors with the candidate.
+        gain: largest ratio of both means.
+        candidates: number of candidates of which this candidate is the best.
     """
     if mended.mean() >= gain * logged.mean():
         return False

@@ -60,8 +60,8 @@ def kinds_of_faults(
 class HypothesisComparison:
     """Result of the search for better hypotheses about a log.
 
-    unchanged: fit of the unchanged log. better: fits that are significantly better than it, and about equally good; the
-    best is first.
+    unchanged: fit of the unchanged log. better: fits that are significantly better than `unchanged`, and about equally
+    good; the best is first.
     """
 
     unchanged: HypothesisFit

@@ -19,8 +19,10 @@ Columns = tuple[np.ndarray, np.ndarray]
 class Triangles:
     """Triangular QR factors of the least-squares equations of n joints with K parameters.
 
-    factors: (n, K + 1, K + 1) upper triangular factor of each joint's matrix [regressor, torque]. count: number of
-    samples. deviation: (n,) standard deviation of the torque [Nm, N].
+    Attributes:
+        factors: (n, K + 1, K + 1) upper triangular factor of each joint's matrix [regressor, torque].
+        count: number of samples.
+        deviation: (n,) standard deviation of the torque [Nm, N].
     """
 
     factors: np.ndarray

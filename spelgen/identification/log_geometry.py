@@ -272,8 +272,10 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
     The columns of R are the derivatives of the inertial parameters with respect to the mass (at a fixed shape), the
     centre of mass, and the inertia tensor about the centre of mass, each times a standard deviation.
 
-    own: (10,) inertial parameters of the body in the URDF. length: largest distance from the body's origin to a joint
-    that the body carries [m]. typical: mass assumed for a body without <inertial> [kg].
+    Args:
+        own: (10,) inertial parameters of the body in the URDF.
+        length: largest distance from the body's origin to a joint that the body carries [m].
+        typical: mass assumed for a body without <inertial> [kg].
     """
     if own[0] <= 0:
         # a wide prior: standard deviations of 20 times the typical mass, with an extent of at least half a metre

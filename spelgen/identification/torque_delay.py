@@ -32,9 +32,11 @@ FRICTION = FrictionModel(memory=True)
 class TorqueDelay:
     """Delay of logged torques relative to positions.
 
-    delay: [s], positive if torques are logged later than positions; 0 if no delay is significant. interval: half the
-    width of the delay's 99 % interval [s]. coupling: coupling of motors and its error ratio, see `find_coupling`. If a
-    coupling is found, no delay is estimated, since the estimate would be biased.
+    Attributes:
+        delay: delay [s], positive if torques are logged later than positions; 0 if no delay is significant.
+        interval: half the width of the delay's 99 % interval [s].
+        coupling: coupling of motors and its error ratio, see `find_coupling`. If a coupling is found, no delay is
+            estimated, since the estimate would be biased.
     """
 
     delay: float = 0.0
@@ -73,17 +75,21 @@ class _Estimate:
 
 def find_torque_delay(
     logs: Sequence[Trajectory],
-    kinds: Sequence[str],
+    joint_types: Sequence[str],
     drives: Drives,
     chain: BodyChain,
     preprocessing: Preprocessing,
 ) -> TorqueDelay:
     """Return the delay of the torques in logs, see `delay_of`.
 
-    kinds: "revolute" or "prismatic" for each joint. drives: input matrix and speeds of the drives. chain: chain of the
-    arm's bodies. preprocessing: filter and gap of the samples.
+    Args:
+        logs: trajectories with torques.
+        joint_types: "revolute" or "prismatic" for each joint.
+        drives: input matrix and speeds of the drives.
+        chain: chain of the arm's bodies.
+        preprocessing: filter and gap of the samples.
     """
-    collected = DriveLog(kinds, drives, preprocessing)
+    collected = DriveLog(joint_types, drives, preprocessing)
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
         collected.add(log)
     samples = collected.samples()

@@ -25,8 +25,10 @@ SIDES = np.array([-1.0, 1.0])
 class FlatTops(NamedTuple):
     """Flat bottoms and tops of the positions and torques of n joints: extreme values at which a signal is constant.
 
-    q: (2, n) lowest and highest positions [rad, m]; NaN if they are not flat. tau: (2, n) lowest and highest torques
-    [Nm, N]; NaN if they are not flat. shares: (2, n) fraction of the samples at these torques.
+    Attributes:
+        q: (2, n) lowest and highest positions [rad, m]; NaN for positions that are not flat.
+        tau: (2, n) lowest and highest torques [Nm, N]; NaN for torques that are not flat.
+        shares: (2, n) fraction of the samples at these torques.
     """
 
     q: np.ndarray
