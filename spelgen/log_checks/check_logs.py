@@ -9,6 +9,7 @@ from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.log_checks.check_servo_logs import ServoLogs
 from spelgen.log_checks.check_torque_logs import COUPLED, CURRENT, WRONG_LINK, TorqueLogs
 from spelgen.log_checks.geometry_finding import WARNINGS
+from spelgen.log_checks.limits_in_logs import AT_A_STOP
 from spelgen.log_checks.report import LogReport, joint_report
 from spelgen.log_checks.robot_checks import CHECKS
 from spelgen.log_checks.statistics import Statistics, statistics
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
     from spelgen.settings.log_mapping import LogMapping
 
-ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, CURRENT, WRONG_LINK, *WARNINGS}
+ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, CURRENT, WRONG_LINK, AT_A_STOP, *WARNINGS}
 
 
 def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None = None) -> LogReport:

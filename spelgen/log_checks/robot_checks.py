@@ -211,14 +211,6 @@ def find_coarse(joint: JointEvidence) -> str | None:
     return None
 
 
-def find_stop(joint: JointEvidence) -> str | None:
-    """Find joints that reach a position limit, at which a mechanical stop adds a contact torque."""
-    for limit, extreme in zip(joint.limits(), (joint.report.low["q"], joint.report.high["q"]), strict=True):
-        if abs(extreme - limit) <= TUNING.limit_rounding:
-            return f"q reaches its limit {limit:.4g}: contact with the stop changes the torque; remove such motion"
-    return None
-
-
 def find_one_way(joint: JointEvidence) -> str | None:
     """Find joints that move in one direction only: dry friction is then confounded with the load of the joint."""
     slower, faster = sorted((-joint.report.low["qd"], joint.report.high["qd"]))
@@ -251,7 +243,6 @@ CHECKS: list[Check[JointEvidence]] = [
     *POSITION_CHECKS,
     Check("beyond-velocity-limit", "warning", partial(find_above, "velocity", "qd")),
     Check("beyond-effort-limit", "warning", partial(find_above, "effort", "tau")),
-    Check("at-a-stop", "warning", find_stop),
     Check("coarse", "warning", find_coarse),
     Check("one-way", "warning", find_one_way),
     Check(WITHOUT_GRAVITY, "warning", find_no_gravity),
