@@ -72,6 +72,16 @@ def test_the_clock_of_one_joint_that_runs_fast_or_slow_is_named(arm, rate, torqu
     assert order == ("fast" if rate > 1 else "slow") and "write" not in error
 
 
+@pytest.mark.parametrize("arm", ["six_dof", "ur10e"], indirect=True)
+@pytest.mark.parametrize("units", [{"q": "deg"}, {"q": "deg", "qd": "rad/s"}])
+def test_a_unit_of_positions_that_contradicts_the_velocities_is_named(arm, units):  # noqa: F811
+    """The velocities are right: the answer is not another unit for them."""
+    mapping = LogMapping.model_validate({"units": units})
+    log = recorded(arm, 13)
+    error = told(arm, replace(log, q=np.deg2rad(log.q), mapping=mapping), mapping)
+    assert "q in rad" in error and "write 'units: {q: rad}' under 'logs'" in error
+
+
 @pytest.mark.parametrize(
     ("arm", "sign", "line"),
     [

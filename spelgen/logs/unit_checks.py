@@ -90,7 +90,15 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
     is_known &= "qd" in mapping.quantities
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
-    if mapping.unit("q", joint):
+    stated = mapping.unit("q", joint)
+    # A wrong unit in the mapping, such as deg for positions in rad, makes the motion of all joints implausibly small.
+    # The unit of the positions is then a better explanation than the unit of the velocities.
+    largest = float(np.ptp(signals.trajectory.q, axis=0).max())
+    for unit in positions if stated and is_known and largest < 0.1 else ():
+        ratio = SCALES.get(unit, 1.0) / SCALES.get(stated or unit, 1.0)
+        if 0.5 < largest * ratio < TURNS:
+            yield abs(log(signals.factor * ratio)) + 0.01, {"units": {"q": unit}}
+    if stated:
         positions = positions[:1]
     if not is_known or mapping.unit("qd", joint):
         speeds = speeds[:1]
