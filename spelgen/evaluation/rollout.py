@@ -1,4 +1,8 @@
-"""Forward simulation of a model, its invariants, and the error of M of simulated arms whose truth is known."""
+"""Forward simulation of a model, tests of the model's physical consistency, and the error of the model's M.
+
+The tests are on positive definiteness of M, and on the energy of free motion. The error of M needs the true M, which is
+known for simulated arms only.
+"""
 
 import math
 from collections.abc import Mapping, Sequence

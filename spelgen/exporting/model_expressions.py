@@ -1,4 +1,8 @@
-"""Entry points of a trained model as CasADi expressions of state, inputs, and symbols for the residual terms."""
+"""CasADi expressions of the functions of a trained model (entry points), for example of inverse dynamics.
+
+The variables of an expression are the inputs of the entry point, for example q and qd, and symbols that represent the
+residual terms (see `residual_expressions`).
+"""
 
 from collections.abc import Mapping
 

@@ -224,7 +224,7 @@ def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
 def _likelihood(
     segments: Sequence[Sequence[Block]], grid: np.ndarray, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the negative log likelihood, and the mean normalised squared residual, (G, n) each, at G grid points.
+    """Return the negative log likelihood, and the mean normalised squared residual [1], (G, n) each, at G grid points.
 
     Args:
         segments: consecutive blocks of each log.
@@ -249,9 +249,10 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
-    """Return the levels with the noise of the momentum observer, and with the exponential tail of its peaks.
+    """Return ``levels`` with the noise of the momentum observer, and with the distribution of the largest peaks.
 
-    tested: held-out samples of each log.
+    These are the fields ``observer`` to ``peak_count`` of `NoiseLevels`. tested: held-out samples of each log, as lists
+    of `HeldOutSample`.
     """
     residuals = [_observer_residuals(levels, samples) for samples in tested]
     signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))
@@ -288,7 +289,7 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
 def _observer_residuals(
     levels: NoiseLevels, samples: Sequence[HeldOutSample]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the residual of the momentum observer, its variance and the velocities, (T, n) each."""
+    """Return the residual of the momentum observer, the variance of the residual, and qd, (T, n) each, at T samples."""
     observer = ContactObserver(levels, TUNING.alarms_per_minute)
     drift = JointFilters.of_drift(levels.drift)
     columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
@@ -305,7 +306,7 @@ def _observer_residuals(
 def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, object]:
     """Return the parameters of an exponential distribution of the largest peaks, as fields of `NoiseLevels`.
 
-    peaks: peaks of each log, (W, n) [1]; they are multiplied by `factor`.
+    peaks: peaks of each log in W time windows, (W, n) [1]; they are multiplied by `factor`.
     """
     together = factor * np.concatenate(peaks)
     start = np.quantile(together, 1 - TUNING.tail, axis=0)

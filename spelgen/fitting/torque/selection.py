@@ -159,8 +159,8 @@ def _best(
         if reduction is None and reduction_within is None:
             continue
         weights = candidate.fit(target, correlation_length, first).coef
-        # An implausibly large torque is probably a model error that repeats with the motion and not a torque of the
-        # joint.
+        # A candidate whose torque is implausibly large is rejected: it probably fits a model error that repeats with
+        # the motion, and not an effect in the joint, such as a spring.
         if limits and candidate.torque(weights).std() > limits[candidate.parameter][candidate.joint]:
             continue
         before, after = target[last].square(), (target - candidate.torque(weights))[last].square()
