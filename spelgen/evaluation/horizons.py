@@ -260,7 +260,7 @@ def end_errors(
 ) -> StateErrors:
     """Return the errors at the last sample of W windows of K samples.
 
-    states: predicted q and qd at the samples after the first, (W, K-1, n) each.
+    states: predicted q [rad, m] and qd [rad/s, m/s] at the samples after the first, (W, K-1, n) each.
     """
     q, qd = (predicted[:, -1] for predicted in states)  # (W, n) each
     measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]

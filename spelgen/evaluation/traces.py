@@ -182,7 +182,7 @@ def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosi
 def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[PredictedMotion, ...]:
     """Return two predicted windows of the model: the window of median error and the window of largest error.
 
-    errors: relative error at the end of each window, (W,) [1].
+    errors: relative error [1] of the model at the end of each of W windows, (W,).
     """
     motions = []
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
@@ -193,7 +193,7 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
 
 
 def _quantiles(values: Tensor) -> Quantiles:
-    """Return the quantiles over the W windows of values (W, T), each (T,); NaN is treated as infinity."""
+    """Return the quantiles over W windows of values at T times, (W, T), each (T,); NaN is treated as infinity."""
     ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values.numpy()
     last = len(ordered) - 1
     return Quantiles(*(ordered[round(quantile * last)] for quantile in (0.1, 0.5, 0.9)))

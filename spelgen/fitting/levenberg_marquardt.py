@@ -29,13 +29,16 @@ class Termination(Enum):
 
 
 class NormalEquations(NamedTuple):
-    """Gauss-Newton Hessian of a cost, (..., k, k), and its negative gradient, (..., k)."""
+    """Gauss-Newton Hessian H, (..., k, k), and negative gradient -g, (..., k), of a cost with k parameters."""
 
     curvature: Tensor
     descent: Tensor
 
     def step(self, damping: float | Tensor = 0.0) -> Tensor:
-        """Return the damped steps (..., k). damping: a number for all systems of equations, or (...), one for each."""
+        """Return the steps (H + damping diag H)^-1 (-g), (..., k).
+
+        damping: a number for all systems of equations, or (...), one for each.
+        """
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
         # Marquardt's scaling by diag H instead of Levenberg's identity: steps are independent of the parameters' units.
         diagonal = torch.diag_embed(self.curvature.diagonal(dim1=-2, dim2=-1))
@@ -94,7 +97,7 @@ class LeastSquaresProblem(Protocol[Parameters]):
         """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) with respect to k free parameters."""
 
     def candidates(self, x: Parameters, step: Tensor) -> Iterable[Parameters]:
-        """Return the candidates, one or more, for the parameters after a step (k,).
+        """Return one or more candidates for the parameters after a step (k,) of the k free parameters.
 
         The solver evaluates the next candidate only if the gain ratio of the best candidate so far (decrease of the
         cost divided by the predicted decrease) is low.

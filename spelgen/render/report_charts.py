@@ -117,7 +117,10 @@ def friction_panels(
 
 
 def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
-    """Return limits of the y axis that contain the model's curve and the values (K,) [Nm, N] except outliers."""
+    """Return limits of the y axis that contain the model's curve, and all values except outliers.
+
+    values: measured friction [Nm, N]. curve: friction of the model [Nm, N]. None if no value is finite.
+    """
     values = values[np.isfinite(values)]
     if not values.size:
         return None

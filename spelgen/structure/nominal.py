@@ -117,7 +117,10 @@ def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
 
 
 def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
-    """Whether, for the inertials of the URDF, every joint moves a mass and M is positive definite at q (S, n)."""
+    """Whether, with the inertials of the URDF, every joint moves a mass and M is positive definite.
+
+    M is tested at S positions q, (S, n) [rad, m].
+    """
     mass, _ = float_energies(arm, q, nominal_inertias(arm, True))
     rows, columns = np.tril_indices(q.shape[1])
     lightest = mass.mean(axis=0)[rows == columns].min()
@@ -138,7 +141,7 @@ def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | 
 
 
 def _default_inertia(arm: Chain, index: int) -> list[float]:
-    """Return the inertial parameters (m, h, I) of a sphere of 1 kg about the origin of the body's joint.
+    """Return the inertial parameters (m, h, I) of a sphere of 1 kg about the origin of the body's joint (`recursion`).
 
     The centre of the sphere is half-way to the next joint. For the last body, or if the next joint is closer than
     0.2 m, the centre is at (0.1, 0, 0.1) m in the frame of the body's joint.
@@ -175,7 +178,7 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
 
 
 def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
-    """Return the root mean square over q (S, n) of the gravity torque dV/dq, (n,) [Nm, N]."""
+    """Return the root mean square over S positions q, (S, n), of the gravity torque dV/dq, (n,) [Nm, N]."""
     # [rad, m] Step of the central differences. Their relative error of 1e-8 is small enough for scales.
     step = 1e-4
     shifts = step * np.eye(q.shape[1])[:, None]
@@ -234,7 +237,10 @@ def _round(value: float, digits: int = 6, zero_below: float = 1e-12) -> float:
 
 
 def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
-    """Return pseudo-inertias J (..., 4, 4) of inertial parameters (m, h, I), (..., 10), ordered as ``Body.inertia``."""
+    """Return pseudo-inertias J, (..., 4, 4), of inertial parameters (m, h, I), (..., 10).
+
+    m: mass; h: first moment; I: inertia about the origin, in the order of ``Body.inertia``.
+    """
     values = np.asarray(parameters, dtype=float)
     tensor = np.zeros((*values.shape[:-1], 3, 3))
     rows, columns = np.triu_indices(3)

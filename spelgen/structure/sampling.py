@@ -115,8 +115,8 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
     """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S).
 
-    values: (2 S,). The first half is for all blocks except for block ``index`` + 1, which gets the second half: only
-    there, this coordinate differs from block 0.
+    values: (2 S,). All blocks get the first S values except block ``index`` + 1, which gets the last S values: only in
+    that block, this coordinate differs from block 0.
     """
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
@@ -125,7 +125,7 @@ def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
 
 
 def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a batch of field elements, or an integer, broadcast to an array of this shape, such as (1 + n, S)."""
+    """Return a batch of field elements, or an integer, broadcast to an array of this shape."""
     if isinstance(element, Residues):
         return np.broadcast_to(element.values, shape)
     return np.full(shape, element % PRIME, dtype=np.uint64)

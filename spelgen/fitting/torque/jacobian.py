@@ -32,7 +32,7 @@ class _RegressorBlock(NamedTuple):
 
     Attributes:
         speed, acceleration: speeds and accelerations of the drives, (T, n).
-        regressor: of the joint torque, (T, n, 10 B).
+        regressor: regressor of the joint torque with respect to the inertial parameters of B bodies, (T, n, 10 B).
         load_regressor: regressor of the gravity torque on the drives, (T, n, 10 B).
         residual_torque: torque of the residual terms, (T, n) [Nm, N].
         friction_factor: factor of the residual terms on friction, (T, n).

@@ -100,7 +100,7 @@ class NoiseEstimator:
 
 @dataclass(frozen=True, eq=False)
 class TorqueProblem:
-    """Negative log posterior of x (K,) for a given noise and prior: a `LeastSquaresProblem`.
+    """Negative log posterior of K parameters x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
     Attributes:
         noise: (n,) [Nm, N], scaled such that the errors of all samples can be treated as independent (see
@@ -187,7 +187,7 @@ class TorqueProblem:
     def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
         """Yield two candidates (K,) for the parameters: x + step, then `TorqueJacobian.curved_step` of x and step.
 
-        step: (k,), step of the free parameters.
+        step: (k,), step of the k free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
         # x + step needs less time and is as good near the optimum. Far from the optimum, the curved step may have a
@@ -242,8 +242,8 @@ class TorqueProblem:
 class TorqueEstimate:
     """MAP estimate: the problem with its noise and prior, and the last state of the solver.
 
-    covariance: (K, K), posterior covariance of x. After `alternate`, it is the covariance for the noise and the prior
-    before their last update; `with_current_covariance` recomputes it.
+    covariance: (K, K), posterior covariance of the K parameters. After `alternate`, it is the covariance for the noise
+    and the prior before their last update; `with_current_covariance` recomputes it.
     """
 
     problem: TorqueProblem
