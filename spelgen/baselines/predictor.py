@@ -1,4 +1,4 @@
-"""Predictors of the motion of an arm, under torques or under position commands, and the integration of dynamics."""
+"""Predictors of the motion of an arm under torques or position commands, and an integrator for stiff friction."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -93,7 +93,7 @@ def _stepper(
         )
 
         def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the solution (v, a), (W, n) each for W windows, of (1 - h A) (v, a) = (velocity, M^-1 force)."""
+            """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force) in W windows, (W, n) each."""
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution

@@ -117,7 +117,7 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
 
 @dataclass(frozen=True)
 class ReadingDifference:
-    """Largest differences of a quantity between readings of a URDF, divided by the quantity's magnitude [1].
+    """Largest relative differences of a quantity between readings of a URDF.
 
     difference: between Pinocchio and the chain without rounding. rounding: between the arm's chain and the chain
     without rounding of angles.

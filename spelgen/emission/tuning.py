@@ -52,8 +52,8 @@ class ModelTuning:
     # [1] Number of hidden units of Kolmogorov-Arnold networks, divided by the number for multilayer perceptrons (the
     # option `width`); smaller, because each edge has several weights.
     kan_fraction: float = 0.25
-    # [1] Number of hidden units of the network of V, divided by the number for other networks (the option `width`);
-    # smaller, because V is a single output.
+    # [1] Number of hidden units of the network of V, divided by the number of the network of M; smaller, because V is a
+    # single output.
     potential_fraction: float = 0.5
 
 

@@ -123,7 +123,7 @@ def mass_error(learned: Tensor, true: Tensor) -> float:
 def mass_errors(
     dynamics: Mapping[str, RigidDynamics], truth: Arm | Path | str, joints: Sequence[str], q: Tensor
 ) -> dict[str, float]:
-    """Return {predictor: relative error of M [1]}, see `mass_error`, at a subset of the test positions.
+    """Return {predictor: relative error of M, see `mass_error`}, at a subset of the test positions.
 
     Args:
         dynamics: {name of the model or of a baseline: dynamics}.

@@ -148,7 +148,7 @@ def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
 
 
 def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> dict[str, Tensor]:
-    """Return {predictor: relative error, (W, K-1) [1]} for W windows of K samples, without the initial sample.
+    """Return {predictor: relative error, (W, K-1)} for W windows of K samples, without the initial sample.
 
     The relative error is the RMS over the errors of position and velocity of all joints. Each of these errors is
     divided by the RMS change of the position or velocity since the start of a window (see `loss_scales`).
@@ -182,7 +182,7 @@ def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosi
 def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[PredictedMotion, ...]:
     """Return two predicted windows of the model: the window of median error and the window of largest error.
 
-    errors: relative error [1] of the model at the end of each of W windows, (W,).
+    errors: relative error of the model at the end of each of W windows, (W,).
     """
     motions = []
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):

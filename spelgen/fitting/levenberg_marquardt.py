@@ -164,7 +164,8 @@ def _accepted_step(
     for _ in range(TUNING.max_trials):
         step = normal.step(damping)
         predicted = normal.predicted_decrease(step)
-        # The search ends here, since a larger damping has an even smaller predicted decrease.
+        # The search for a damping ends at a small predicted decrease of the cost: a larger damping would have an even
+        # smaller one.
         if predicted < max(TUNING.min_predicted_decrease * state.cost, min_decrease):
             return Termination.SMALL_PREDICTION
         best = _best_candidate(problem, state, step, predicted)
@@ -192,7 +193,7 @@ def _best_candidate(
         candidate = initial_state(problem, x, state.damping, state.steps + 1)
         if candidate.cost < best.cost:
             best = candidate
-        # The quadratic model predicts the decrease well: further candidates would gain little.
+        # Here the quadratic model predicts the decrease of the cost well: further candidates would lower it little.
         if state.cost - best.cost >= TUNING.min_gain_ratio * predicted:
             break
     return best

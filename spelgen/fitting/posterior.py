@@ -50,10 +50,11 @@ class Uncertain(NamedTuple):
 
 
 class Propagated(NamedTuple):
-    """Value of a function of the model, (...), and a square root of its covariance, (..., k).
+    """Value of a function of the model, (...), and a square root of the covariance of the value, (..., k).
 
-    root: J R, with the Jacobian J (..., K) of the value with respect to the K fitted parameters, and their covariance R
-    R^T, R (K, k). The norm of ``root`` over its last axis is the standard deviation of the value.
+    root: J R, with the Jacobian J, (..., K), of the value with respect to the K fitted parameters. R, (K, k), is a
+    square root of rank k of the covariance R R^T of these parameters. The norm of ``root`` over the last axis is the
+    standard deviation of the value.
     """
 
     value: Tensor

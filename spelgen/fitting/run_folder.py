@@ -1,4 +1,4 @@
-"""Run folder: reading and writing of its files, each completely or not at all, and the model of the run."""
+"""The files of a run folder, and the model of a run. A file is written completely or not at all."""
 
 import io
 import json

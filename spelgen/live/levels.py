@@ -251,8 +251,7 @@ def _likelihood(
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
     """Return ``levels`` with the noise of the momentum observer, and with the distribution of the largest peaks.
 
-    These are the fields ``observer`` to ``peak_count`` of `NoiseLevels`. tested: held-out samples of each log, as lists
-    of `HeldOutSample`.
+    The new fields are ``observer`` to ``peak_count`` of `NoiseLevels`. tested: held-out samples of each log.
     """
     residuals = [_observer_residuals(levels, samples) for samples in tested]
     signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))

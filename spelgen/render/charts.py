@@ -290,7 +290,7 @@ def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     Otherwise the ticks are 1, 2 and 5 times powers of ten. If fewer than three of these values are on the axis, the
     ticks are equidistant, as on a linear axis (`_steps`).
     """
-    # The tolerance includes a power of ten at the end of the axis despite rounding.
+    # With the tolerance 1e-9, a power of ten at the end of the axis is included despite rounding.
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
     powers = range(first, last + 1, max(1, (last - first) // 5 + 1))
     if len(powers) >= 3:

@@ -59,7 +59,8 @@ def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
     """Return the chart of training and validation loss over the epochs, with a line at the epoch of the best model."""
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
     epochs, *losses = array(columns).T
-    # The vertical line extends from the smallest to the largest loss. It cannot start at zero on a logarithmic axis.
+    # The vertical line at the best epoch extends from the smallest to the largest loss: on a logarithmic axis it cannot
+    # start at zero.
     ends = (np.nanmin(losses), np.nanmax(losses))
     lines = [
         Line("training loss", epochs, losses[0], "train"),

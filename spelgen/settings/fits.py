@@ -70,9 +70,9 @@ class GaussianPrior(Group):
         shared_friction: Common factor of all friction of all joints.
         friction_compensation: Friction compensation of a drive, divided by typical friction per typical speed, if the
             logs show any.
-        degrees_of_freedom: Weight of the initial value of an estimated standard deviation: it counts as much as this
-            number of parameters. The standard deviation of each single body is estimated with the same weight, so that
-            the prior of a body is a Student-t distribution with these degrees of freedom.
+        degrees_of_freedom: Weight of the initial value of an estimated standard deviation, as a number of parameters.
+            The standard deviation of each single body is estimated with the same weight, so that the prior of a body is
+            a Student-t distribution with these degrees of freedom.
     """
 
     bodies: Positive = 0.75

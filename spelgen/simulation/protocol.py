@@ -1,4 +1,4 @@
-"""Functions and classes for all simulation protocols: friction, initial positions, desired motions, and logs."""
+"""Parts of all simulation protocols: friction model, sample times, range of positions, desired motions, and results."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class Nominal:
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
     """Return the nominal values of ``arm`` for the outputs and constants of its ``structure``."""
-    # The seed is fixed, because these numbers are part of the emitted module, which must be reproducible.
+    # The seed is fixed, because the nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = list(map(working_range, arm.coordinates))
     q = np.stack([rng.uniform(lower, upper, 512) for lower, upper in ranges], axis=-1)
@@ -197,7 +197,7 @@ def _mass_changes(
 
     Args:
         arm: the arm.
-        q: sampled positions, (S, n) [rad, m].
+        q: S sampled positions, (S, n) [rad, m].
         inertias: ten inertial parameters of each body.
         mass: lower triangles of M at q, (S, n(n+1)/2).
         typical: magnitudes of the entries of M, (n(n+1)/2,), by which the changes are divided.
@@ -254,7 +254,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
 
 
 def parameters_of(pseudo: np.ndarray) -> np.ndarray:
-    """Return the inertial parameters (m, h, I), (..., 10), of pseudo-inertias (..., 4, 4)."""
+    """Return the inertial parameters (m, h, I), (..., 10), of pseudo-inertias (..., 4, 4); see `pseudo_inertia`."""
     second_moment = pseudo[..., :3, :3]
     tensor = _trace(second_moment) * np.eye(3) - second_moment
     mass, first_moment = pseudo[..., 3, 3:], pseudo[..., :3, 3]
@@ -270,7 +270,7 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the Cholesky factor of a consistent pseudo-inertia, and whether the parameters are consistent.
 
     Args:
-        parameters: (m, h, I) of a body, (10,) [kg, kg m, kg m2].
+        parameters: mass, first moment and inertia (m, h, I) of a body, (10,) [kg, kg m, kg m2].
 
     Returns:
         C (4, 4) with C C^T = J. If the parameters are inconsistent, the smallest eigenvalues of J are raised.

@@ -68,7 +68,7 @@ def servo_rank(arm: Chain) -> ServoRank:
 
 
 def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-    """Return the torque regressor Y (S, n, 10 B) of B bodies from Lagrange's equations.
+    """Return the torque regressor Y, (S, n, 10 B), of B bodies at S states, from Lagrange's equations.
 
     Args:
         arm: the arm.

@@ -38,7 +38,7 @@ class ServoParameters:
     active: Tensor
 
     def after(self, step: Tensor) -> ServoParameters:
-        """Return the parameters after a step (k,); the delay remains at least zero."""
+        """Return the k parameters after a step (k,); the delay remains at least zero."""
         joints, bodies, delay = step.split([self.joints.numel(), len(self.bodies), 1])
         return replace(
             self,
@@ -49,7 +49,7 @@ class ServoParameters:
 
     @property
     def flat(self) -> Tensor:
-        """All parameters as one vector, (k,)."""
+        """All k parameters as one vector, (k,)."""
         delay = torch.tensor([self.delay], dtype=torch.float64)
         return torch.cat([self.joints.flatten(), self.bodies, delay])
 

@@ -117,7 +117,7 @@ def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
 
 
 def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
-    """Return a mask (m,), True for those of m parameters that the logs distinguish from all other parameters.
+    """Return a mask (m,) of m parameters, True for parameters that the logs distinguish from all other parameters.
 
     A parameter is distinguished if an upper bound of its variance inflation factor is below
     `ServoTuning.variance_inflation`. Example: dead zone and dry friction of a joint without gravity load are not
@@ -213,7 +213,7 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
             if ratio == "dead_zone" and not value:
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
-            # The bound 50 avoids an overflow of exp.
+            # The logarithm is limited to 50, so that exp does not overflow.
             factor = math.exp(min(half, 50.0))
             # The static error, a sum of dry friction and dead zone, may be determined even if its two terms are not.
             determined = factor < TUNING.max_factor and (distinct[joint] or ratio not in ("dry", "dead_zone"))

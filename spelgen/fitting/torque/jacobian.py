@@ -315,7 +315,7 @@ class TorqueJacobian:
         Returns:
             The scaled residual, (T, n) [Nm, N].
             A list of matrices (T, K'), one per colour: derivatives with respect to the K' parameters of drives and
-                friction, that is, to all parameters except those of bodies.
+                friction, that is, to all parameters except body parameters.
             A list of matrices (T, n), one per colour: derivatives with respect to the gravity torques on the drives.
         """
         copies = {}

@@ -59,7 +59,7 @@ class NoiseEstimator:
     def of(cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor) -> NoiseEstimator:
         """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
-        # The lower bound avoids divisions by zero at joints of constant torque.
+        # The standard deviation has a lower bound, which avoids divisions by zero at joints of constant torque.
         torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
         return cls(jacobian.samples.count, correlation_length, torque_std)
 

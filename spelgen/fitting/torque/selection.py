@@ -70,7 +70,10 @@ def _gap(correlation_length: float) -> int:
 
 
 def within_range(position: torch.Tensor, fitted: torch.Tensor) -> torch.Tensor:
-    """Return a mask (T, ...), True for positions within the range of the fitted positions (T', ...)."""
+    """Return a mask (T, ...), True for the T positions that are within the range of the fitted positions.
+
+    fitted: T' positions, (T', ...).
+    """
     return (position >= fitted.amin(dim=0)) & (position <= fitted.amax(dim=0))
 
 
