@@ -67,9 +67,9 @@ def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Ten
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     """Return the friction state z, (T, n, K) [rad, m], along positions q (T, n) [rad, m]; z[0] is zero.
 
-    K is the number of bristles per drive. From q, measured positions, encoder jitter is removed first. After a reversal
-    of a drive, z depends only on z
-    at this reversal and the displacement since then: the loop is over reversals, not over samples.
+    K is the number of bristles per drive. Encoder jitter is first removed from q, the measured positions. After a
+    reversal of a drive, z depends only on z at this reversal and on the displacement since then: the loop is over
+    reversals, not over samples.
     """
     path = encoded(q)
     if bristles.motors is not None:

@@ -48,8 +48,8 @@ class Growth:
     Attributes:
         seconds: Times since the start of a prediction, (T,) [s].
         windows: Number of predictions.
-        relative: {predictor: quantiles of the relative error [1]}, the errors of q and qd divided by the RMS change of
-            q and qd since the start.
+        relative: {predictor: quantiles of the relative error}: the errors of q and qd divided by the RMS change of q
+            and qd since the start.
         tip_mm: {predictor: quantiles of the position error of the tip [mm]}; empty without a URDF.
     """
 

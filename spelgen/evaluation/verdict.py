@@ -52,8 +52,9 @@ def verdict(
 ) -> Verdict:
     """Return the assessment of an evaluation.
 
-    identified: content of least_squares.json, for the coverage of the training logs. limits: position limits of the
-    joints. independent: names of joints on whose position the dynamics do not depend, such as a vertical first axis.
+    identified: content of least_squares.json, for the range of motion of the training logs. limits: position limits of
+    the joints. independent: names of joints on whose position the dynamics do not depend, such as a vertical first
+    axis.
     """
     # Each assessment function adds uses, and the texts with the errors from which they were decided.
     uses = _Uses()

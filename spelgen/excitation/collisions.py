@@ -32,8 +32,8 @@ FLOOR = "the floor"
 class Contact:
     """Contact of two objects during a motion.
 
-    time: first time at which the objects are closer than the clearance [s]. distance: distance at this time [m]. first,
-    second: names of the objects.
+    time: first time at which the objects are closer than the clearance [s]. distance: signed distance at this time [m],
+    negative for overlapping shapes. first, second: names of the objects.
     """
 
     time: float

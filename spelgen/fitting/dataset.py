@@ -204,7 +204,7 @@ class Validation:
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)
 
     def loss(self, substeps: int) -> float:
-        """Return the `rollout_loss` of the validation windows [1]; infinite if a rollout diverges."""
+        """Return the dimensionless `rollout_loss` of the validation windows; infinite if a rollout diverges."""
         total = 0.0
         try:
             with torch.no_grad():

@@ -87,7 +87,7 @@ def _adaptive_step(
     from torchdiffeq import odeint  # imported only if needed, since the import takes half a second
 
     def rate(t: Tensor, state: Tensor) -> Tensor:
-        """Return the derivative of the states (q, p) of W windows, (W, 2 n), with respect to time in intervals."""
+        """Return d(q, p) / dt, (W, 2 n), of W windows, with t: time divided by the duration of the interval."""
         q_now, p_now = state.chunk(2, dim=-1)
         return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
 

@@ -224,7 +224,7 @@ def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
 def _likelihood(
     segments: Sequence[Sequence[Block]], grid: np.ndarray, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the negative log likelihood, and the mean normalised squared residual [1], (G, n) each, at G grid points.
+    """Return the negative log likelihood, and the mean normalised squared residual, (G, n) each, at G grid points.
 
     Args:
         segments: consecutive blocks of each log.

@@ -1,4 +1,4 @@
-"""Charts of the report on a run: from the curves of its evaluation, the losses and the coverage of the logs."""
+"""Charts of the report on a run: training losses, curves of the evaluation, and ranges of motion of the logs."""
 
 from collections.abc import Sequence
 

@@ -118,7 +118,7 @@ def servo_windows(
     """Return at most ``count`` windows, evenly spread over the logs.
 
     The windows have the length `TUNING.length` or, if all segments between gaps are shorter, the length of the longest
-    segment. Raises LogError if it has fewer than `TUNING.min_samples` samples.
+    segment. Raises LogError if a window would have fewer than `TUNING.min_samples` samples.
     """
     segments: list[Trajectory] = []
     for log in logs:

@@ -74,7 +74,7 @@ def _least_squares_noise_fit(problem: TorqueProblem, state: State) -> tuple[Torq
 
 
 def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
-    """Return a mask (n,) of the joints with a friction compensation that is not modelled yet, from the residual at x.
+    """Return a mask (n,), True if the residual at x shows a friction compensation of the joint that is not modelled.
 
     A drive may add a torque that compensates friction after the torque was measured. The residual then decreases with
     velocity, which friction cannot explain. Criteria for a joint:
