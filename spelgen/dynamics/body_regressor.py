@@ -28,7 +28,7 @@ def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 def quaternion(rotation: object) -> np.ndarray:
     """Return the unit quaternion (w, x, y, z) with w >= 0 of a rotation matrix (3, 3)."""
     matrix = np.array(rotation, dtype=float)
-    # SciPy returns quaternions in the order (x, y, z, w): they are rotated by one element.
+    # SciPy returns quaternions in the order (x, y, z, w); `np.roll` moves w to the front.
     result: np.ndarray = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
     result[np.abs(result) < 1e-16] = 0.0  # Smaller elements are rounding errors.
     return result

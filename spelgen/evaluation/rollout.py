@@ -92,7 +92,7 @@ def true_mass(robot: Arm | Path | str, q: Tensor, joints: Sequence[str] | None =
 
     Args:
         robot: The true arm, or the path of its URDF.
-        q: Positions (T, n) [rad; m].
+        q: Positions (T, n) [rad, m].
         joints: Names of the n joints in the order of q; None: the joints in the settings, else the longest chain.
     """
     from spelgen.dynamics.pinocchio_arm import arm_dynamics
@@ -129,7 +129,7 @@ def mass_errors(
         dynamics: {name of the model or of a baseline: dynamics}.
         truth: The true arm, or the path of its URDF.
         joints: Names of the n joints.
-        q: Positions (T, n) [rad; m] of the test logs.
+        q: Positions (T, n) [rad, m] of the test logs.
     """
     # Positions are subsampled: M changes slowly along a trajectory, so more positions give the same error.
     q = q[:: max(1, len(q) // TUNING.mass_positions)]

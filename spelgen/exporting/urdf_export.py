@@ -105,7 +105,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
     coulomb = np.stack([projection.friction.forward, projection.friction.backward], axis=1)
-    # {section: {name: array (n,) or (n, K)}}, one row per joint.
+    # {section: {name: array (n,), or (n, K) with K values per joint}}.
     sections = {"viscous_coulomb": {"viscous": projection.friction.viscous, "coulomb": coulomb}}
     # Only rigid-body models have a friction model with constants; others have friction networks.
     if projection.exact:

@@ -141,7 +141,7 @@ def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | 
 
 
 def _default_inertia(arm: Chain, index: int) -> list[float]:
-    """Return the inertial parameters (m, h, I) of a sphere of 1 kg about the origin of the body's joint (`recursion`).
+    """Return mass, first moment and inertia (m, h, I), about the origin of the body's joint, of a sphere of 1 kg.
 
     The centre of the sphere is half-way to the next joint. For the last body, or if the next joint is closer than
     0.2 m, the centre is at (0.1, 0, 0.1) m in the frame of the body's joint.
