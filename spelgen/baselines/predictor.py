@@ -207,7 +207,7 @@ def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
 
 @dataclass(frozen=True)
 class Predictor:
-    """Predictor of the motion in windows, from their first samples and their torques.
+    """Predictor of the motion in windows, from the first sample and the torques of each window.
 
     solver: function that returns q and qd of W windows of K samples, (W, K-1, n) each, at all samples except the first;
     a `Solver` if the prediction integrates dynamics. dynamics: the integrated dynamics, or None.

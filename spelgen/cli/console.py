@@ -90,7 +90,7 @@ def _local(value: object) -> object:
 
 
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
-    """Report an exception on stderr and exit with its exit code; with `debug`, its traceback first."""
+    """Report an exception on stderr, with `debug` after the traceback; exit with the exit code of the exception."""
     if isinstance(error, BrokenPipeError):
         # The reader of stdout has ended. No message is printed; stdout becomes /dev/null, so that the flush at the exit
         # of the interpreter does not fail.
@@ -123,7 +123,7 @@ def _message(error: BaseException, debug: bool) -> str:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
-    """Show a progress bar on stderr if it is a terminal.
+    """Show a progress bar on stderr if stderr is a terminal.
 
     Yield a function with the arguments number of finished steps, number of all steps, and optionally title of the
     current step.

@@ -77,7 +77,7 @@ class MassTrace:
 
 @dataclass(frozen=True, eq=False)
 class FrictionTrace:
-    """Friction torque of each joint as a function of its velocity.
+    """Friction torque of each joint as a function of the joint's velocity.
 
     Only one joint moves at a time, and the arm is at the mean position of the logs.
 

@@ -50,7 +50,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """The arguments of `fit` after its default values have been resolved.
+    """The arguments of `fit` with all default values resolved.
 
     Attributes:
         validation: fraction of the logs that is set aside for validation, or the validation trajectories.

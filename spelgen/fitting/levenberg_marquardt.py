@@ -46,7 +46,7 @@ class NormalEquations(NamedTuple):
         return result
 
     def predicted_decrease(self, step: Tensor) -> float:
-        """Return the decrease of the cost that its quadratic model predicts for a step s (k,): -g^T s - s^T H s / 2."""
+        """Return the decrease of the cost by a step s (k,) in the quadratic model of the cost: -g^T s - s^T H s / 2."""
         return float(step @ (self.descent - self.curvature @ step / 2))
 
 

@@ -73,7 +73,7 @@ def _adaptive_step(
     z: Tensor,
     step: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return q, p, z at the end of one interval, integrated with adaptive steps, and dq/dt at its start.
+    """Return q, p, z at the end of an interval, integrated with adaptive steps, and dq/dt at the start of the interval.
 
     The solver is dopri5 (Dormand and Prince, J. Comput. Appl. Math. 6, 1980); gradients are propagated through its
     steps. All W windows are integrated together, with time divided by the duration of the window's interval.

@@ -177,7 +177,7 @@ def find_levels(
 
 
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
-    """Return the factor by which the covariance of an estimated payload is multiplied, and its degrees of freedom.
+    """Return the factor on the covariance of an estimated payload, and the degrees of freedom of this factor.
 
     The factor is the mean normalised squared error of estimated payloads. The logs are without payload, so each
     estimated payload is an error. Each window of consecutive blocks gives one estimate (a trial), with two errors: the

@@ -165,7 +165,7 @@ def turning(velocity: Tensor, width: Tensor) -> Tensor:
 
 
 class SlidingFriction(FrictionLaws):
-    """Friction without state: dry friction depends on velocity; the width of its sign change is trained."""
+    """Friction without state: dry friction depends on velocity by a smooth sign, whose width is trained."""
 
     parameter_groups = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", SMOOTHING_VELOCITY),)
 

@@ -97,7 +97,7 @@ class NetworkDynamics(PortHamiltonian):
 
 
 class DenseInputDynamics(NetworkDynamics):
-    """A model whose M, V and D are networks, as is its diagonal input matrix G(q).
+    """A model whose M, V, D and diagonal input matrix G(q) are networks.
 
     The network of G has three outputs per joint, one for each axis of the joint's frame. Only the output of
     the z axis, about or along which the joint moves, is used.

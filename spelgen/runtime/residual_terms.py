@@ -253,7 +253,7 @@ class ResidualDynamics(RigidBodyDynamics):
         return prepared._replace(residual=self.residuals.prepare(prepared.armature))
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m]; the residual R is part of its M."""
+        """Return the configuration cache at q, (..., n) [rad, m]; M in the cache includes the residual R."""
         cache = super().configuration(q, prepared)
         if self.residuals is None:
             return cache

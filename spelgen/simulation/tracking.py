@@ -189,7 +189,7 @@ def record(
 
 
 def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
-    """Return the log of a recording: low-pass filtered positions, their central differences, and torques."""
+    """Return the log of a recording: low-pass filtered positions, velocities by central differences, and torques."""
     sample_rate = 1.0 / (recording.t[1] - recording.t[0])
     q = low_pass_regular(recording.encoders, sample_rate, tracking.cutoff)
     return Trajectory(recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau, name)

@@ -105,7 +105,7 @@ def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
 
 
 def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
-    """Limit the nominal friction of each drive to the standard deviation of its torque in the samples.
+    """Limit the nominal friction of each drive to the standard deviation of the drive's torque in the samples.
 
     Nominal friction is derived from the effort limits of the URDF, which are placeholders in many files. The prior
     width of torque offsets is proportional to nominal friction. If nominal friction is far too large, offsets may
