@@ -164,7 +164,7 @@ class Clock(Fault):
             yield from self._best(problem, reading, np.full(2, delay[delay != 0][0]), 1.0 * (delay != 0))
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with the best delays of signals at the start and the end of the log, if they differ."""
+        """Yield the fits with the best delays of signals at the start and the end of a recording, if they differ."""
         reading, starts = unchanged.hypothesis, []
         for part in _delayed_parts(len(reading.offset)) if problem.samples.longest_delay else ():
             for last in GEOMETRY.clock_starts:
@@ -188,12 +188,12 @@ class Clock(Fault):
     def _drifting(
         self, problem: GeometryProblem, reading: Hypothesis, delays: np.ndarray, part: np.ndarray
     ) -> Hypothesis:
-        """Return the hypothesis with delays (2,) [s] of some signals at the start and the end of the log.
+        """Return the hypothesis with delays (2,) [s] of some signals at the start and the end of a recording.
 
         part: mask (2, n) of these signals.
         """
         first, last = delays
-        drift = (last - first) / float(problem.samples.times[-1])
+        drift = (last - first) / float(problem.samples.times.max())
         return reading.changed(self, delay=first * part, drift=drift * part)
 
     def text(self, correction: Correction) -> str:

@@ -52,8 +52,7 @@ class DriveSamples(NamedTuple):
     Attributes:
         around: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and joint torques [Nm, N] at each of the E times `OFFSETS` after
             the sample; beyond the ends of a recording its first or last value.
-        times: (S,) times of the samples since the start of the first recording [s], without the pauses between
-            recordings.
+        times: (S,) times of the samples since the start of their recording [s].
         bent: (S, n, K) bristle deflections, divided by the break-away displacements.
         direction: (S, n) direction of dry friction, see `DynamicsSamples`.
         torques: (S, n, D) joint torques [Nm, N], shifted in time by each of the D `SHIFTS`.
@@ -101,7 +100,6 @@ class DriveLog:
         self._samples: list[DriveSamples] = []
         self._every = self._step = 1
         self._number = 0
-        self._seconds = 0.0
 
     def add(self, trajectory: Trajectory) -> None:
         """Add the samples of a trajectory; nothing is added if it is too short, or its sample rate is too low."""
@@ -116,7 +114,8 @@ class DriveLog:
             samples = dynamics_samples(
                 [piece], pauses=True, preprocessing=self._preprocessing, reach=self._reach
             )
-            self._samples += [self._shifted(x) for x in samples if len(x.q) > 2 * STEPS]
+            start = float(piece.t[0] - trajectory.t[0])
+            self._samples += [self._shifted(x, start) for x in samples if len(x.q) > 2 * STEPS]
         while self._count > 2 * HINTS.samples:
             if len(self._samples) > HINTS.trajectories:
                 self._samples = self._samples[1::2]
@@ -128,10 +127,11 @@ class DriveLog:
         self._samples = [x.thinned(2) for x in self._samples]
         self._every *= 2
 
-    def _shifted(self, samples: DynamicsSamples) -> DriveSamples:
+    def _shifted(self, samples: DynamicsSamples, start: float) -> DriveSamples:
         """Return every `_every`-th sample at which the arm moves, with the time-shifted signals.
 
-        Samples at both ends are omitted, because shifted torques are not available there.
+        Samples at both ends are omitted, because shifted torques are not available there. start: time of the first
+        sample since the start of the recording [s].
         """
         inner = samples[STEPS:-STEPS]
         assert inner.z is not None and inner.direction is not None
@@ -145,8 +145,7 @@ class DriveLog:
         signals = np.pad(signals, ((OFFSETS[-1], OFFSETS[-1]), (0, 0), (0, 0)), mode="edge")
         around = sliding_window_view(signals, 2 * OFFSETS[-1] + 1, axis=0)[STEPS:-STEPS, ..., ::2]
         torques = sliding_window_view(tau, len(SHIFTS), axis=0)
-        times = self._seconds + np.arange(len(tau)) / FREQUENCY
-        self._seconds = float(times[-1])
+        times = start + np.arange(len(tau)) / FREQUENCY
         columns = (around, times[STEPS:-STEPS], inner.z / self._reach.values, inner.direction, torques)
         return DriveSamples(*(column[moving[:: self._every]] for column in columns))
 

@@ -63,9 +63,12 @@ class MotionSamples:
         spline = CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
         if delays.ndim == 2:
             return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
-        times = self.times[:, None, None] + delays
-        nearest = np.searchsorted((self.times[1:] + self.times[:-1]) / 2, times)
-        rest = np.clip(times - self.times[nearest], -self.longest_delay, self.longest_delay)
+        # times of later recordings are larger, so that the nearest sample is of the same recording
+        recording = np.cumsum(np.diff(self.times, prepend=self.times[:1]) < 0)
+        present = self.times + 1e6 * recording
+        times = present[:, None, None] + delays
+        nearest = np.searchsorted((present[1:] + present[:-1]) / 2, times)
+        rest = np.clip(times - present[nearest], -self.longest_delay, self.longest_delay)
         joint, signal = np.ogrid[: delays.shape[1], :4]
         return np.asarray(np.einsum("snie,snie->sni", self.values[nearest, joint, signal], spline(rest)))
 
@@ -99,7 +102,7 @@ class Hypothesis:
         source: (2, n) indices of the joints under which the signals are logged.
         scale: (2, n) factors from logged signals to SI units.
         offset: (n,) zero offsets of the positions [rad, m].
-        delay: (2, n) delays of the logged signals at time 0 [s].
+        delay: (2, n) delays of the logged signals [s], at the start of a recording if they drift.
         drift: (2, n) derivatives of the delays with respect to time [1].
         gravity: vector of gravity in the frame of the root link [m/s^2].
     """
