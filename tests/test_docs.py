@@ -173,7 +173,7 @@ def codes_of_messages() -> set[str]:
         found, nodes = [], list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
         for target, value in ((x.targets[0], x.value) for x in nodes if isinstance(x, ast.Assign)):
             parallel = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
-            for name, x in zip(target.elts, value.elts) if parallel else [(target, value)]:
+            for name, x in zip(target.elts, value.elts, strict=True) if parallel else [(target, value)]:
                 constants[getattr(name, "id", "")] = x
                 if getattr(name, "id", "") in ("code", "SEEN", "ELASTIC", "GEOMETRY_CODES"):
                     found += getattr(x, "elts", [x])
