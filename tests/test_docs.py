@@ -135,10 +135,21 @@ def run_commands(block: str, folder: Path) -> str:
     return "\n".join(told)
 
 
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as both MkDocs and GitHub make them of plain words."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", heading.lower())) for heading in headings}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
-        assert target.startswith("http") or (page.parent / target).exists(), target
+    text = page.read_text(encoding="utf-8")
+    for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", text):
+        if target.startswith("http"):
+            continue
+        linked = page.parent / target if target else page
+        assert linked.exists(), target
+        assert not anchor or anchor in anchors(linked), f"{target}#{anchor}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -169,7 +180,7 @@ def codes_of_messages() -> set[str]:
     """The codes of all remarks, warnings and accepted errors in the source text of the package."""
     constants: dict[str, ast.expr] = {}
     codes = set(get_args(Accepted))
-    for path in (ROOT / "spelgen").rglob("*.py"):
+    for path in sorted((ROOT / "spelgen").rglob("*.py")):
         found, nodes = [], list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
         for target, value in ((x.targets[0], x.value) for x in nodes if isinstance(x, ast.Assign)):
             parallel = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
