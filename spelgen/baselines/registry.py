@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 
 from spelgen.arm.configured_arm import Arm, load_arm
-from spelgen.baselines.linear_servos import DelayedCommand, LinearServos
 from spelgen.baselines.predictor import CommandFollower, Predictor, States, of_dynamics
 from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import identified_dynamics
 from spelgen.emission.assemble import spec_of
 from spelgen.errors import Diagnostic, LogError, in_one_line
-from spelgen.identification.identification import LeastSquares, identified_dynamics
-from spelgen.identification.identify import identify_by
 from spelgen.labels import (
     CONSTANT_VELOCITY,
     DELAYED_COMMAND,
@@ -141,6 +139,10 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
     The result has a least-squares identification and its parameters (K,) per friction model, except for logs without
     accelerations. preprocessing: preprocessing of the fit, in which all default values are resolved.
     """
+    # Imported here: evaluation reads the fitted baselines.
+    from spelgen.identification.identification import LeastSquares
+    from spelgen.identification.identify import identify_by
+
     # The assessment compares the range of motion in test logs with the coverage of the training logs.
     fitted: FittedBaselines = {"coverage": coverage(logs)}
     methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
@@ -168,5 +170,7 @@ def command_followers(
         message = "no linear servos to compare with: they are fitted by `train`"
         notes.append(Diagnostic("info", "no-linear-servos", "logs", None, message))
         return {}
+    from spelgen.baselines.linear_servos import DelayedCommand, LinearServos
+
     servos = LinearServos(**linear_servos)
     return {LINEAR_SERVOS: servos, DELAYED_COMMAND: DelayedCommand(servos.late)}

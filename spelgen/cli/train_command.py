@@ -114,8 +114,8 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
     copy of these noise levels; without noise levels in the source run there is no payload. A fit without a source run
     gets noise levels from its own logs.
     """
-    from spelgen.live.levels import cross_validated_levels, keep_levels, stored_levels
-    from spelgen.live.replay import carried_payload
+    from spelgen.live.levels import cross_validated_levels
+    from spelgen.live.noise import keep_levels, stored_levels
     from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
     if source is None:
@@ -126,6 +126,7 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
             note(f"info: no estimator: {error}")
         return None
     from spelgen.fitting.fitted import load_run
+    from spelgen.live.replay import carried_payload
 
     original = load_run(source)
     levels = stored_levels(original)
@@ -166,14 +167,16 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
 
 def _outcome(fit: Fit) -> tuple[str, str]:
     """Return two sentences: the status of a fit with its reason, and the result of the fit."""
-    from spelgen.fitting.servo.report import servo_summary
-
     config, result = fit.config, fit.result
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
     if not isinstance(config, Rollout):  # other objectives use windows only to evaluate the model
-        summary = servo_summary(fit.record.servo)
+        summary = None
+        if fit.record.servo is not None:
+            from spelgen.fitting.servo.report import servo_summary
+
+            summary = servo_summary(fit.record.servo)
         if summary is not None:
             result = summary.text
         elif not fit.record.validation_windows:

@@ -6,8 +6,6 @@ from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.design import PRESET_NAMES, Design, load_design
-from spelgen.emission.plan import derive_spec
-from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
 from spelgen.spec import ModelSpec, Options
 from spelgen.urdf.robot import Assume
@@ -30,6 +28,8 @@ def generate(
         module: path of the file that the source will be written to; the source has the URDF's path relative to this
             file.
     """
+    from spelgen.emission.text import module_text
+
     spec = make_spec(arm, preset, width=width, depth=depth, assume=assume, module=module)
     return module_text(spec, standalone=standalone)
 
@@ -44,6 +44,9 @@ def make_spec(
     module: Path | None = None,
 ) -> ModelSpec:
     """Return the specification of the model of an arm; arguments and errors as for ``generate``."""
+    # Imported here: commands that have a specification do not derive one.
+    from spelgen.emission.plan import derive_spec
+
     arm = arm if isinstance(arm, Arm) else load_arm(arm)
     name, design = str(preset), None
     # The options contain the content of a user's design file, so that the module can be rebuilt without the
