@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from spelgen.arm.configured_arm import Arm, load_arm
+from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.predictor import CommandFollower, Predictor, States, of_dynamics
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import identified_dynamics
-from spelgen.emission.assemble import spec_of
 from spelgen.errors import Diagnostic, LogError, in_one_line
 from spelgen.labels import (
     CONSTANT_VELOCITY,
@@ -26,7 +25,6 @@ from spelgen.labels import (
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, coverage, require_torques
 from spelgen.logs.windows import Windows
-from spelgen.spec import Options
 
 FittedBaselines = dict[str, Any]
 """Content of least_squares.json: the fitted baselines, and the coverage of the training logs."""
@@ -50,13 +48,6 @@ class EvaluatedArm:
     fitted_arm: Arm | None
     probe: Windows
     notes: list[Diagnostic]
-
-
-def arm_of_model(model: object, urdf: Path) -> Arm:
-    """Return the arm that a model was built from, read from its URDF. Raises UrdfError, ArmError or SettingsError."""
-    spec = spec_of(model)
-    options = Options() if spec is None else spec.options
-    return load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
 
 
 def constant_velocity(arm: EvaluatedArm) -> list[Predictor]:

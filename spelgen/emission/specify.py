@@ -69,9 +69,10 @@ def make_spec(
     return spec if module is None else replace(spec, urdf=_path_of_urdf(module, arm.robot.path))
 
 
-def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> Arm:
-    """Return the arm of a specification, read from this URDF with the options in the specification."""
-    return load_arm(urdf, spec.options.joints, spec.options.tip, spec.options.angle_tolerance)
+def arm_of_spec(spec: ModelSpec | None, urdf: str | Path) -> Arm:
+    """Return the arm of a specification, read from this URDF with its options; None: with the default options."""
+    options = Options() if spec is None else spec.options
+    return load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
 
 
 def find_urdf(module: Path, name: str) -> Path:

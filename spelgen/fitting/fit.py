@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm, urdf_path
-from spelgen.baselines.registry import FittedBaselines, arm_of_model, fit_baselines
-from spelgen.emission.assemble import ArmModel
+from spelgen.baselines.registry import FittedBaselines, fit_baselines
+from spelgen.emission.assemble import ArmModel, spec_of
+from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import Diagnostic, OptionError, RunError, SettingsError, SpelgenError
 from spelgen.files import write_json
 from spelgen.fitting.dataset import FitRequest, RunOptions
@@ -213,7 +214,7 @@ class _Fitting:
         if self.baselines or request.urdf is None or not request.urdf.exists():
             return None
         try:
-            return arm_of_model(request.model, request.urdf)
+            return arm_of_spec(spec_of(request.model), request.urdf)
         except SpelgenError as error:
             message = f"no least squares to compare with: {error}"
             self.notes.append(Diagnostic("warning", "no-baselines", "run", None, message))

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spelgen.baselines.registry import arm_of_model
 from spelgen.dynamics.bristles import bristle_reach, encoder_step
 from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.dynamics.tip_frame import tip_frame
-from spelgen.emission.assemble import assemble
+from spelgen.emission.assemble import assemble, spec_of
+from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import LogError, RunError
 from spelgen.fitting.fitted import Fit, required_spec
 from spelgen.fitting.torque.fit import fit_torque
@@ -57,7 +57,7 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
     folds = [logs[k::count] for k in range(min(count, len(logs)))]
     effort, point = np.full(fit.model.n, np.inf), np.zeros(3)
     if fit.urdf is not None and fit.urdf.exists():
-        arm = arm_of_model(fit.model, fit.urdf)
+        arm = arm_of_spec(spec_of(fit.model), fit.urdf)
         effort, tip = np.array([joint.effort or np.inf for joint in arm.chain.coordinates]), tip_frame(arm)
         # The contact force is estimated at the tip, or at the origin of the last body if another body carries the tip.
         if tip.carrier == len(arm.chain.bodies) - 1:
