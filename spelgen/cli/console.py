@@ -22,10 +22,10 @@ from spelgen.labels import counted, printable
 
 METAVARS: dict[object, str] = {int: "N", float: "X", str: "TEXT", Path: "FILE"}
 FAILED = 1
-INTERRUPTED = 130  # exit code of shells: 128 + SIGINT
-BROKEN_PIPE = 141  # exit code of shells: 128 + SIGPIPE
+INTERRUPTED = 130  # Shells use the exit code 128 + signal number; SIGINT is 2.
+BROKEN_PIPE = 141  # Shells use the exit code 128 + signal number; SIGPIPE is 13.
 
-# Top-level module -> extra of spelgen that installs the module.
+# {top-level module: optional dependency group ("extra") of spelgen that installs the module}
 EXTRAS = {"pinocchio": "simulate", "ray": "parallel"}
 EXTRAS |= dict.fromkeys(("casadi", "mujoco", "onnxruntime", "onnxscript", "safetensors"), "deploy")
 
@@ -40,7 +40,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
     """
     groups: dict[str, type] = {}
     options: list[inspect.Parameter] = []
-    # eval_str: annotations are strings, because of `from __future__ import annotations`.
+    # `eval_str` turns annotations into types: `from __future__ import annotations` makes them strings.
     for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
         if isinstance(parameter.annotation, type) and is_dataclass(parameter.annotation):
             groups[name] = parameter.annotation
@@ -56,7 +56,8 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
             for name, group in groups.items():
                 values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
             command(**values)
-            sys.stdout.flush()  # a closed pipe raises its error here and not at the exit of the interpreter
+            # A closed pipe raises its error here, where it is reported, and not at the exit of the interpreter.
+            sys.stdout.flush()
         except (typer.Exit, typer.Abort, typer.BadParameter):
             raise
         except BaseException as error:
@@ -64,7 +65,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
 
     for option in options:
         _name_values(option.annotation, option.default)
-    # Typer reads the options from the signature and the annotations.
+    # Typer reads the options of a command from its signature and annotations, so both are replaced.
     parameters = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
     vars(run)["__signature__"] = inspect.Signature(parameters)
     run.__annotations__ = {option.name: option.annotation for option in options}
@@ -89,7 +90,7 @@ def _local(value: object) -> object:
 
 
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
-    """Report an exception on stderr and exit with its exit code; with `debug`, its traceback first."""
+    """Report an exception on stderr, with `debug` after the traceback; exit with the exit code of the exception."""
     if isinstance(error, BrokenPipeError):
         # The reader of stdout has ended. No message is printed; stdout becomes /dev/null, so that the flush at the exit
         # of the interpreter does not fail.
@@ -122,7 +123,7 @@ def _message(error: BaseException, debug: bool) -> str:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
-    """Show a progress bar on stderr if it is a terminal.
+    """Show a progress bar on stderr if stderr is a terminal.
 
     Yield a function with the arguments number of finished steps, number of all steps, and optionally title of the
     current step.
@@ -130,7 +131,7 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
     from rich.console import Console
     from rich.progress import Progress
 
-    # The bar is on stderr, because stdout contains only the result.
+    # The progress bar is on stderr, because stdout contains only the result of the command.
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, total, now=title: bar.update(task, completed=done, total=total, description=now)
@@ -147,8 +148,11 @@ def note(text: object) -> None:
 
 
 def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
-    """Print the result of a command. form: "text" prints `lines`, "json" prints `record` as one line of JSON."""
-    # JSON has one line, as log files of pipelines have one record per line.
+    """Print the result of a command.
+
+    form: "text" prints `lines`, the result as lines of text; "json" prints `record`, the same result, as JSON.
+    """
+    # The JSON object is printed on one line, because log files of pipelines have one record per line.
     if form == "json":
         print(json.dumps(record, default=str))
         return

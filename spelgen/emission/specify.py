@@ -65,18 +65,24 @@ def make_spec(
         depth=depth,
     )
     spec = derive_spec(arm, options)
-    # The path is relative, so that a project folder with module and URDF can be moved.
+    # The module contains a relative path of the URDF, so that a project folder with module and URDF can be moved.
     return spec if module is None else replace(spec, urdf=_path_of_urdf(module, arm.robot.path))
 
 
 def arm_of_spec(spec: ModelSpec | None, urdf: str | Path) -> Arm:
-    """Return the arm of a specification, read from this URDF with its options; None: with the default options."""
+    """Return the arm of a specification, read from this URDF with its options; None: with the default options.
+
+    Raises UrdfError, ArmError or SettingsError.
+    """
     options = Options() if spec is None else spec.options
     return load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
 
 
 def find_urdf(module: Path, name: str) -> Path:
-    """Return the URDF ``name`` in the module's folder, the current one, or robots/ of either. Raises ModuleError."""
+    """Return the path of the URDF ``name``. Raises ModuleError if it is not found.
+
+    It is searched in the module's folder, in the current folder, and in the subfolders robots/ of both.
+    """
     # The folder of the module is searched first, since most projects have the URDF there.
     folders = [module.parent, Path(), Path("robots"), module.parent / "robots"]
     for folder in folders:
@@ -90,7 +96,7 @@ def find_urdf(module: Path, name: str) -> Path:
 
 
 def _path_of_urdf(module: Path, urdf: Path) -> str:
-    """Return the URDF's file name if ``find_urdf`` finds this file by name, else its path relative to the module."""
+    """Return the name of the URDF if it is in a folder that ``find_urdf`` searches, else its relative path."""
     try:
         if find_urdf(module, urdf.name).samefile(urdf):
             return urdf.name

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 class ModelTuning:
     """Initial values of drives, servos and friction, and sizes of networks, of an untrained model."""
 
-    # [1] Lower bound of the eigenvalues of M, divided by the smallest nominal eigenvalue over the workspace.
+    # [1] Lower bound of the eigenvalues of M, divided by the smallest eigenvalue of the nominal M over the joint
+    # ranges.
     margin: float = 0.1
     # [1] Typical friction, divided by the effort limit of the drive: gears lose some per cent of the torque.
     friction_of_effort: float = 0.02
@@ -51,7 +52,8 @@ class ModelTuning:
     # [1] Number of hidden units of Kolmogorov-Arnold networks, divided by the number for multilayer perceptrons (the
     # option `width`); smaller, because each edge has several weights.
     kan_fraction: float = 0.25
-    # [1] Units of the network of V, which has one output, divided by the width of the networks of M.
+    # [1] Number of hidden units of the network of V, divided by the number of the network of M; smaller, because V is a
+    # single output.
     potential_fraction: float = 0.5
 
 

@@ -31,7 +31,9 @@ def export(
     entries: Sequence[str] = (),
     float32: bool = False,
 ) -> Exported:
-    """Return a trained model in the format of another tool; results of the export are compared with the model's.
+    """Return a trained model in the format of another tool, and write it to a path, if one is given.
+
+    The results of the export are compared with the results of the model.
 
     Args:
         trained: a fit, the folder of a run, or a model.
@@ -50,7 +52,7 @@ def export(
     if to not in EXPORTERS:
         do = suggestion(to, EXPORTERS)
         raise RunError(f"the format {to!r}", expected=f"one of {', '.join(EXPORTERS)}", do=do)
-    # The path is checked first, because loading and exporting a run takes seconds.
+    # The path of the export is checked first, because loading and exporting a run takes seconds.
     if path is not None:
         require_fitting(to, Path(path))
     if isinstance(trained, str | Path):

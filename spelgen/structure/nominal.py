@@ -30,9 +30,9 @@ class Nominal:
 
     ``output_means`` and ``output_scales`` have one value per output of the structure, ``constants`` and
     ``constant_scales`` one per constant; all other tuples have one value per coordinate. ``potential_scale``: standard
-    deviation of V [J]. ``joint_torque``: root sum of squares of the root mean square gravity torque and of the root
-    mean square torque for unit acceleration [Nm, N]. ``mass_sensitivities`` and ``potential_sensitivities``: change of
-    M and of V with a coordinate, relative to the coordinate with the largest change.
+    deviation of V [J]. ``joint_torque``: typical torque [Nm, N], sqrt(g^2 + a^2) with the root mean squares g of the
+    gravity torque and a of the torque for unit acceleration. ``mass_sensitivities`` and ``potential_sensitivities``:
+    change of M and of V with a coordinate, divided by the largest such change of all coordinates.
     """
 
     output_means: tuple[float, ...]
@@ -51,7 +51,7 @@ class Nominal:
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
     """Return the nominal values of ``arm`` for the outputs and constants of its ``structure``."""
-    # The seed is fixed, because these numbers are part of the emitted module, which must be reproducible.
+    # The seed is fixed, because the nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = [x.working_range for x in arm.coordinates]
     q = np.stack([rng.uniform(lower, upper, 512) for lower, upper in ranges], axis=-1)
@@ -62,13 +62,14 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
     means = mass.mean(axis=0)
     rows, columns = np.tril_indices(len(ranges))
     diagonal = rows == columns
-    # |M_ij| <= sqrt(M_ii M_jj), because M is positive definite (Cauchy-Schwarz inequality).
+    # The typical magnitude of an entry is its bound: |M_ij| <= sqrt(M_ii M_jj), because M is positive definite.
     typical = np.sqrt(means[diagonal][rows] * means[diagonal][columns])
     output_rows = _functionals(structure.outputs, len(ranges))
     constant_rows = _functionals(structure.constants, len(ranges))
     outputs = mass @ output_rows.T
     constants = constant_rows @ means
-    # Lower bounds of the scales: an output that hardly varies for the nominal parameters may vary for the true ones.
+    # Lower bounds of the scales: an output that is almost constant for the inertials of the URDF may vary for the true
+    # ones, and the scale is a divisor.
     output_floor = 0.05 * (np.abs(output_rows) @ typical)
     constant_floor = 0.05 * (np.abs(constant_rows) @ typical)
     # Friction is scaled by the torque that a joint's drive needs for gravity and for unit acceleration.
@@ -99,7 +100,10 @@ def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
 
 
 def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
-    """Whether, for the inertials of the URDF, every joint moves a mass and M is positive definite at q (S, n)."""
+    """Whether, with the inertials of the URDF, every joint moves a mass and M is positive definite.
+
+    M is tested at S positions q, (S, n) [rad, m].
+    """
     mass, _ = float_energies(arm, q, nominal_inertias(arm, True))
     rows, columns = np.tril_indices(q.shape[1])
     lightest = mass.mean(axis=0)[rows == columns].min()
@@ -120,7 +124,7 @@ def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | 
 
 
 def _default_inertia(arm: Chain, index: int) -> list[float]:
-    """Return the inertial parameters (m, h, I) of a sphere of 1 kg about the origin of the body's joint.
+    """Return mass, first moment and inertia (m, h, I), about the origin of the body's joint, of a sphere of 1 kg.
 
     The centre of the sphere is half-way to the next joint. For the last body, or if the next joint is closer than
     0.2 m, the centre is at (0.1, 0, 0.1) m in the frame of the body's joint.
@@ -157,7 +161,7 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
 
 
 def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
-    """Return the root mean square over q (S, n) of the gravity torque dV/dq, (n,) [Nm, N]."""
+    """Return the root mean square over S positions q, (S, n), of the gravity torque dV/dq, (n,) [Nm, N]."""
     # [rad, m] Step of the central differences. Their relative error of 1e-8 is small enough for scales.
     step = 1e-4
     shifts = step * np.eye(q.shape[1])[:, None]
@@ -170,11 +174,13 @@ def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> n
 def _mass_changes(
     arm: Chain, q: np.ndarray, inertias: list[list[float]], mass: np.ndarray, typical: np.ndarray
 ) -> np.ndarray:
-    """Return the root mean square change, without unit, of the entries of M if one coordinate changes, (n,).
+    """Return, for each coordinate, the root mean square change of M if only this coordinate changes, (n,).
+
+    The mean is over samples and entries; changes of entries are divided by typical magnitudes and have no unit.
 
     Args:
         arm: the arm.
-        q: sampled positions, (S, n) [rad, m].
+        q: S sampled positions, (S, n) [rad, m].
         inertias: ten inertial parameters of each body.
         mass: lower triangles of M at q, (S, n(n+1)/2).
         typical: magnitudes of the entries of M, (n(n+1)/2,), by which the changes are divided.
@@ -214,7 +220,10 @@ def _round(value: float, digits: int = 6, zero_below: float = 1e-12) -> float:
 
 
 def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
-    """Return pseudo-inertias J (..., 4, 4) of inertial parameters (m, h, I), (..., 10), ordered as ``Body.inertia``."""
+    """Return pseudo-inertias J, (..., 4, 4), of inertial parameters (m, h, I), (..., 10).
+
+    m: mass; h: first moment; I: inertia about the origin, in the order of ``Body.inertia``.
+    """
     values = np.asarray(parameters, dtype=float)
     tensor = np.zeros((*values.shape[:-1], 3, 3))
     rows, columns = np.triu_indices(3)
@@ -228,7 +237,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
 
 
 def parameters_of(pseudo: np.ndarray) -> np.ndarray:
-    """Return the inertial parameters (m, h, I), (..., 10), of pseudo-inertias (..., 4, 4)."""
+    """Return the inertial parameters (m, h, I), (..., 10), of pseudo-inertias (..., 4, 4); see `pseudo_inertia`."""
     second_moment = pseudo[..., :3, :3]
     tensor = _trace(second_moment) * np.eye(3) - second_moment
     mass, first_moment = pseudo[..., 3, 3:], pseudo[..., :3, 3]
@@ -244,16 +253,15 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the Cholesky factor of a consistent pseudo-inertia, and whether the parameters are consistent.
 
     Args:
-        parameters: (m, h, I) of a body, (10,) [kg, kg m, kg m2].
+        parameters: mass, first moment and inertia (m, h, I) of a body, (10,) [kg, kg m, kg m2].
 
     Returns:
         C (4, 4) with C C^T = J. If the parameters are inconsistent, the smallest eigenvalues of J are raised.
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # [1] If J is inconsistent, eigenvalues of J are raised to this fraction of the largest eigenvalue. J counts as
-    # inconsistent if its smallest eigenvalue is below fraction^2 times the largest one: the bound is that low, because
-    # a slender body has a small eigenvalue, and is consistent.
+    # [1] Smallest eigenvalue of an inconsistent J after its correction, divided by the largest eigenvalue. The test of
+    # consistency has the lower bound fraction^2, because a slender body has a small eigenvalue and is consistent.
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)
