@@ -19,31 +19,20 @@ LogPaths = Path | str | Iterable[Path | str]
 UNPACK = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".xz": "unxz", ".bz2": "bunzip2"}
 
 
-def _function(name: str) -> Callable[..., list[LogTable]]:
-    """Return a function that is imported when it is called first: most logs of a user have one format."""
-    return lambda *arguments: pkgutil.resolve_name(name)(*arguments)
+def _lazy(name: str) -> Callable[..., list[LogTable]]:
+    """Return a function of a file of this folder that is imported at the first call: most users have one format."""
+    return lambda *arguments: pkgutil.resolve_name(f"spelgen.logs.{name}")(*arguments)
 
 
 PARQUET = LogFormat(
-    _function("spelgen.logs.parquet_files:read_parquet"),
-    (".parquet",),
-    _function("pyarrow.parquet:read_table"),
+    _lazy("parquet_files:read_parquet"), (".parquet",), _lazy("parquet_files:pa.parquet.read_table")
 )
-CSV = LogFormat(
-    _function("spelgen.logs.csv_files:read_csv"), (".csv",), _function("spelgen.logs.csv_files:csv_columns")
-)
-NPZ = LogFormat(_function("spelgen.logs.npz:read_npz"), (".npz",), _function("spelgen.logs.npz:npz_columns"))
+CSV = LogFormat(_lazy("csv_files:read_csv"), (".csv",), _lazy("csv_files:csv_columns"))
+NPZ = LogFormat(_lazy("npz:read_npz"), (".npz",), _lazy("npz:npz_columns"))
 BAG = LogFormat(
-    _function("spelgen.logs.bags:read_bag"),
-    (".mcap", ".db3", ".bag"),
-    marker="metadata.yaml",
-    folder="a ROS 2 bag",
+    _lazy("bags:read_bag"), (".mcap", ".db3", ".bag"), marker="metadata.yaml", folder="a ROS 2 bag"
 )
-LEROBOT = LogFormat(
-    _function("spelgen.logs.parquet_files:read_dataset"),
-    marker="meta/info.json",
-    folder="a LeRobot data set",
-)
+LEROBOT = LogFormat(_lazy("parquet_files:read_dataset"), marker="meta/info.json", folder="a LeRobot data set")
 FORMATS = [PARQUET, CSV, NPZ, BAG, LEROBOT]
 
 
