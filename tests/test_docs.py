@@ -186,7 +186,7 @@ def codes_of_messages() -> set[str]:
             parallel = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
             for name, x in zip(target.elts, value.elts, strict=True) if parallel else [(target, value)]:
                 constants[getattr(name, "id", "")] = x
-                if getattr(name, "id", "") in ("code", "SEEN", "ELASTIC", "GEOMETRY_CODES", "WARNINGS"):
+                if getattr(name, "id", "") in ("code", "SEEN", "ELASTIC", "WARNINGS"):
                     found += getattr(x, "elts", [x])
         for node in nodes:
             if isinstance(node, ast.Call):
