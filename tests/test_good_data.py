@@ -291,6 +291,7 @@ NO_LIMITS = {
     "0": 'effort="0" velocity="0" lower="0" upper="0"',
     "absent": "",
     "inf": 'effort="inf" velocity="INF" lower="-inf" upper="+inf"',
+    "below 0": 'effort="-1" velocity="-1" lower="-1e16" upper="1e16"',
     "nan": 'effort="nan" velocity="NaN" lower="nan" upper="nan"',
     "1e16": 'effort="1e16" velocity="1e9" lower="-1e16" upper="1e16"',
     "largest": 'effort="1.7976931348623157e+308" velocity="1.7976931348623157e+308" '

@@ -8,7 +8,15 @@ import numpy as np
 
 from spelgen.errors import LogError
 from spelgen.labels import counted
-from spelgen.logs.jumps import centred, is_outlier, is_stale, jump_count, repeated_rows, unwrapped
+from spelgen.logs.jumps import (
+    centred,
+    is_outlier,
+    is_stale,
+    jump_count,
+    read_as_words,
+    repeated_rows,
+    unwrapped,
+)
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import TUNING
@@ -63,6 +71,12 @@ def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping
         if not period:
             continue
         count = jump_count(column, period)
+        if count and quantity == "q":
+            scale = mapping.scale(quantity, joint)
+            word = read_as_words((column - mapping.offset(quantity, joint)) / scale, 2 * pi / abs(scale))
+            # a sign bit of whole turns: unwrapped, the words would be magnitudes
+            if word is not None and word.key == "sign_bit":
+                continue
         result = unwrapped(column, period)
         if quantity == "u":
             # Registers of commands and of positions may start in different revolutions: the median difference of the
@@ -190,11 +204,24 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
         data, rows = data[~foreign], np.asarray(rows)[~foreign]
         count, message = counted(int(foreign.sum()), "row"), "of another topic or publisher left out"
         repairs += (f"{count} {message}: without values, or with positions only",)
+    incomplete = np.isnan(data).any(axis=1)
+    if incomplete.any():
+        data, rows = data[~incomplete], np.asarray(rows)[~incomplete]
+        repairs += (
+            f"{counted(int(incomplete.sum()), 'row')} left out as dropouts: a signal without a number",
+        )
     if layout.mapping.sample_rate:
         data = np.column_stack([np.arange(len(data)) / layout.mapping.sample_rate, data[:, 1:]])
         return data, repairs
+    timeless = _is_timeless(data[:, 0])
+    if timeless.any():
+        data, rows = data[~timeless], np.asarray(rows)[~timeless]
+        data[:, 0] -= data[0, 0]
+        repairs += (
+            f"{counted(int(timeless.sum()), 'row')} left out: times far from those of all other rows",
+        )
     t = data[:, 0]
-    late = np.count_nonzero(np.diff(t) < 0)
+    late = int(np.count_nonzero(np.diff(t) < 0))
     if late:
         ordered = data[np.argsort(t, kind="stable")]
         positions = slice(1, 1 + len(layout.joints))
@@ -202,7 +229,7 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
         if _roughness(ordered[:, positions]) > _roughness(data[:, positions]):
             raise _backward_times(t, rows, layout)
         data = ordered
-        repairs += (f"{late} times before that of the row above: the rows were sorted",)
+        repairs += (f"{counted(late, 'time')} before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
     # Many rows with equal times and different values show that the resolution of the clock is too low. Up to ten such
@@ -213,8 +240,16 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
     repeats = np.count_nonzero(is_repeat)
     if repeats:
         data = data[~is_repeat]
-        repairs += (f"{repeats} rows with the time of the row before were left out",)
+        repairs += (f"{counted(int(repeats), 'row')} with the time of the row before left out",)
     return data, repairs
+
+
+def _is_timeless(t: np.ndarray) -> np.ndarray:
+    """Return a mask (T,) of the times t (T,) that are far from all others, such as 0 in a message without a stamp."""
+    if len(t) < TUNING.jump_window:
+        return np.zeros(len(t), bool)
+    first, middle, last = np.quantile(t, [0.25, 0.5, 0.75])
+    return np.asarray((np.abs(t - middle) > 1e4 * (last - first)) & (last > first))
 
 
 def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:

@@ -1,6 +1,7 @@
 """Warnings about physically inconsistent values and probable mistakes in a URDF."""
 
 from collections.abc import Iterator, Sequence
+from math import pi
 
 import numpy as np
 
@@ -26,6 +27,7 @@ def lint(robot: Robot) -> list[Diagnostic]:
     findings += _lint_placeholders([link.inertial for link in robot.links if link.inertial])
     moving = [joint for joint in robot.joints if joint.moves]
     findings += [finding for joint in moving for finding in _lint_joint(joint)]
+    findings += [finding for joint in robot.joints for finding in _lint_units(joint)]
     findings += _lint_groups(robot, moving)
     warnings = [Diagnostic("warning", code, where, line, message) for code, where, line, message in findings]
     return [*warnings, *_unlimited([joint for joint in moving if joint.mimic is None])]
@@ -83,6 +85,29 @@ def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
     if joint.lower is not None and joint.upper is not None and joint.lower > joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
         yield "lower-above-upper", f"{where} limit", line, message
+
+
+def _lint_units(joint: UrdfJoint) -> Iterator[Finding]:
+    """Yield warnings about angles that are probably in degrees, and lengths that are probably in millimetres."""
+    where, line = f"joint {joint.name!r}", joint.line
+    limits = [abs(x) for x in (joint.lower, joint.upper) if x is not None]
+    angle, turns = max(map(abs, joint.rpy)), max(limits, default=0.0) / (2 * pi)
+    if angle > 2 * pi + 0.01:
+        yield "degrees", f"{where} origin", line, f"rpy of {angle:g} rad is more than a turn: perhaps degrees"
+    if joint.type == "revolute" and turns > 4:
+        yield (
+            "degrees",
+            f"{where} limit",
+            line,
+            f"{2 * pi * turns:g} rad is {turns:.0f} turns: perhaps degrees",
+        )
+    if max(map(abs, joint.xyz)) > 20:
+        yield (
+            "millimetres",
+            f"{where} origin",
+            line,
+            f"xyz of {max(map(abs, joint.xyz)):g} m: perhaps millimetres",
+        )
 
 
 def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
