@@ -204,7 +204,13 @@ def test_times_of_a_coarse_clock_are_reconstructed_where_rows_are_evenly_spaced(
 def test_times_of_a_coarse_clock_are_an_error_where_rows_are_not_evenly_spaced(tmp_path):
     uneven = np.cumsum(np.where(np.sin(5 * T) > 0, 0.002, 0.02))
     pa.csv.write_csv(columns_of(np.floor(uneven / 0.02) * 0.02), tmp_path / "log.csv")
-    with pytest.raises(LogError, match=r"rows with the time of another row, but another state.*sample_rate"):
+    refused = pytest.raises(LogError, match=r"with the time of another row, but another state.*sample_rate")
+    with refused:
+        read_logs(tmp_path / "log.csv", JOINTS)
+    pa.csv.write_csv(
+        columns_of(np.floor(T * 1e7 / 4) / 1e7), tmp_path / "log.csv"
+    )  # times of six digits in years
+    with refused:
         read_logs(tmp_path / "log.csv", JOINTS)
 
 
@@ -275,6 +281,8 @@ def test_times_of_lerobot_are_reported_as_frame_numbers_until_a_rate_is_stated(t
     (log,) = read_logs(folder, JOINTS, degrees)
     assert log.sample_rate == pytest.approx(30, rel=1e-3)
     assert any("times are frame numbers at 30 frames per second and not measured" in x for x in log.remarks)
+    with pytest.raises(LogError, match="write 'input: position' into the YAML"):
+        read_logs(folder, JOINTS, {"units": {"q": "deg"}})
     (log,) = read_logs(folder, JOINTS, degrees | {"sample_rate": 60})
     assert log.sample_rate == pytest.approx(60, rel=1e-6)
     assert log.remarks == ()

@@ -19,7 +19,7 @@ from spelgen.logs.jumps import (
 )
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
-from spelgen.logs.tuning import TUNING
+from spelgen.logs.tuning import SIGNALS, TUNING
 from spelgen.logs.values import foreign_rows, is_split
 from spelgen.settings.log_mapping import LogMapping
 
@@ -297,7 +297,7 @@ def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
         slope, first = np.polyfit(numbers, t[start:stop], 1) if len(numbers) > 2 else (0.0, t[start])
         times[start:stop] = first + slope * numbers
         rates.append(slope)
-    if np.abs(times - t).max() > tick or not min(rates) > 0:
+    if np.abs(times - t).max() > tick or not min(rates) > 0 or np.median(rates) < SIGNALS.fastest_step:
         count = np.count_nonzero(steps == 0)
         raise LogError(
             f"{count} of {len(t)} rows with the time of another row, but another state", file=layout.file,

@@ -72,6 +72,8 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     message = f"q that changes {signals.factor:.3g} times as fast as qd"
     if is_far:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
+        if (signals.q == signals.q.round()).all():
+            message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
     distance, keys = min(_unit_readings(signals, is_far), key=itemgetter(0), default=(np.inf, {}))
     if distance > log(1.25):
         return message if is_far else None
@@ -93,6 +95,8 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
     if mapping.unit("q", joint):
         positions = positions[:1]
+    elif is_far and not is_known:
+        positions = positions[:3]  # the range does not tell milliradians from counts of an encoder
     if not is_known or mapping.unit("qd", joint):
         speeds = speeds[:1]
     for q, qd in product(positions, speeds):
@@ -144,7 +148,8 @@ def _rate_by_velocities(signals: JointSignals) -> float | None:
     is_common = factor > 0 and np.ptp(factors) < 0.05 * factor and signals.correlation > 0.98
     if not is_common or abs(steps - signals.step).max() > 0.5 * signals.step:
         return None
-    if is_factor(factor, 1.0) or any(is_factor(factor, TIMES[unit]) for unit in TIMES):
+    # a factor near 1 is more likely one of the velocities
+    if abs(log(factor)) < log(1.5) or any(is_factor(factor, TIMES[unit]) for unit in TIMES):
         return None
     step = signals.step * factor
     return plain_number(1 / step, 4) if SIGNALS.fastest_step <= step <= SIGNALS.slowest_step else None
