@@ -78,7 +78,7 @@ def _failure(path: Path, code: int, lines: list[str]) -> UrdfError:
 def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path) -> None:
     """Replace xacro's function for $(find PACKAGE), so that packages are found without ROS.
 
-    Packages are searched first in each folder above the file ``path``, and in its subfolder PACKAGE.
+    A package is searched in the folders above the file ``path`` and in their subfolders PACKAGE, and then by xacro.
     """
     installed = functions["_eval_find"]
 
@@ -94,7 +94,9 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
         named = [folder for folder in path.parents if folder.name == package]
         with suppress(Exception):  # ROS is not installed, or does not know the package
             return str(named[0]) if named else installed(package)
-        raise ValueError(f"the package {package!r} of $(find {package}) is neither above the file nor known to ROS")
+        raise ValueError(
+            f"the package {package!r} of $(find {package}) is neither above the file nor known to ROS"
+        )
 
     functions["_eval_find"] = find
 
