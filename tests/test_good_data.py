@@ -132,7 +132,7 @@ def test_messages_of_a_second_publisher_are_left_out_with_one_note(tmp_path):
     (log,) = read_logs(bag_of(mixed, tmp_path / "bag"), JOINTS)
     check_read(log)
     assert log.repairs == (
-        f"{len(zeros)} rows of another topic or publisher left out: without values, or with positions only",
+        f"{len(zeros)} rows left out, of another topic or publisher: without values, or with positions only",
     )
 
 
@@ -166,7 +166,7 @@ def test_rows_of_another_topic_are_left_out_and_a_cell_without_a_number_is_an_er
 
     (log,) = read_logs(write(mixed, tmp_path / f"log.{form}"), JOINTS)
     check_read(log)
-    assert log.repairs[0].startswith(f"{other.sum()} rows of another topic or publisher left out")
+    assert log.repairs[0].startswith(f"{other.sum()} rows left out, of another topic or publisher")
     mixed["tau_elbow"] = pa.array(columns["tau_elbow"][rows], mask=other | (np.arange(len(rows)) == 6))
     with pytest.raises(LogError, match="row 7, column tau_elbow: got no finite number"):
         read_logs(write(mixed, tmp_path / f"log.{form}"), JOINTS)

@@ -790,7 +790,7 @@ def test_rows_whose_times_are_years_from_the_others_are_left_out(tmp_path, rows)
     (log,) = read_logs(parquet(tmp_path / "log.parquet", table), ("a",))
     np.testing.assert_array_equal(log.q[:, 0], np.delete(np.sin(t), rows))
     assert 0 <= log.t[0] < log.t[-1] < 3
-    assert log.repairs == (f"{len(rows)} rows left out: times far from those of all other rows",)
+    assert log.repairs == (f"{len(rows)} rows left out, with times far from those of all other rows",)
 
 
 def test_rows_with_a_hole_are_an_error_until_dropouts_are_dropped(tmp_path):
@@ -801,7 +801,7 @@ def test_rows_with_a_hole_are_an_error_until_dropouts_are_dropped(tmp_path):
         read_logs(path, ("a",))
     (log,) = read_logs(path, ("a",), {"dropouts": "dropped"})
     np.testing.assert_array_equal(log.t, t[~np.isnan(tau)])
-    assert log.repairs == ("40 rows left out as dropouts: a signal without a number",)
+    assert log.repairs == ("40 rows left out, with a signal without a number",)
 
 
 def test_dropouts_are_removed_on_request(tmp_path):

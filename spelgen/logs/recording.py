@@ -1,6 +1,6 @@
 """Conversion of rows in SI units to trajectories: sorting, unwrapping, removal of repeats, velocities, torque delay."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from math import pi
 
@@ -207,27 +207,24 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
     if is_split(data):
         data, repairs = _joined_rows(data, layout)
         rows = np.arange(len(data))
-    foreign = foreign_rows(data, len(layout.joints))
-    if foreign.any():
-        data, rows = data[~foreign], np.asarray(rows)[~foreign]
-        count, message = counted(int(foreign.sum()), "row"), "of another topic or publisher left out"
-        repairs += (f"{count} {message}: without values, or with positions only",)
-    incomplete = np.isnan(data).any(axis=1)
-    if incomplete.any():
-        data, rows = data[~incomplete], np.asarray(rows)[~incomplete]
-        repairs += (
-            f"{counted(int(incomplete.sum()), 'row')} left out as dropouts: a signal without a number",
-        )
-    if layout.mapping.sample_rate:
-        data = np.column_stack([np.arange(len(data)) / layout.mapping.sample_rate, data[:, 1:]])
-        return data, repairs
-    timeless = _is_timeless(data[:, 0])
-    if timeless.any():
-        data, rows = data[~timeless], np.asarray(rows)[~timeless]
+    rate, others = (
+        layout.mapping.sample_rate,
+        "another topic or publisher: without values, or with positions only",
+    )
+    left_out: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        f"of {others}": lambda x: foreign_rows(x, len(layout.joints)),
+        "with a signal without a number": lambda x: np.isnan(x).any(axis=1),
+        "with times far from those of all other rows": lambda x: _is_timeless(x[:, 0]) & (not rate),
+    }
+    for reason, find in left_out.items():
+        found = find(data)
+        if found.any():
+            data, rows = data[~found], np.asarray(rows)[~found]
+            repairs += (f"{counted(int(found.sum()), 'row')} left out, {reason}",)
+    if rate:
+        return np.column_stack([np.arange(len(data)) / rate, data[:, 1:]]), repairs
+    if len(data) and abs(data[0, 0]) > 1e8:  # a date, if the first rows had no time
         data[:, 0] -= data[0, 0]
-        repairs += (
-            f"{counted(int(timeless.sum()), 'row')} left out: times far from those of all other rows",
-        )
     t = data[:, 0]
     late = int(np.count_nonzero(np.diff(t) < 0))
     if late:

@@ -89,25 +89,16 @@ def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
 
 def _lint_units(joint: UrdfJoint) -> Iterator[Finding]:
     """Yield warnings about angles that are probably in degrees, and lengths that are probably in millimetres."""
-    where, line = f"joint {joint.name!r}", joint.line
-    limits = [abs(x) for x in (joint.lower, joint.upper) if x is not None]
-    angle, turns = max(map(abs, joint.rpy)), max(limits, default=0.0) / (2 * pi)
-    if angle > 2 * pi + 0.01:
-        yield "degrees", f"{where} origin", line, f"rpy of {angle:g} rad is more than a turn: perhaps degrees"
-    if joint.type == "revolute" and turns > 4:
-        yield (
-            "degrees",
-            f"{where} limit",
-            line,
-            f"{2 * pi * turns:g} rad is {turns:.0f} turns: perhaps degrees",
-        )
-    if max(map(abs, joint.xyz)) > 20:
-        yield (
-            "millimetres",
-            f"{where} origin",
-            line,
-            f"xyz of {max(map(abs, joint.xyz)):g} m: perhaps millimetres",
-        )
+    limits = [abs(x) for x in (joint.lower, joint.upper) if x is not None and joint.type == "revolute"]
+    sizes = (
+        ("degrees", "origin", "rpy", max(map(abs, joint.rpy)), "rad", 2 * pi + 0.01),
+        ("degrees", "limit", "a position", max(limits, default=0.0), "rad", 8 * pi),
+        ("millimetres", "origin", "xyz", max(map(abs, joint.xyz)), "m", 20.0),
+    )
+    for code, element, quantity, size, unit, largest in sizes:
+        if size > largest:
+            message = f"{quantity} of {size:g} {unit}: perhaps {code}"
+            yield code, f"joint {joint.name!r} {element}", joint.line, message
 
 
 def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
