@@ -103,20 +103,20 @@ class Estimator:
     ) -> Iterator[EstimatorState]:
         """Process samples at times t (T,), with q, qd and tau (T, n); yield the estimates after each sample."""
         refusals, terms = balance_along(self.model, self.levels, self.intake, t, (q, qd, tau), self.prepared)
-        for now, speed, refusal, at in zip(t.tolist(), qd, refusals, terms, strict=True):
-            changed = at is not None and self._advance(now, speed, at, refusal)
+        for now, refusal, at in zip(t.tolist(), refusals, terms, strict=True):
+            changed = at is not None and self._advance(now, at, refusal)
             a, d = self.drift.x.T
             yield EstimatorState(now, refusal, self.contact, self.payload, changed, 1 + a, d)
 
-    def _advance(self, t: float, qd: np.ndarray, at: Balance, refusal: Refusal) -> bool:
+    def _advance(self, t: float, at: Balance, refusal: Refusal) -> bool:
         """Update all filters with the terms of the momentum balance; return True if a changed load was detected."""
         if refusal != "used":
             self.blocks.restart()
             self.half = None
             if refusal == "gap":
                 self.observer.restart()
-        self.contact = self.observer.step(t, qd, at, self.payload, self.drift.x)
-        block = None if refusal == "saturated" else self.blocks.add(t, qd, at)
+        self.contact = self.observer.step(t, at, self.payload, self.drift.x)
+        block = None if refusal == "saturated" else self.blocks.add(t, at)
         if block is not None:
             self.drift.update(block, block.y - block.load @ self.payload.parameters)
             if self.half is not None:

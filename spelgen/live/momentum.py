@@ -28,7 +28,7 @@ class Balance(NamedTuple):
     momentum: p. torque: G (tau - offset) + friction compensation + dL/dq. friction: mean of the friction torques at
     both bounds of the friction state. uncertainty: half the difference of the friction torques at both bounds.
     load_momentum, load_torque: P and N, momentum and torque per inertial parameter of the payload, (T, n, 10).
-    jacobian: Jacobian of a point of the last body, (T, 3, n), in root axes.
+    jacobian: Jacobian of a point of the last body, (T, 3, n), in root axes. velocity: qd.
     """
 
     momentum: np.ndarray
@@ -38,6 +38,7 @@ class Balance(NamedTuple):
     load_momentum: np.ndarray
     load_torque: np.ndarray
     jacobian: np.ndarray
+    velocity: np.ndarray
 
 
 def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -114,4 +115,4 @@ def _terms(
     else:
         low = high = model.friction_torque(at, qd)
     terms = model.momentum(at, qd), torque, (high + low) / 2, (high - low).abs() / 2
-    return [*terms, *load_terms(model.chain, q, qd, point)]
+    return [*terms, *load_terms(model.chain, q, qd, point), qd]

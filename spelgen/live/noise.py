@@ -48,7 +48,7 @@ class NoiseLevels(BaseModel):
     joint. load_variance: factor on the covariance of estimated payloads, an estimate with load_freedom degrees of
     freedom. speed: largest speed of the training logs [rad/s, m/s]. encoder: encoder step of positions [rad, m].
     effort: torque limit [Nm, N]. minutes: duration of the training logs [min]. point: position of the tip in the frame
-    of the last body, (3,) [m].
+    of the last body, (3,) [m]. delay: delay of measured torques relative to positions, found by the fit [s].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -68,6 +68,7 @@ class NoiseLevels(BaseModel):
     effort: Vector
     minutes: float
     point: Vector
+    delay: float
 
     @property
     def rest_speed(self) -> np.ndarray:
