@@ -137,8 +137,14 @@ def estimate(
     record["supported_alarms_per_minute"] = rate = levels.supported_alarms
     record["logs"] = [result.to_dict() for result in results]
     wanted = alarms or TUNING.alarms_per_minute
-    supported = (
-        f"contact thresholds: {wanted:g} false alarms per minute (training logs support >= {rate:.2g})"
+    thresholds = dict(zip(joints, levels.contact_thresholds(wanted).tolist(), strict=True))
+    record["contact_thresholds"] = thresholds
+    smallest = ", ".join(f"{joint} {moving:.3g}; {rest:.3g}" for joint, (moving, rest) in thresholds.items())
+    supported = fill(
+        f"contact thresholds in motion; at rest: {smallest} Nm, N, for {wanted:g} false alarms per minute (training "
+        f"logs support >= {rate:.2g})",
+        WIDTH,
+        subsequent_indent="    ",
     )
     answer(format, record, *(result.text() for result in results), supported, f"wrote {page}")
 

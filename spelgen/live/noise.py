@@ -92,6 +92,11 @@ class NoiseLevels(BaseModel):
         """Lowest rate of false alarms [1/min] that the training logs support: one in their whole duration."""
         return 1 / self.minutes
 
+    def contact_thresholds(self, alarms_per_minute: float) -> np.ndarray:
+        """Return the smallest external torques that are contacts, in motion and at rest, (n, 2) [Nm, N]."""
+        moving = self.thresholds(alarms_per_minute) * self.observer
+        return np.stack([moving, moving + self.resting], axis=1)
+
     def resting_torque(self, qd: np.ndarray) -> np.ndarray:
         """Return the bound of the friction error near standstill, (..., n) [Nm, N], at velocities qd (..., n).
 
