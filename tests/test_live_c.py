@@ -62,7 +62,7 @@ def segments(files: list[Path], arm: Arm) -> Trajectory:
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_c_equals_python_along_recordings(name, tmp_path):
-    """With an unfitted model, noise as large as its residuals, and delayed torques: every part of the estimator is busy."""
+    """With an unfitted model, noise as large as its residuals, and delayed torques: every part is busy."""
     urdf = SHARED / ("arms/panda_erd.urdf" if name == "panda" else f"logs/{name}/{name}.urdf")
     files = sorted((SHARED / "logs" / name).glob("*.parquet"))
     if not files:
@@ -81,7 +81,7 @@ def test_c_equals_python_along_recordings(name, tmp_path):
 
 
 def test_c_equals_python_with_couplings_and_hostile_samples(tmp_path):
-    """A mimic joint, a prismatic one, coupled motors and a passive joint, under unusable samples; torques are ahead of the motion."""
+    """A mimic joint, a prismatic one, coupled motors and a passive joint, unusable samples, and early torques."""
     (tmp_path / "arm.urdf").write_text(COUPLED)
     (tmp_path / "arm.yaml").write_text(MOTORS)
     model = randomised(tmp_path / "arm.urdf", "closed-form")

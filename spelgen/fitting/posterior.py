@@ -1,8 +1,8 @@
 """Posterior of a fitted model: 95 % intervals of its parameters, of M(q), g(q) and of predicted torques.
 
 The covariance R R^T of the fitted parameters x (`fitting.torque.covariance`) is propagated to first order: the variance
-of a function f(x) is |df/dx R|^2. The variance of a predicted torque also includes the squared residual of held-out
-samples.
+of a function f(x) is |J R|^2, with the Jacobian J = df/dx. The variance of a predicted torque also includes the squared
+residual of held-out samples.
 """
 
 import copy
@@ -50,10 +50,10 @@ class Uncertain(NamedTuple):
 
 
 class Propagated(NamedTuple):
-    """Value of a function of the model, (...), and its derivative df/dx R, (..., k).
+    """Value of a function of the model, (...), and a square root of its covariance, (..., k).
 
-    R R^T is the covariance of the fitted parameters x, with R (K, k). The norm of ``root`` over k is the standard
-    deviation of the value.
+    root: J R, with the Jacobian J (..., K) of the value with respect to the K fitted parameters, and their covariance R
+    R^T, R (K, k). The norm of ``root`` over its last axis is the standard deviation of the value.
     """
 
     value: Tensor
@@ -64,9 +64,11 @@ class Propagated(NamedTuple):
 class Posterior:
     """Posterior of a model that was fitted to torques.
 
-    covariance: (K, K), covariance of the rigid-body, drive and friction parameters. torque_std: (n,) [Nm, N], RMS
-    torque residual of blocks of samples that were not fitted, below the cutoff frequency of the fit's filter. delay:
-    delay of the torques relative to the positions [s]; None if there is no delay.
+    Attributes:
+        covariance: (K, K), covariance of the rigid-body, drive and friction parameters.
+        torque_std: (n,) [Nm, N], RMS of the low-pass filtered torque residual on blocks of samples that were not
+            fitted.
+        delay: delay of the torques relative to the positions [s]; None if there is no delay.
     """
 
     model: ArmModel
@@ -83,17 +85,18 @@ class Posterior:
         return Uncertain(value.numpy(), root.norm(dim=-1).numpy())
 
     def propagate(self, function: Callable[[ArmModel], Tensor]) -> Propagated:
-        """Return the value (...) of a function of the model, and its derivative df/dx R, (..., k).
+        """Return the value (...) of a function of the model, and a square root of its covariance, (..., k).
 
-        R (K, k) is a factor of the covariance R R^T of the K fitted parameters x.
+        The square root is J R, with the Jacobian J of the function with respect to the fitted parameters, computed by
+        central differences, and R from `_root`.
         """
 
         def at(x: Tensor) -> Tensor:
             """Return the value of the function at parameters x, (K,)."""
             return evaluate_with(self.model, self._vector.unflatten(x), function)
 
-        # Step of the central differences, in standard deviations: small enough that the function is linear, and large
-        # enough that rounding errors are negligible.
+        # Step of the central differences, in standard deviations of the fitted parameters: small enough that the
+        # function is linear within a step, and large enough that rounding errors are negligible.
         part = 1e-4
         with torch.no_grad():
             columns = [(at(self._x + part * x) - at(self._x - part * x)) / (2 * part) for x in self._root.mT]
@@ -116,8 +119,9 @@ class Posterior:
     def torque(self, *motion: np.ndarray) -> Uncertain:
         """Return the torques (T, n) [Nm, N] that would be logged, with standard deviations.
 
-        motion: q, qd, qdd (T, n), and the friction state z and direction, if known. The standard deviation includes
-        noise and model errors, estimated by the torque residual of blocks of samples that were not fitted.
+        motion: q, qd, qdd, (T, n) each and, if known, the friction state z and the direction of motion (see
+        `DynamicsSamples`). The variance is the sum of two variances: the one due to errors of the parameters, and
+        `torque_std` squared, which includes noise and model errors.
         """
         q, *motion_and_state = (torch.as_tensor(np.ascontiguousarray(x)) for x in motion)
         model, root, of_bodies = self.model, self._root.clone(), self._vector.mask("bodies")
@@ -140,7 +144,7 @@ class Posterior:
 
     @cached_property
     def base_parameters(self) -> tuple[Interval, ...]:
-        """Intervals of the identifiable combinations of inertial parameters and armatures."""
+        """95 % intervals of the base parameters: identifiable combinations of inertial parameters and armatures."""
         names, combination = self._base
         values, roots = (combination @ factor for factor in self._constants)
         rows = zip(names, values.tolist(), roots.norm(dim=1).tolist(), strict=True)
@@ -148,24 +152,24 @@ class Posterior:
 
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
-        """Intervals of the masses [kg] and first moments [kg m] that the logs determine individually."""
+        """95 % intervals of the masses [kg] and first moments [kg m] that are base parameters by themselves."""
         _, combination = self._base
         alone = compress(self.base_parameters, (combination.count_nonzero(dim=1) == 1).tolist())
         return tuple(replace(x, positive=x.name[0] == "m") for x in alone if x.name[0] in "mh")
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
-        """Names of the masses and first moments that the logs determine only in combinations, or not at all."""
+        """Names of the masses and first moments that logs determine only in combinations, or not at all."""
         known = {x.name for x in self.bodies}
         names = map(parameter_name, range(10 * len(self.model.chain.parents)))
         return tuple(name for name in names if name[0] in "mh" and name not in known)
 
     @cached_property
     def drives(self) -> dict[str, tuple[Interval, ...]]:
-        """Intervals of the joints, by the name of the quantity.
+        """{quantity: 95 % intervals of the joints}.
 
-        The quantities are armature, viscous and Coulomb friction, torque offset, and trained gain. Viscous and Coulomb
-        friction approximate the fitted friction by least squares up to the typical speed.
+        The quantities are armature, viscous and Coulomb friction, torque offset, and trained motor gain. Viscous and
+        Coulomb friction approximate the fitted friction by least squares up to the typical speed.
         """
         model, inputs = self.model, self.model.inputs
         trained = inputs.gain_rows.tolist() if isinstance(inputs, MotorInputs) else []
@@ -191,9 +195,9 @@ class Posterior:
 
     @property
     def drive_columns(self) -> dict[str, list[str]]:
-        """Columns of the table of drives, by the name of the quantity.
+        """{quantity: column of the table of drives}.
 
-        A column has n texts of value and unit; a text is empty if the joint has no value.
+        A column has one text per joint, the value with interval and unit; the text is empty if the joint has no value.
         """
         columns = {}
         for quantity, of_joints in self.drives.items():
@@ -239,7 +243,10 @@ class Posterior:
 
     @cached_property
     def _root(self) -> Tensor:
-        """Factor R (K, k) of the covariance R R^T, without directions of negligible variance."""
+        """Square root R (K, k) of the covariance R R^T of the K fitted parameters.
+
+        Its columns are the k eigenvectors of non-negligible variance, each times its standard deviation.
+        """
         values, vectors = torch.linalg.eigh(self.covariance)
         kept = values > 1e-14 * values.max()
         root: Tensor = vectors[:, kept] * values[kept].sqrt()
@@ -251,10 +258,7 @@ class Posterior:
 
     @cached_property
     def _constants(self) -> Propagated:
-        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance.
-
-        The square root is the derivative with respect to the parameters x, times R, with R R^T the covariance of x.
-        """
+        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance."""
         return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
 
     def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
@@ -263,8 +267,8 @@ class Posterior:
     def _linear(self, value: Tensor, rows: Tensor) -> Uncertain:
         """Return a value (...) that is linear in inertial parameters and armatures, with its standard deviation.
 
-        rows: (..., 10 B + n), derivatives of the value with respect to the inertial parameters of B bodies and the
-        armatures.
+        rows: (..., 10 B + n), derivatives of the value with respect to the inertial parameters of the B bodies, then
+        with respect to the n armatures.
         """
         return Uncertain(value.numpy(), (rows @ self._constants.root).norm(dim=-1).numpy())
 
@@ -276,7 +280,7 @@ def posterior_of(
 
     Args:
         model: model with the fitted parameters.
-        content: `Checkpoint.posterior` of a file, checked here: covariance (K, K), torque_std (n,) and delay_std [s].
+        content: field ``posterior`` of a checkpoint: covariance (K, K), torque_std (n,) and delay_std [s].
         delay: delay of the torques relative to the positions [s].
         file: path of the checkpoint, for error messages.
 
@@ -301,7 +305,7 @@ def posterior_of(
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
-    """Return the tensor ``name``; None if it is absent, has another shape, is not float64, is zero or not finite."""
+    """Return the tensor ``name``; None unless it has this shape, is float64, finite and not zero."""
     tensor = content.get(name)
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
         return tensor if tensor.any() and tensor.isfinite().all() else None
@@ -309,21 +313,22 @@ def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | Non
 
 
 def _friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
-    """Return a function that approximates the friction of a model by viscous and Coulomb friction, (2, n).
+    """Return a function: model -> its viscous and Coulomb friction coefficients, (2, n).
 
-    The approximation is a straight line, fitted by least squares to the friction torque at speeds up to the typical
-    speed. The friction torque is averaged over random positions. The gravity load and the residual terms at these
-    positions are computed once, from ``model``; the function may be called with models of other friction.
+    They are the slope and the intercept of a straight line through the friction torque at speeds up to the typical
+    speed, fitted by least squares. The friction torque is averaged over random positions. The gravity load and the
+    factor of the residual terms at these positions are computed only once, from the argument ``model``: they are also
+    used for models with other friction parameters.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
     places = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
     q = torch.from_numpy([x.center for x in joints] + places)
     with torch.no_grad():
-        # gravity torque on the drives at P random positions, (P, n)
+        # The load of each drive is the gravity torque in the drive's coordinates, at P = 32 random positions, (P, n).
         load = model.gravity(q) @ torch.linalg.inv(motors_of(model))
         factor = friction_factor(model, q)
-    # Speeds are in units of the typical speed. They are dense at low speeds, which determine the Stribeck effect and
-    # the intercept.
+    # The speeds are in units of the typical speed. They are dense at low speeds, where the Stribeck effect determines
+    # the intercept of the line.
     speeds = np.geomspace(0.02, 1.0, 25)
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 

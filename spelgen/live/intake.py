@@ -41,10 +41,15 @@ class DelayLine:
 class Intake:
     """Checks of samples one after the other, and bounds of the friction state.
 
-    counts: number of samples for each result of the check. low, high: bounds of the friction state, (n, K) [rad, m].
-    The initial bounds are minus and plus the break-away displacements. Motion of a joint makes both bounds equal: the
-    friction state of the joint is then known. aligned: q, qd and tau of the last used sample at one time: the motion
-    is delayed like the torques, or the torques if these are ahead, (3, n).
+    The initial bounds of the friction state are minus and plus the break-away displacements. After a sufficient motion
+    of a joint both bounds are equal, and its friction state is known.
+
+    Attributes:
+        counts: {result of the check: number of samples}.
+        low: Lower bound of the friction state of each of K bristles, (n, K) [rad, m].
+        high: Upper bound, (n, K) [rad, m].
+        aligned: q, qd and tau of the last used sample, (3, n), at the same time: the motion is delayed if torques are
+            measured late, the torques if they are measured early.
     """
 
     def __init__(self, levels: NoiseLevels, bristles: BristleReach) -> None:
@@ -61,9 +66,13 @@ class Intake:
         self.line = DelayLine(abs(self.levels.delay))
 
     def accept(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
-        """Check a sample and update the bounds of the friction state; return "used" or the reason of a refusal."""
+        """Check a sample and update the bounds of the friction state.
+
+        Return "used", or the reason why the sample is refused or only partly used. t: time [s]. q, qd, tau: (n,) each.
+        """
         refusal = self._check(t, q, qd, tau)
-        # Several refused samples in a row show that the clock or the positions have changed permanently: restart.
+        # After `TUNING.restart` consecutive samples with such a refusal, a permanent change of the clock or of the
+        # positions is assumed, and the checks restart with the current sample.
         self.ignored += refusal in ("reversed", "jump")
         restarts = self.ignored >= TUNING.restart
         refusal = "gap" if restarts else refusal
@@ -97,7 +106,8 @@ class Intake:
             return "jump"
         if t - self.t > TUNING.gap:
             return "used" if self.t == -np.inf else "gap"
-        # The limit includes one encoder step, and motion for `TUNING.block` seconds, since time stamps may be delayed.
+        # The largest possible motion since the last sample. Time stamps may be delayed, so the limit includes a motion
+        # of `TUNING.block` seconds at the largest speed of the training logs, and one encoder step.
         furthest = speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
         if (np.abs(q - self.q) > furthest).any():
             return "jump"
@@ -133,7 +143,8 @@ def balance_along(
     used = [k for k, refusal in enumerate(refusals) if refusal not in IGNORED]
     terms: list[Balance | None] = [None] * len(t)
     if used:
-        # All samples are computed in one call, since a call of torch takes longer than the arithmetic of one sample.
+        # The terms of all samples are computed in one call, because the overhead of a call of torch is larger than the
+        # computation for one sample.
         aligned, low, high = map(np.array, zip(*states, strict=True))
         columns = balance(model, levels.point, [*aligned.swapaxes(0, 1)], (low, high), prepared)
         for k, *row in zip(used, *columns, strict=True):
