@@ -142,8 +142,8 @@ def estimate(
     record["contact_thresholds"] = thresholds
     smallest = ", ".join(f"{joint} {moving:.3g}; {rest:.3g}" for joint, (moving, rest) in thresholds.items())
     supported = fill(
-        f"contact thresholds in motion; at rest: {smallest} Nm, N, for {wanted:g} false alarms per minute (training "
-        f"logs support >= {rate:.2g})",
+        f"contact thresholds in motion; at rest: {smallest} Nm, N, for a rate of false alarms of {wanted:g} per minute "
+        f"(training logs support >= {rate:.2g})",
         WIDTH,
         subsequent_indent="    ",
     )
