@@ -135,18 +135,17 @@ def balance_along(
         prepared: parameter cache of the model; None: the function computes it.
     """
     refusals: list[Refusal] = []
-    states: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    for sample in zip(t.tolist(), *samples, strict=True):
+    states: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
+    for k, sample in enumerate(zip(t.tolist(), *samples, strict=True)):
         refusals.append(intake.accept(*sample))
         if refusals[-1] not in IGNORED:
-            states.append((intake.aligned, intake.low, intake.high))
-    used = [k for k, refusal in enumerate(refusals) if refusal not in IGNORED]
+            states.append((k, intake.aligned, intake.low, intake.high))
     terms: list[Balance | None] = [None] * len(t)
-    if used:
+    if states:
         # The terms of all samples are computed in one call, because the overhead of a call of torch is larger than the
         # computation for one sample.
-        aligned, low, high = map(np.array, zip(*states, strict=True))
+        used, aligned, low, high = map(np.array, zip(*states, strict=True))
         columns = balance(model, levels.point, [*aligned.swapaxes(0, 1)], (low, high), prepared)
-        for k, *row in zip(used, *columns, strict=True):
+        for k, *row in zip(used.tolist(), *columns, strict=True):
             terms[k] = Balance(*row)
     return refusals, terms

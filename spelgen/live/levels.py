@@ -35,6 +35,9 @@ from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.trajectory import Trajectory, joined_column
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
+Folds = Sequence[tuple[RigidBodyDynamics, Sequence[Trajectory]]]
+"""Pairs of a model and the logs to which it was not fitted."""
+
 
 def noise_levels(fit: Fit) -> NoiseLevels:
     """Return the stored or estimated noise levels of a fit. Raises RunError if they cannot be read or estimated."""
@@ -120,8 +123,8 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
 class HeldOutSample(NamedTuple):
     """A sample of a log, with the terms of a model that was not fitted to the log.
 
-    t: time [s]. at: terms of the momentum balance. is_resumed: whether the sample is
-    the first one after a gap. block: the block that ends at this sample, or None.
+    t: time [s]. at: terms of the momentum balance. is_resumed: whether the sample is the first one after a gap. block:
+    the block that ends at this sample, or None.
     """
 
     t: float
@@ -144,16 +147,11 @@ def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> 
     return samples
 
 
-def find_levels(
-    folds: Sequence[tuple[RigidBodyDynamics, Sequence[Trajectory]]],
-    effort: np.ndarray,
-    point: np.ndarray,
-    delay: float,
-) -> NoiseLevels:
+def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: float) -> NoiseLevels:
     """Return the noise levels of an arm from held-out logs.
 
     Args:
-        folds: pairs of a model and the logs to which it was not fitted.
+        folds: models with their held-out logs.
         effort: torque limits, (n,) [Nm, N]; infinite if unknown.
         point: position of the tip in the frame of the last body, (3,) [m].
         delay: delay of the torques relative to the positions [s].
