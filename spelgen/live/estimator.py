@@ -163,7 +163,7 @@ class Estimator:
                 it is longer than 0.3 s, the disturbance is omitted.
         """
         at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
-        z = torch.from_numpy((self.intake.low + self.intake.high) / 2)
+        z = torch.from_numpy(self.intake.bounds.mean(axis=0))
         past = (z,) if is_stateful(self.model) else ()
         with torch.no_grad():
             cache = self.model.at(*at, prepared=self.prepared)

@@ -46,8 +46,7 @@ class Intake:
 
     Attributes:
         counts: {result of the check: number of samples}.
-        low: Lower bound of the friction state of each of K bristles, (n, K) [rad, m].
-        high: Upper bound, (n, K) [rad, m].
+        bounds: Lower and upper bound of the friction state of each of K bristles, (2, n, K) [rad, m].
         aligned: q, qd and tau of the last used sample, (3, n), at the same time: the motion is delayed if torques are
             measured late, the torques if they are measured early.
     """
@@ -62,7 +61,7 @@ class Intake:
 
     def _begin(self) -> None:
         """Reset the friction state and the delay: the motion so far is unknown."""
-        self.low, self.high = -self.limit, self.limit
+        self.bounds = np.stack([-self.limit, self.limit])
         self.line = DelayLine(abs(self.levels.delay))
 
     def accept(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
@@ -90,8 +89,7 @@ class Intake:
             moved = path - start
             if self.bristles.motors is not None:
                 moved = self.bristles.motors @ moved
-            self.low = np.clip(self.low + moved[:, None], -self.limit, self.limit)
-            self.high = np.clip(self.high + moved[:, None], -self.limit, self.limit)
+            self.bounds = np.clip(self.bounds + moved[:, None], -self.limit, self.limit)
             self.path, self.t, self.q, self.ignored = path, t, q, 0
         self.counts[refusal] += 1
         return refusal
@@ -135,17 +133,18 @@ def balance_along(
         prepared: parameter cache of the model; None: the function computes it.
     """
     refusals: list[Refusal] = []
-    states: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
+    states: list[tuple[int, np.ndarray, np.ndarray]] = []
     for k, sample in enumerate(zip(t.tolist(), *samples, strict=True)):
         refusals.append(intake.accept(*sample))
         if refusals[-1] not in IGNORED:
-            states.append((k, intake.aligned, intake.low, intake.high))
+            states.append((k, intake.aligned, intake.bounds))
     terms: list[Balance | None] = [None] * len(t)
     if states:
         # The terms of all samples are computed in one call, because the overhead of a call of torch is larger than the
         # computation for one sample.
-        used, aligned, low, high = map(np.array, zip(*states, strict=True))
-        columns = balance(model, levels.point, [*aligned.swapaxes(0, 1)], (low, high), prepared)
+        used, aligned, bounds = map(np.array, zip(*states, strict=True))
+        signals, limits = [*aligned.swapaxes(0, 1)], [*bounds.swapaxes(0, 1)]
+        columns = balance(model, levels.point, signals, limits, prepared)
         for k, *row in zip(used.tolist(), *columns, strict=True):
             terms[k] = Balance(*row)
     return refusals, terms

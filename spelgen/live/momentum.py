@@ -116,9 +116,7 @@ def _terms(
 ) -> list[Tensor]:
     at = model.at(q, qd, prepared=prepared)
     torque = model.input_force(at, qd, tau) + model.lagrangian_gradient(at, qd)
-    if is_stateful(model):
-        low, high = (model.friction_torque(at, qd, z) for z in bounds)
-    else:
-        low = high = model.friction_torque(at, qd)
+    states = (torch.stack(bounds),) if is_stateful(model) else ()
+    low, high = model.friction_torque(at, qd, *states).expand(2, *qd.shape)
     terms = model.momentum(at, qd), torque, (high + low) / 2, (high - low).abs() / 2
     return [*terms, *load_terms(model.chain, q, qd, point), qd]
