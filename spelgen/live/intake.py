@@ -26,15 +26,15 @@ class DelayLine:
 
     def step(self, t: float, values: np.ndarray) -> np.ndarray:
         """Add values at time t [s]; return the values ``delay`` seconds before, or the oldest ones."""
-        samples, at = self.samples, t - self.delay
+        samples, past = self.samples, t - self.delay
         if not samples or t - samples[-1][0] >= self.delay / TUNING.delay_samples:
             samples.append((t, values))
-        while len(samples) > 2 and samples[1][0] <= at:
+        while len(samples) > 2 and samples[1][0] <= past:
             del samples[0]
         (begin, first), (end, second) = samples[0], samples[-1 if len(samples) == 1 else 1]
-        if at <= begin:
+        if past <= begin:
             return first
-        weight = (at - begin) / (end - begin)
+        weight = (past - begin) / (end - begin)
         return (1 - weight) * first + weight * second
 
 
