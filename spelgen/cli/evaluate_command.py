@@ -144,8 +144,8 @@ def estimate(
         f"{joint} {moving:.3g}; {resting:.3g}" for joint, (moving, resting) in thresholds.items()
     )
     supported = fill(
-        f"contact thresholds in motion; at rest: {smallest} Nm, N, for a rate of false alarms of {alarm_rate:g} per minute "
-        f"(training logs support >= {rate:.2g})",
+        f"contact thresholds in motion; at rest: {smallest} Nm, N, for a rate of false alarms of {alarm_rate:g} per "
+        f"minute (training logs support >= {rate:.2g})",
         WIDTH,
         subsequent_indent="    ",
     )
