@@ -23,13 +23,10 @@ from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import ParameterVector
-from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.identification.intervals import Interval, base_unit, interval_listing
 from spelgen.labels import UNITS, parameter_name
 from spelgen.listing import Listing
-from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.runtime.motors import MotorInputs
 
 QUANTITIES = {
@@ -124,6 +121,11 @@ class Posterior:
         `DynamicsSamples`). The variance is the sum of two variances: the one due to errors of the parameters, and
         `torque_std` squared, which includes noise and model errors.
         """
+        # Imported here, because intervals of parameters need no samples.
+        from spelgen.fitting.torque.jacobian import TorqueJacobian
+        from spelgen.fitting.torque.samples import TorqueSamples
+        from spelgen.logs.dynamics_samples import DynamicsSamples
+
         q, *motion_and_state = (torch.as_tensor(np.ascontiguousarray(x)) for x in motion)
         model, root, of_bodies = self.model, self._root.clone(), self._vector.mask("bodies")
         root[of_bodies] = self._constants.root[: int(of_bodies.sum())]

@@ -7,6 +7,11 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
 from scipy.special import stdtrit
 
+from spelgen.errors import RunError
+from spelgen.files import read_json, write_json
+from spelgen.fitting.fitted import Fit
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_record import require
 from spelgen.live.tuning import TUNING
 
 
@@ -60,6 +65,7 @@ class NoiseLevels(BaseModel):
         effort: Torque limit, (n,) [Nm, N].
         minutes: Duration of the training logs [min].
         point: Position of the tip in the frame of the last body, (3,) [m].
+        delay: Delay of measured torques relative to positions, as found by the fit [s].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -79,6 +85,7 @@ class NoiseLevels(BaseModel):
     effort: Vector
     minutes: float
     point: Vector
+    delay: float
 
     @property
     def rest_speed(self) -> np.ndarray:
@@ -100,6 +107,11 @@ class NoiseLevels(BaseModel):
     def supported_alarms(self) -> float:
         """Lowest rate of false alarms that can be estimated from the training logs: one in their duration [1/min]."""
         return 1 / self.minutes
+
+    def contact_thresholds(self, alarms_per_minute: float) -> np.ndarray:
+        """Return the smallest external torques that are contacts, in motion and at rest, (n, 2) [Nm, N]."""
+        moving = self.thresholds(alarms_per_minute) * self.observer
+        return np.stack([moving, moving + self.resting], axis=1)
 
     def resting_torque(self, qd: np.ndarray) -> np.ndarray:
         """Return the bound of the friction error near standstill, (..., n) [Nm, N], at velocities qd (..., n).
@@ -128,3 +140,17 @@ class NoiseLevels(BaseModel):
         excess = self.peak_count * (odds ** (1 / self.peak_count) - 1)
         thresholds: np.ndarray = np.maximum(self.peak_start + self.peak_scale * excess, 1.0)
         return thresholds
+
+
+def keep_levels(fit: Fit, levels: NoiseLevels) -> None:
+    """Write noise levels into the run folder of a fit, if it has one."""
+    if fit.folder is not None:
+        write_json(RunFolder(fit.folder).estimator, levels.model_dump(mode="json"))
+
+
+def stored_levels(fit: Fit) -> NoiseLevels | None:
+    """Return the noise levels in the run folder of a fit; None if there are none."""
+    file = None if fit.folder is None else RunFolder(fit.folder).estimator
+    if file is None or not file.exists():
+        return None
+    return require(NoiseLevels, read_json(file, RunError), file)
