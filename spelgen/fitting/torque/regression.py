@@ -12,12 +12,7 @@ from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.torque.jacobian import TorqueJacobian
-from spelgen.fitting.torque.parameters import (
-    ParameterVector,
-    joint_torque,
-    log_cholesky_parameters,
-    upper_cholesky,
-)
+from spelgen.fitting.torque.parameters import joint_torque, log_cholesky_parameters, upper_cholesky
 from spelgen.fitting.torque.problem import TorqueProblem
 from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
 from spelgen.fitting.torque.stages import initial_fit
@@ -95,10 +90,12 @@ def _regression(
 
 
 def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) -> None:
-    """Set rigid bodies and friction of a model to the physically consistent projection of a regression.
+    """Set the bodies of a model to the physically consistent projection of a regression.
 
     The projection is a fit to the torques of the regression, with a wide prior about bodies of 1 kg: the prior at the
-    URDF is the reason why a fit is worse than a regression, for example if its centres of mass are in mm.
+    URDF is the reason why a fit is worse than a regression, for example if its centres of mass are in mm. Friction and
+    drives of the projection are discarded: a regression may have negative friction, which the projection would explain
+    by drives that compensate friction.
     """
     with torch.no_grad():
         body = pseudo_inertia(torch.tensor([DEFAULT_BODY]).double())
@@ -112,4 +109,6 @@ def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) ->
     )
     prior = GaussianPrior(bodies=TUNING.max_width)
     estimate = initial_fit(TorqueProblem.of(TorqueJacobian(model, predicted), prior))
-    ParameterVector(model).write(estimate.state.x)
+    rigid = estimate.problem.jacobian.rigid
+    with torch.no_grad():
+        model.bodies.raw.copy_(rigid.unflatten(estimate.state.x)[rigid.bodies])
