@@ -124,7 +124,7 @@ class Fit:
     def posterior(self) -> Posterior:
         """Posterior of the model: 95 % intervals of the parameters, of M(q), g(q) and of predicted torques.
 
-        Raises RunError unless rigid bodies were fitted to torques.
+        Raises RunError unless rigid bodies were fitted to torques, or to positions under position servos.
         """
         delay = self.record.preprocessing.torque_delay or 0.0
         file = None if self.folder is None else RunFolder(self.folder).checkpoint

@@ -124,9 +124,10 @@ class Checkpoint(BaseModel):
 
     seconds: duration of the fit [s]. substeps: integrator steps per sample interval. torque_nmse: mean squared torque
     error divided by the variance of the torque, per joint. posterior: covariance and torque residual (see
-    `posterior_of`); None except for rigid bodies fitted to torques. rollbacks: number of repeated epochs of a fit to
-    windows. learning_rate_factor: factor on the learning rate after these repetitions. momentum_done: whether the
-    momentum stage has ended. Further keys are states of an objective; torch checks their content.
+    `posterior_of`); None except for rigid bodies fitted to torques or to positions under position servos. rollbacks:
+    number of repeated epochs of a fit to windows. learning_rate_factor: factor on the learning rate after these
+    repetitions. momentum_done: whether the momentum stage has ended. Further keys are states of an objective; torch
+    checks their content.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")

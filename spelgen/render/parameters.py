@@ -15,7 +15,7 @@ from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
 from spelgen.dynamics.regressor_dynamics import urdf_parameters
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
-from spelgen.fitting.posterior import Posterior
+from spelgen.fitting.posterior import PRECISE, Posterior
 from spelgen.fitting.run_record import Content
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.intervals import Interval
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
 Rows = tuple[tuple[str, ...], ...]
-DETERMINED = ("firm", "fair")
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,8 @@ def parameter_tables(
     tables: list[Listing] = []
     if arm is not None and identified and "base_parameters" in identified:
         tables.append(base_table(model, arm, identified, posterior))
+    elif posterior is not None:
+        tables.append(posterior.listings[0])
     if isinstance(model, RigidBodyDynamics):
         tables.append(_body_table(body_parameters(model), arm, posterior))
         tables.append(_joint_table(model, arm, posterior))
@@ -110,8 +111,8 @@ def base_table(
     # The formula is omitted if it equals the name: the parameter is then not combined with others.
     columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
     rows = list(zip(*columns.values(), strict=True))
-    sure = tuple(row for row in rows if row[-2] in DETERMINED)
-    unsure = tuple(row for row in rows if row[-2] not in DETERMINED)
+    sure = tuple(row for row in rows if row[-2] in PRECISE)
+    unsure = tuple(row for row in rows if row[-2] not in PRECISE)
     title = "Base parameters: identifiable combinations"
     folded_title = f"{len(unsure)} more, not significantly different from zero"
     return ParameterTable(title, tuple(columns), sure, f"{note}.", folded=unsure, folded_title=folded_title)

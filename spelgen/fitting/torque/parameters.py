@@ -28,14 +28,17 @@ RIGID_GROUPS = (
     "bodies", "friction_compensation", "gains", "armature", "offset", "sizes", "effects", "velocities",
     "load_dependence", "fractions",
 )  # fmt: skip
-"""Groups of parameters (see `ParameterInfo`) of bodies, drives and friction; all others are of residual terms."""
+"""Groups of parameters (see `ParameterInfo`) of bodies, drives and friction; all others are of residual terms, or of
+position servos."""
+SERVO_GROUPS = ("stiffness", "damping", "dead_zone", "delay")
+"""Groups of position servos, which fits to torques do not have."""
 DAY_GROUPS = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
 """Groups that differ from day to day."""
 NEGLIGIBLE = -30.0  # logarithm of a negligible friction coefficient
 
 
 class ParameterVector:
-    """Maps the parameters of bodies, drives and friction of a model to one vector x (K,), and back.
+    """Maps the parameters of bodies, drives, servos and friction of a model to one vector x (K,), and back.
 
     groups: parameter group of each name. initial: parameters by name when this object was created.
     """
@@ -46,7 +49,7 @@ class ParameterVector:
         self._tensors: dict[str, torch.Tensor] = {}  # parameters, and buffers that a fit may change
         self.initial: dict[str, torch.Tensor] = {}
         for name, info in parameter_table(model).items():
-            if info.kind in RIGID_GROUPS:
+            if info.kind in (*RIGID_GROUPS, *SERVO_GROUPS):
                 self.groups[name], self._tensors[name] = info.kind, tensors[name]
                 self.initial[name] = tensors[name].detach().clone()
         (self.bodies,) = self.names("bodies")
