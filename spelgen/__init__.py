@@ -1,11 +1,12 @@
-"""spelgen: a URDF in, a PyTorch model of the arm's dynamics with its exact structure out."""
+"""spelgen generates a PyTorch model of a robot arm's dynamics, with the exact structure of the arm, from a URDF."""
 
 import ast
 from importlib import import_module
 from pathlib import Path
 
-# Name of the API -> the module that defines it: the imports of the stub file, which type checkers read. A module is
-# imported at the first use of a name (PEP 562), so that `import spelgen` is fast.
+# {name of the API: module that defines it}, from the imports in the stub file `__init__.pyi`: type checkers read the
+# same file, so that both agree. A module is imported at the first use of a name (PEP 562), so that `import spelgen` is
+# fast.
 _HOME = {
     alias.name: str(node.module)
     for node in ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")).body

@@ -29,12 +29,12 @@ PRESETS = Path(__file__).parent / "presets"
 
 @dataclass(frozen=True)
 class Design:
-    """The form of each quantity of the equations of motion.
+    """The form of a model: how each quantity of the equations of motion (M, V, friction, G) is represented.
 
-    Values of the fields: ``derived``: zeros, constants and dependences of the quantity follow from the structure of the
-    arm, and networks learn only the remaining functions. ``dense``: a network learns the whole quantity without
-    knowledge of the arm (Wang et al., Sci Rep 15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024); with the
-    suffix ``3n``, the quantity has three rows per joint, one for each axis of its frame. ``closed-form``: rigid bodies
+    ``derived``: the structure of the arm determines which entries of the quantity are zero, are constant, or depend on
+    which joints; networks learn only the entries that vary. ``dense``: a network learns the whole quantity without
+    knowledge of the arm (Wang et al., Sci Rep 15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024). The suffix
+    ``3n``: the quantity has three rows per joint, one for each axis of the joint's frame. ``closed-form``: rigid bodies
     with trained inertial parameters, and networks for residual terms, if any. ``constants``: a friction model with
     trained constants.
 
@@ -78,7 +78,7 @@ def load_design(preset: str | Path | Design) -> Design:
 
 
 def _read(path: Path) -> Design:
-    """Return the design in a YAML file, which has every key of ``Design``, and ``about``, a description."""
+    """Return the design in a YAML file with all keys of ``Design`` and, optionally, ``about``, a description."""
     document = read_document(path)
     content = document.value()
     if not isinstance(content, dict):
@@ -109,7 +109,7 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
                 f"one of {', '.join(choices)}",
             )
             errors.append(SettingsError(got, file=file, line=lines[name], element=name, expected=expected))
-    # Invalid values are raised before conflicts are searched: a conflict is defined between valid values only.
+    # Errors of single values are raised first: the rules for pairs of values require that each value is valid.
     collect(errors)
     for first, second, do in _conflicts(values):
         got = f"{first}: {values[first]} with {second}: {values[second]}"
@@ -118,7 +118,7 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
 
 
 def _conflicts(values: Mapping[str, object]) -> Iterator[tuple[str, str, str]]:
-    """Yield each pair of keys whose values contradict each other, with advice."""
+    """Yield (key, other key, advice) for each pair of keys whose values contradict each other."""
     # The rules have the order of the keys in a file, so that errors appear in the order of the file's lines.
     rigid = values["mass"] == "closed-form"
     if rigid != (values["potential"] == "closed-form"):

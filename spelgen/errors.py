@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 Severity = Literal["info", "warning"]
-MAX_ERRORS = 50  # number of printed errors
-MAX_TEXT = 2000  # number of printed characters of a part of a message
+MAX_ERRORS = 50  # largest number of printed errors
+MAX_TEXT = 2000  # largest printed length of each field of an error, in characters
 
 
 @dataclass(eq=False, repr=False)
@@ -27,7 +27,8 @@ class SpelgenError(Exception):
     do: str | None = None
 
     def __post_init__(self) -> None:
-        # `args` gets only `got`: an exception is copied, by Ray for example, by a call of its class with `args`.
+        # `args` must be the positional arguments of this class: copying an exception, as Ray does, calls
+        # `class(*args)`.
         super().__init__(self.got)
         # Callers give the file as text or as a path. `SpelgenErrors` compares the files of errors, so both become text.
         self.file = None if self.file is None else str(self.file)
@@ -57,7 +58,7 @@ class SettingsError(SpelgenError):
 
 
 class OptionError(SettingsError):
-    """An option that does not apply; the text names the command or setting that the option belongs to."""
+    """An option that has no effect here; ``belongs`` names the command or setting that the option belongs to."""
 
     def __init__(self, option: str, belongs: str) -> None:
         super().__init__(belongs, element=option)
@@ -77,7 +78,7 @@ class RunError(SpelgenError):
 
 
 class SpelgenErrors(SpelgenError):
-    """Several errors, printed one per line; an error that occurs in several files is printed once."""
+    """Several errors in one exception, printed one per line; equal errors in several files are printed once."""
 
     def __init__(self, errors: Sequence[SpelgenError]) -> None:
         super().__init__(f"{len(errors)} errors")
@@ -97,7 +98,7 @@ class SpelgenErrors(SpelgenError):
 
 
 def _once(errors: Sequence[SpelgenError]) -> str:
-    """Return the text of the first of several errors that differ only in their files, followed by the other files."""
+    """Return a text for errors that differ only in their files: the first error, then the other files."""
     first = errors[0]
     files = dict.fromkeys(error.file for error in errors if error.file and error.file != first.file)
     return f"{first}\n  the same: {shortened(list(map(str, files)), 5)}" if files else str(first)

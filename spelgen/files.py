@@ -1,7 +1,8 @@
-"""Reading of regular files, atomic writing of files, and local copies of files at addresses.
+"""Reading of regular files, atomic writing of files, and local copies of remote files.
 
-Addresses are URLs of fsspec, such as `s3://bucket/logs`. All other modules work on local paths: the local copy of an
-address is in a temporary folder until the process ends, and files written to the copy are sent to the address.
+An address is a URL of fsspec, such as `s3://bucket/logs`. All other modules work on local paths: an address is copied
+to a temporary folder, which exists until the process ends, and files written to this folder are uploaded to the
+address.
 """
 
 import atexit
@@ -17,7 +18,7 @@ from typing import Any
 
 from spelgen.errors import SpelgenError
 
-# Largest JSON or Python file [bytes]: the parsed content takes about thirty times the memory.
+# Largest JSON or Python file that is read [bytes]: parsed, it takes about thirty times this memory.
 MAX_BYTES = 2**25
 
 
@@ -52,7 +53,7 @@ def read_bytes(
             return path.read_bytes()
     except FileNotFoundError:
         raise error("no such file", file=path) from None
-    except (OSError, ValueError) as problem:  # ValueError: a null character in the name
+    except (OSError, ValueError) as problem:  # `stat` raises ValueError for a null character
         reason = problem.strerror if isinstance(problem, OSError) else None
         raise error(f"cannot be read ({reason or problem})", file=path) from None
     raise error(f"a file of {size} bytes", file=path, expected=f"at most {largest}", do=do)
@@ -74,8 +75,8 @@ def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
 def limited_memory(size: int) -> Iterator[None]:
     """Limit the additional memory of the process to ``size`` bytes; a larger allocation raises MemoryError.
 
-    The limit protects from readers of other packages, which allocate the size that a file states without checking it.
-    It has an effect on Linux only.
+    File readers of third-party packages allocate the size that a file states, without checking it. The limit has an
+    effect on Linux only.
     """
     try:
         import resource
@@ -100,8 +101,9 @@ def limited_memory(size: int) -> Iterator[None]:
 def replacing(path: Path | str) -> Iterator[Path]:
     """Yield a hidden file in the folder of `path`; at the end it replaces `path` atomically, even if power fails.
 
-    An absent folder is created, and a file with an address is sent to the address. An interrupted or failed write does
-    not change `path`. Raises OSError with the path if the file cannot be written, for instance on a full disk.
+    An absent folder is created. If `path` is in the local copy of an address, the file is also uploaded. An interrupted
+    or failed write does not change `path`. Raises OSError with the path if the file cannot be written, for instance on
+    a full disk.
     """
     path = Path(path)
     with naming(path):
@@ -121,14 +123,14 @@ def replacing(path: Path | str) -> Iterator[Path]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file if it exists; for the copy of an address, also remove the file at the address."""
+    """Remove a file if it exists. If it is the local copy of a remote file, also remove the remote file."""
     path.unlink(missing_ok=True)
     sent(path)
 
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add `path` to an OSError without a file name that is raised within the context, as by a full disk."""
+    """Context manager that adds the file name `path` to an OSError without one, as raised for a full disk."""
     try:
         yield
     except OSError as error:
@@ -158,14 +160,14 @@ def write_json(path: Path | str, content: Mapping[str, object]) -> Path:
 # is a drive of Windows.
 ADDRESS = re.compile(r"^([a-z][a-z0-9+.-]+):/+(?=[^/])")
 
-_copies: dict[str, Path] = {}  # address -> local copy
+_copies: dict[str, Path] = {}  # {address: path of its local copy}
 
 
 def local(path: Path | str) -> Path:
-    """Return a local path unchanged, and for an address the local copy of its file or folder.
+    """Return the path of the local copy of a remote file or folder; a local path is returned unchanged.
 
-    Files written to the copy are sent to the address (see `sent`). Raises SpelgenError if the address cannot be
-    reached, or if a key of the object store would be copied to a path outside the copy.
+    Files written to the copy are uploaded (see `sent`). Raises SpelgenError if the address cannot be reached, or if a
+    key of the object store would be copied to a path outside the copy.
     """
     # A local file whose name has the form of an address takes precedence over the address.
     match = ADDRESS.match(str(path))
@@ -180,9 +182,9 @@ def local(path: Path | str) -> Path:
 
 
 def sent(path: Path) -> None:
-    """Copy a local file to the address of which it is a copy; remove the file there if the local file was removed.
+    """Upload the local copy of a remote file. If the local copy was removed, remove the remote file.
 
-    A file that is no copy of an address is not sent.
+    Files that are no local copies are ignored.
     """
     target = address_of(path)
     if target is None:
@@ -196,7 +198,7 @@ def sent(path: Path) -> None:
 
 
 def address_of(path: Path) -> str | None:
-    """Return the address of which a path is a copy; None for a local path."""
+    """Return the address whose local copy is at `path`; None if `path` is no local copy."""
     for address, copy in _copies.items():
         if path == copy:
             return address

@@ -15,7 +15,7 @@ LINEAR_SERVOS, DELAYED_COMMAND = "linear servo", "delayed command"
 
 @dataclass(frozen=True)
 class Units:
-    """Units of joint quantities: position, velocity, torque (or force), and inertia, the diagonal entry of M."""
+    """Units of the position, velocity, torque (or force) of a joint, and of its diagonal entry of M (inertia)."""
 
     position: str
     velocity: str
@@ -29,13 +29,16 @@ UNITS = {"revolute": Units("rad", "rad/s", "Nm", "kg m²"), "prismatic": Units("
 
 INERTIAL_PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """Inertial parameters of a body: mass, first moment, and inertia tensor about the origin of the joint's frame."""
-# A base parameter has the name of the first of these parameters in its sum. Iyy, hz and m are last, because for a
-# revolute joint they can always be regrouped into other parameters.
+# A base parameter is a linear combination of inertial parameters. Its name is its first inertial parameter in this
+# order. Iyy, hz and m are last, because a revolute joint always allows regrouping them into other parameters.
 BASE_ORDER = ("Izz", "Ixx", "Ixy", "Ixz", "Iyz", "hx", "hy", "m", "Iyy", "hz")
 
 
 def parameter_name(index: int) -> str:
-    """Return the name of an inertial parameter (index from 0), such as ``Izz2``: component zz of the second body."""
+    """Return the name of an inertial parameter, such as ``Izz2``: component zz of the second body.
+
+    index: index in the vector of all inertial parameters, with ten parameters per body, from 0.
+    """
     return f"{INERTIAL_PARAMETERS[index % 10]}{index // 10 + 1}"
 
 
@@ -101,7 +104,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def share(fraction: float, reference: str = "") -> str:
-    """Return ``5 % of the motion``, or ``13.6 times the motion`` for a fraction above 1."""
+    """Return a fraction of ``reference`` as text, such as ``5 % of the motion`` or ``13.6 times the motion``."""
     # Above 1 a factor is easier to understand than a percentage: 2.5 times the motion, not 250 %.
     if fraction > 1:
         return f"{fraction:.3g} times {reference}".rstrip()
@@ -126,16 +129,16 @@ def short_name(name: str) -> str:
 
 
 def thousandths(joint_types: Sequence[str]) -> str:
-    """Return the unit of small distances of these joints: ``mrad``, ``mm`` or, for both types, ``mrad, mm``."""
+    """Return the unit of small distances: ``mrad`` for revolute joints, ``mm`` for prismatic, ``mrad, mm`` for both."""
     units = {"mm" if joint_type == "prismatic" else "mrad" for joint_type in joint_types}
     return ", ".join(sorted(units, reverse=True)) or "mrad, mm"
 
 
 def observed(predictor: str) -> str:
-    """Return the name of a predictor that adds the constant disturbance estimated by a momentum observer."""
+    """Return the name of a predictor with an observer, which adds the disturbance torque of a momentum observer."""
     return f"{predictor} + observer"
 
 
 def is_drawn(predictor: str) -> bool:
-    """Return True if charts show a predictor. Of the predictors with an observer, only the model's is shown."""
+    """Return True if charts show a predictor. A predictor with an observer is shown only if it is the trained model."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

@@ -56,7 +56,7 @@ class Listing:
         return "left" if column in self.left else "right"
 
     def _layout(self, columns: Sequence[Sequence[str]], group: Sequence[int]) -> str:
-        """Return the table that consists of the first column (names of rows) and the columns with indices `group`."""
+        """Return the text of a table with the first column (names of rows) and the columns with indices `group`."""
         names, *chosen = _fitted([columns[column] for column in (0, *group)])
         room = WIDTH - 2 * (1 + len(group)) - sum(map(_width, chosen))
         chosen.insert(0, [_folded(name, max(MIN_NAME, room)) for name in names])
@@ -80,7 +80,7 @@ def _fitted(columns: Sequence[Sequence[str]]) -> list[Sequence[str]]:
 
 
 def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
-    """Return groups of column indices; each group fits into the page width together with the names of rows."""
+    """Return groups of column indices: the names of rows and the columns of one group fit into the page width."""
     # Names of rows are wrapped before the table is split; numbers cannot be wrapped.
     words = [word for name in columns[0][1:] for word in SEPARATOR.split(name)]
     room = WIDTH - 2 - max(MIN_NAME, _width(words))
@@ -134,7 +134,7 @@ def number(value: float | None) -> str:
 
 def duration(seconds: float) -> str:
     """Return a time such as `40 s`, `2.5 min` or `3.5 h`."""
-    # Times are rounded to three digits, since repeated trainings differ by more.
+    # Times have at most three digits: the duration of a training that is repeated differs by more than the rounding.
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = seconds / 60

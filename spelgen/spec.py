@@ -1,7 +1,6 @@
-"""ModelSpec: everything that a model is made of, as frozen data with a canonical JSON form.
+"""ModelSpec: the complete specification of a model, as frozen data with a canonical JSON form.
 
 The derivation of an arm's structure produces a ModelSpec; models are assembled and modules are written from it.
-It is thus the interface between the derivation of structure and the training of models.
 """
 
 import hashlib
@@ -30,7 +29,7 @@ class Options:
 
     preset: str = "hybrid"
     design: Design | None = None
-    """Design from a YAML file; None for the design of spelgen that ``preset`` names."""
+    """Design from a YAML file; None: the design is the preset of spelgen with the name ``preset``."""
     assume: Assume = "kinematics"
     joints: tuple[str, ...] | None = None
     tip: str | None = None
@@ -85,7 +84,7 @@ class LinkSpec:
     ratio: float
     offset: float
     position: Triple
-    """Origin of the joint's frame in the parent's frame at q = 0 [m]."""
+    """Origin of the joint's frame in the parent's frame at displacement 0 [m]."""
     rotation: tuple[Triple, Triple, Triple]
     mass: float
     center_of_mass: Triple
@@ -109,7 +108,7 @@ class ServoSpec:
 
 @dataclass(frozen=True)
 class OutputSpec:
-    """A learned function f(q) = mean + scale * network(q of ``joints``); its contribution to M is f times ``basis``."""
+    """A learned function f(q) = mean + scale * network(q of ``joints``). M contains f times the matrix ``basis``."""
 
     joints: tuple[int, ...]
     basis: Entries
@@ -119,9 +118,9 @@ class OutputSpec:
 
 @dataclass(frozen=True)
 class ConstantSpec:
-    """A trained constant with the initial value ``start``; its contribution to M is the constant times ``basis``.
+    """A trained constant c with the initial value ``start``. M contains c times the matrix ``basis``.
 
-    The trained parameter is the constant divided by ``scale``.
+    The parameter that is trained is c divided by ``scale``.
     """
 
     basis: Entries
@@ -131,7 +130,7 @@ class ConstantSpec:
 
 @dataclass(frozen=True)
 class InputSpec:
-    """An entry of the input matrix G: torque of one joint divided by the input of one motor."""
+    """An entry of the input matrix G: the torque of joint ``joint`` per unit of the input of motor ``motor``."""
 
     joint: int
     motor: int
@@ -141,7 +140,10 @@ class InputSpec:
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """Specification of a model; indices are from 0. Raises ModuleError if indices and names contradict each other."""
+    """Specification of a model; indices are from 0.
+
+    Raises ModuleError if an index is out of range, a name occurs twice, or a tuple has a wrong length.
+    """
 
     robot: str
     urdf: str
@@ -158,7 +160,7 @@ class ModelSpec:
     """The joints that V depends on."""
     potential_scale: float
     margin: float
-    """Lower bound of the eigenvalues of M, relative to the nominal mean of M; M is corrected below this bound."""
+    """Lower bound of the generalised eigenvalues of M relative to its nominal mean; below it, M is corrected."""
     started_from_urdf: bool
     """Whether the initial inertial parameters are from the URDF."""
     links: tuple[LinkSpec, ...] = ()
@@ -232,7 +234,8 @@ def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
         # The result is converted back to JSON and compared, because pydantic converts values and ignores unknown keys.
         if json.loads(spec.to_json()) == {"format": version, **content}:
             return spec
-        # A difference is an error: otherwise the model would differ from the text of a file edited by hand.
+        # A difference between file and specification is an error: the model would not be the one that the file
+        # describes.
         reason = "keys or values of other types"
     except (ValidationError, ValueError, RecursionError, SettingsError) as problem:
         reason = " ".join(str(problem).split())[:200]

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from spelgen.errors import RunError
 
-# Number of times that a task is run again after its worker died.
+# Largest number of repetitions of a task whose worker died.
 RETRIES = 5
 
 Task = TypeVar("Task")

@@ -41,7 +41,7 @@ def render(template: str, **context: object) -> str:
 
 
 def read(name: str) -> str:
-    """Return the text of a file in the folder of templates, which pages contain unchanged."""
+    """Return the text of a file in the folder of templates that is no template, for example a style sheet."""
     return (_FOLDER / name).read_text(encoding="utf-8")
 
 

@@ -35,8 +35,10 @@ class InputEntry:
 class Drives(NamedTuple):
     """Matrices (n, n) of the motors of n joints.
 
-    inputs: the matrix G; the joint torques are G times the logged torques. speeds: the matrix C; the motor speeds, in
-    units of the joint velocities, are C qd. Friction and rotor inertia act at these speeds (see `motor_speeds`).
+    Attributes:
+        inputs: the matrix G; the joint torques are G times the logged torques.
+        speeds: the matrix C; the motor speeds, measured on the output side of the gears, are C qd (see `motor_speeds`).
+            Friction and rotor inertia act at the motor speeds.
     """
 
     inputs: np.ndarray
@@ -47,8 +49,9 @@ class Drives(NamedTuple):
 class Actuation:
     """The nonzero entries of the input matrix G, (n, n), and diagnostics; ``joints`` is the number n of joints.
 
-    couplings: entries (joint torque per motor torque) of coupled motors if the logs contain joint torques. G does not
-    contain these entries; they determine the motor speeds.
+    couplings: nonzero entries of the matrix of joint torques per motor torque, for motors that drive several joints, if
+    the logs contain joint torques. G is then the identity for these joints, and only the motor speeds depend on the
+    couplings.
     """
 
     joints: int
@@ -71,8 +74,8 @@ class Actuation:
     def drives(self) -> Drives:
         """Return the input matrix G and the matrix C of motor speeds per joint velocity, (n, n) each."""
         torques = self.matrix()
-        # If the logs contain joint torques, rows of G of coupled joints are rows of the identity. The motor speeds
-        # depend on the couplings, which replace these rows.
+        # With logged joint torques, G is the identity for coupled joints. To compute the motor speeds, its rows are
+        # replaced by the couplings.
         for coupling in self.couplings:
             torques[coupling.row] = 0.0
         for coupling in self.couplings:
@@ -87,12 +90,12 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
         inputs: joint torques per motor torque, (n, n).
 
     Returns:
-        C (n, n), row i for motor i. The speed of a motor is measured on the output side of its gear, at the joint that
-        gets its largest torque: C is the identity if each motor moves only its own joint. The row of a passive joint,
-        which has no motor, is the row of the identity.
+        C (n, n), row i for motor i. The speed of a motor is divided by its gear ratio to the joint on which the motor
+        has the largest torque: C is the identity if each motor moves only its own joint. For a passive joint, which has
+        no motor, the row of C is the row of the identity.
     """
-    # Motors and joints have equal power: tau_m . speed_m = tau . qd with tau = G tau_m gives speed_m = G^T qd. Each
-    # row of C = G^T is then divided by its element of largest magnitude.
+    # Motors and joints have equal power: tau_m . speed_m = tau . qd, and tau = G tau_m, so that speed_m = G^T qd. C is
+    # G^T with each row divided by its element of largest magnitude.
     largest = np.take_along_axis(inputs, np.abs(inputs).argmax(axis=0)[None], axis=0)
     passive = largest == 0
     speeds: np.ndarray = (inputs / np.where(passive, 1.0, largest)).T + np.diag(passive[0].astype(float))
@@ -105,7 +108,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
     Raises SettingsError for a coupling of a moving and a locked joint, and UrdfError if a transmission that is needed
     has unusable numbers.
     """
-    # A passive joint gets no entry: its row of G is zero.
+    # Only driven joints have entries of G: the row of a passive joint is zero.
     driven = [name for name in joints if settings.joint(name).actuated]
     remarks = tuple(_undriven(robot, settings, driven))
     couplings = tuple(_couplings(robot, settings, joints))
@@ -113,7 +116,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # Coupled joints get no gear, because their entries of G in `couplings` include the gears.
+    # The entries of coupled joints are in `couplings`, and include the gears.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)
@@ -153,7 +156,7 @@ def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEnt
 
 
 def _reduction(robot: Robot, name: str) -> float | None:
-    """Return the reduction of the simple transmission of a joint; None if it is absent or 0 in the URDF."""
+    """Return the reduction of the transmission of a joint, of type SimpleTransmission; None if it is absent or 0."""
     for transmission in robot.transmissions:
         if _SIMPLE in transmission.type and transmission.joint_names == [name]:
             collect(transmission.errors)
@@ -165,9 +168,9 @@ def _reduction(robot: Robot, name: str) -> float | None:
 
 
 def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[InputEntry]:
-    """Return the entries of coupled motors: from the settings, and for all other joints from the URDF.
+    """Return the entries of G of motors that drive several joints.
 
-    The URDF specifies couplings as differential transmissions.
+    Couplings in the settings take precedence over differential transmissions in the URDF.
     """
     entries: list[InputEntry] = []
     free = set(joints)
@@ -198,7 +201,7 @@ def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[
 
 
 def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]:
-    """Return the matrix of the torques of two joints (rows) per torque of two motors, each of which moves both joints.
+    """Return the matrix (2, 2) of joint torques (rows) per motor torque (columns) of a differential transmission.
 
     Source: ROS transmission_interface, DifferentialTransmission. A reduction that is absent or 0 is replaced by 1.
     """
@@ -210,9 +213,9 @@ def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]
 def _block(
     joints: Sequence[str], names: Sequence[str], matrix: Sequence[Sequence[float]]
 ) -> Iterator[InputEntry]:
-    """Yield the nonzero entries of the block of G in the rows and columns of the joints ``names``.
+    """Yield the nonzero entries of G for ``matrix``, the block of G in the rows and columns of the joints ``names``.
 
-    The block has the values ``matrix``. Indices of the entries are positions in ``joints``.
+    Row and column of an entry are positions in ``joints``.
     """
     for row, values in zip(names, matrix, strict=True):
         for column, value in zip(names, values, strict=True):

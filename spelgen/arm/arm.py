@@ -73,8 +73,8 @@ class Chain:
     """A serial arm with n coordinates from the root to the tip; parents precede their children in ``bodies``.
 
     ``gravity`` [m/s2] is in the frame of the root link. ``locked`` are the names of the locked joints, in the order of
-    the URDF. ``diagnostics`` are the diagnostics of the choice and lumping of joints, without the diagnostics of the
-    URDF.
+    the URDF. ``diagnostics`` are about the choice of the joints and the lumping of links; diagnostics of the URDF are
+    not included.
     """
 
     name: str
@@ -170,8 +170,8 @@ def _require_small(robot: Robot, chain: ChainChoice) -> None:
     if moving > largest:
         do = "choose fewer with --joints or --tip"
         raise ArmError(f"{moving} joints", file=robot.source, expected=f"at most {largest}", do=do)
-    # `following` is the number of mimic joints of the chain, each of which is a separate body in the derivation.
-    # `leaders` contains each joint of the chain too, as its own leader; these joints are subtracted.
+    # `following` is the number of mimic joints of the chain: each is a separate body in the derivation. The joints of
+    # the chain are subtracted, because `leaders` contains them as their own leaders.
     following = sum(x.leader.name in chain.names for x in leaders(robot).values()) - moving
     if following > most_followers:
         got = f"{following} joints that follow others by <mimic>"
@@ -208,7 +208,8 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
         if joint.moves and followed.leader.name in chain.names and followed.multiplier:
             poses.append((joint, *placement.move(joint)))
         else:
-            # Locked joints are at 0, so that a mimic joint whose leader is locked is at the offset of its <mimic>.
+            # A locked joint is locked at 0. A mimic joint whose leader is locked is locked at the offset of its
+            # <mimic>.
             locked.append(joint)
             placement.lock(joint, float(followed.offset) if joint.moves else 0.0)
     moved = []
@@ -293,17 +294,17 @@ def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]
 def _dependent_remarks(
     placement: Placement, moved: Sequence[MovingJoint], locked: Sequence[UrdfJoint]
 ) -> Iterator[Diagnostic]:
-    """Yield a warning for each locked joint whose axis is parallel to a joint of the chain with the same parent body.
+    """Yield a warning for each locked joint that may be part of a parallelogram linkage of the arm.
 
-    Such a pair of joints indicates a parallelogram linkage whose loop was opened in the URDF.
+    URDF has no closed loops: a linkage is opened. Its two joints then have the same parent body and parallel axes, and
+    one of them is not in the chain.
     """
     behind: set[str] = set()
     for joint in locked:
         if joint.moves or joint.parent in behind:
             behind.add(joint.child)
         turns = joint.type in ("revolute", "continuous") and joint.mimic is None
-        # Joints behind another locked joint, towards the tip of its branch, are not part of a parallelogram linkage of
-        # the arm.
+        # A joint that another locked joint carries is not part of a parallelogram linkage of the arm.
         if joint.parent in behind or not turns:
             continue
         beside = _parallel_beside(placement.frames[joint.parent], moved, joint)
@@ -324,9 +325,9 @@ def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], joint: UrdfJoin
     axis = rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis)
     parallel = []
     for body in (moving.body for moving in moved):
-        # Axis of the moving joint, the z axis of its frame, as a vector in the frame of the parent body.
+        # Axis of the moving joint in the frame of the parent body: the z axis of the joint's frame.
         beside = np.array(body.rotation, dtype=float)[:, 2]
-        # [rad] Largest angle between axes that count as parallel, since URDFs have rounded axes.
+        # [rad] Axes count as parallel up to an angle of 0.01, since axes in URDFs are rounded.
         is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2
         if body.parent == frame.body >= 0 and body.joint_type != "prismatic" and is_parallel:
             parallel.append(body.name)

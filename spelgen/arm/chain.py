@@ -53,8 +53,8 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
     if not chain.joints:
         expected = "a serial chain of joints"
         raise ArmError("no joint that moves by itself", file=robot.source, expected=expected)
-    # A floating joint between the root and the arm, of a mobile base, is not an error: the arm is described relative
-    # to the base.
+    # A mobile base has a floating joint between the root and the arm. This is not an error: the arm is described
+    # relative to the base.
     below = robot.path_to(chain.joints[0].parent)
     for joint in robot.path_to(chain.joints[-1].parent):
         if joint.type in ("floating", "planar") and joint not in below:
@@ -68,7 +68,7 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
 
 
 def leaders(robot: Robot) -> dict[str, Leader]:
-    """Return the leader of each joint by the joint's name; a joint without <mimic> is its own leader.
+    """Return {name of a joint: its leader} for all joints; a joint without <mimic> is its own leader.
 
     The leader of a joint that mimics a mimic joint is the joint without <mimic> at the end of this sequence.
     """
@@ -81,8 +81,8 @@ def leaders(robot: Robot) -> dict[str, Leader]:
             followers.append((leader.name, leader.mimic))
             leader = robot.joint[leader.mimic.joint]
         follow = result.setdefault(leader.name, Leader(leader, Fraction(1), Fraction(0)))
-        # Mimic joints are processed from the leader outwards, because the multiplier and the offset of a mimic joint
-        # depend on the values of the joint that it mimics.
+        # The joint next to the leader comes first, because multiplier and offset of a mimic joint depend on the values
+        # of the joint that it mimics.
         for name, mimic in reversed(followers):
             multiplier = exact(mimic.multiplier)
             offset = multiplier * follow.offset + exact(mimic.offset)
@@ -142,9 +142,9 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
 def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain of joints from the root to a tip, without the joints of grippers.
 
-    If several chains have the largest length, the only one whose joints all have effort limits is returned; without
-    such a chain, ArmError is raised. Chains that differ only in the prismatic joints of a pair of jaws are one chain
-    without these joints.
+    If several chains are the longest, and only one of them has effort limits for all joints, this chain is returned;
+    otherwise ArmError is raised. Exception: if the chains differ only in their last joints, prismatic joints with the
+    same parent link (a pair of jaws), the chain without these joints is returned.
     """
     # The end of each branch may be the tip. The longest chain is the arm, because hands, tools and sensors are on
     # shorter branches.

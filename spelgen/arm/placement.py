@@ -131,10 +131,11 @@ def _text(values: Sequence[float] | np.ndarray) -> str:
 class Frame(NamedTuple):
     """The pose of the frame of a link at zero position.
 
-    body: index of the body of the link, -1 for the root link. composed: float64 rotation (3, 3) of the link in the
-    frame of the last body with a revolute joint on the path from the root to the link. rotation: exact rotation (3, 3)
-    of the link in the frame of its own body, which is another body if its joint is prismatic. position: exact position
-    (3,) of the link in the frame of its own body [m].
+    Attributes:
+        body: index of the body of the link, -1 for the root link.
+        rotation, position: exact rotation (3, 3) and position (3,) [m] of the link in the frame of this body.
+        composed: float64 rotation (3, 3) of the link relative to the start of the segment, which is the last body with
+            a revolute joint on the path from the root to the link.
     """
 
     body: int
@@ -153,9 +154,9 @@ class Placement:
     def __init__(self, root: str, rounding: AngleRounding) -> None:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
-        # A segment starts at the root, or at a body with a revolute joint; bodies with prismatic joints continue it.
-        # For the root and for each body, the list has the rotations of all bodies from the start of the segment to
-        # this body, relative to the start, in float64 and exact.
+        # A segment starts at the root, or at a body with a revolute joint; bodies with prismatic joints continue the
+        # segment. The list has one element for the root and each body: the rotations, relative to the start of its
+        # segment, of all bodies from the start to this body, in float64 and exact.
         self._segments: list[tuple[_Rotation, ...]] = [((np.eye(3), IDENTITY),)]
 
     def lock(self, joint: UrdfJoint, value: float) -> None:
@@ -224,25 +225,25 @@ class Placement:
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
     def _seen_from_both(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return the position (3,) [m] of a joint in the frame of the parent body, without rounding errors.
+        """Return the position (3,) [m] of a joint's frame, changed so that tiny components in this frame are exactly 0.
 
-        position: in the frame of the parent body, without components that are rounding errors. rotation: rotation
-        (3, 3) of the joint's frame. Components that are rounding errors in the joint's frame are set to 0, too: an
-        offset of (0.1, 0.1, 0) is not exactly parallel to the rational approximation of an axis at 45 degrees. The
-        result is ``position`` if components cannot be zero in both frames.
+        position: in the frame of the parent body; its tiny components are 0 already. rotation: rotation (3, 3) of the
+        joint's frame in the parent body. Example: an offset of (0.1, 0.1, 0) along an axis at 45 degrees is not exactly
+        parallel to the rational approximation of the axis. The result is ``position`` if the components cannot be zero
+        in both frames.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
-        # Exact zeros matter: with a rounding error in place of 0, a zero entry of M would become nonzero.
+        # A rounding error in place of 0 would make a zero entry of M nonzero.
         moved = self._rounding.position(rotation @ in_own_frame)
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
         """Return an exact rotation (3, 3) in the frame of a body.
 
-        composed: float64 rotation (3, 3) relative to the start of the segment of the body (see ``_segments``). Zero
-        elements matter: an axis at 45 degrees, which is not rational, may be normal to axes of several bodies. The
-        rotation is therefore approximated relative to each body of the segment; the approximation that preserves the
-        most zero elements relative to all these bodies is used.
+        composed: float64 rotation (3, 3) relative to the start of the segment of the body (see ``_segments``). A zero
+        element of a rotation between two bodies of the segment means that two axes are normal to each other, and must
+        remain zero. The rotation is therefore approximated relative to each of these bodies in turn, and the
+        approximation with the most zero elements, relative to all of them, is used.
         """
         segment = self._segments[body + 1]
         candidates: list[tuple[int, int, np.ndarray]] = []

@@ -55,7 +55,7 @@ def rounded_angle(angle: float, tolerance: float) -> float:
     """
     if tolerance == 0.0:
         return angle
-    # Divisors of pi, with the tolerance of each: the special angles in the URDFs of 189 arms are multiples of them. The
+    # {divisor: tolerance [rad]}: special angles are multiples of pi / divisor, as found in the URDFs of 189 arms. The
     # tolerance of pi/12, pi/8 and pi/5 is small, because 0.26, 0.39 and 0.63 rad also occur as exact values.
     limits = {2: tolerance, 12: 2e-5, 8: 2e-5, 5: 2e-5}
     for divisor, limit in limits.items():
@@ -99,7 +99,8 @@ def alignment(axis: np.ndarray) -> np.ndarray:
     cross = np.cross(closest, axis)
     skew = np.cross(np.eye(3), cross)
     smallest = np.eye(3) + skew + skew @ skew / (1.0 + float(closest @ axis))
-    # The columns of a signed permutation that maps +z to the closest coordinate axis, with its sign.
+    # `columns` are the columns of a signed permutation matrix that maps +z to the coordinate axis, + or -, that is
+    # closest to `axis`.
     first, second = np.eye(3)[(index + 1) % 3], np.eye(3)[(index + 2) % 3]
     columns = [first, second, closest] if sign > 0 else [second, first, closest]
     if sign < 0 and index == 2:
@@ -114,8 +115,7 @@ def exact_rotation(rotation: np.ndarray, error: float = TUNING.rotation_error) -
 
     Elements differ by less than ``error``. The components of the quaternion, divided by the largest one, are replaced
     by close fractions: the rotation matrix of any rational quaternion is rational (Euler-Rodrigues). If a zero element
-    becomes nonzero in this way, another approximation is used, which preserves one zero: the product of a rotation
-    about a coordinate axis, a signed permutation, and a rotation about a coordinate axis.
+    of ``rotation`` becomes nonzero in this way, `_rotation_with_zero` is used, which preserves the first zero element.
     """
     ratios = _quaternion_ratios(rotation)
     candidate = IDENTITY
@@ -175,9 +175,10 @@ def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     cosine, sine: cosine and sine of the angle in float64, both multiplied by the same positive factor, which need not
     be 1. error: largest error of an element.
     """
-    # The angle is the sum of exact quarter turns and a remainder, which is approximated. Approximations of 45 and 135
-    # degrees then differ by exactly a right angle. The remainder is between -0.7 and 0.87 rad: with the limits +-45
-    # degrees, rounding errors of the common angles +-45 degrees would change the number of quarter turns.
+    # The angle is split into exact quarter turns and a remainder: only the remainder is approximated, so that the
+    # approximations of 45 and 135 degrees differ by exactly a right angle. The remainder is between -0.7 and 0.87 rad,
+    # not between -45 and 45 degrees: rounding errors of +-45 degrees, which are common angles, would change the number
+    # of quarter turns.
     eighth = 0.7  # [rad] somewhat less than pi/4
     quarter, angle = divmod(atan2(sine, cosine) + eighth, pi / 2)
     tangent = tan((angle - eighth) / 2)
@@ -185,8 +186,8 @@ def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     if abs(tangent) >= TUNING.zero_noise:
         for bound in TUNING.denominators:
             t = Fraction(tangent).limit_denominator(bound)
-            # t = tan(angle / 2) may have a quarter of the error: the error of the angle is up to twice the error of t,
-            # and `_rotation_with_zero` multiplies two such rotations.
+            # The error of t = tan(angle / 2) must be below error / 4: the error of the angle is up to twice the error
+            # of t, and `_rotation_with_zero` multiplies two such rotations.
             if abs(float(t) - tangent) < error / 4:
                 break
     norm = 1 + t * t

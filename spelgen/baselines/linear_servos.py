@@ -1,4 +1,4 @@
-"""Predictors of arms under position servos: the delayed command, and a linear second-order servo at each joint."""
+"""Predictors of the motion of an arm under position servos: the delayed command, and linear second-order servos."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,13 +11,16 @@ from spelgen.logs.trajectory import LogRows, delayed_commands
 
 @dataclass(frozen=True)
 class DelayedCommand:
-    """Predictor whose position at time t is the command at t - delay; ``delay`` in [s]."""
+    """Predictor of joint positions: the position at time t is the command at time t - delay. delay: [s]."""
 
     delay: float
     about = "the commands themselves, after the delay by which they are nearest to the positions of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the delayed commands at the end of the K sample intervals of each part of a log, (K, n) [rad, m]."""
+        """Return the delayed commands as predicted positions, (K, n) [rad, m] per segment of K sample intervals.
+
+        parts, q, qd: see `CommandFollower.positions`.
+        """
         return [delayed_commands(log, rows, self.delay, 1)[:, 0] for log, rows in parts]
 
 
@@ -25,8 +28,12 @@ class DelayedCommand:
 class LinearServos:
     """Independent servos of the joints: qdd = w^2 (u(t - delay) + offset - q) - 2 damping w qd.
 
-    frequency: natural frequency w [rad/s]. damping: damping ratio [1]. delay: delay of the command [s]. offset: offset
-    of the position [rad, m]. All four have one value per joint. late: delay [s] of `DelayedCommand`, for all joints.
+    Attributes:
+        frequency: Natural frequency w of each joint, (n,) [rad/s].
+        damping: Damping ratio of each joint, (n,) [1].
+        delay: Delay of the command of each joint, (n,) [s].
+        offset: Offset of the position of each joint, (n,) [rad, m].
+        late: Delay of the other baseline, `DelayedCommand`, which is the same for all joints [s].
     """
 
     frequency: Sequence[float]
@@ -37,10 +44,13 @@ class LinearServos:
     about = "a linear second-order servo at each joint, fitted to windows of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return second-order responses to the commands at the end of the K sample intervals of each part, (K, n)."""
+        """Return the predicted positions, (K, n) [rad, m] per segment of K sample intervals.
+
+        parts, q, qd: see `CommandFollower.positions`.
+        """
         frequency, damping, result = np.array(self.frequency), np.array(self.damping), []
         for start, speed, (log, rows) in zip(q, qd, parts, strict=True):
-            # The mean interval is used for all steps, so that the exact response is computed only once.
+            # All sample intervals are replaced by their mean, so that one transition matrix serves for all intervals.
             dt = float(np.diff(log.t[rows]).mean())
             columns = [delayed_commands(log, rows, late, 1)[:, 0, k] for k, late in enumerate(self.delay)]
             u = np.stack(columns, axis=-1) + self.offset
@@ -51,7 +61,7 @@ class LinearServos:
 def linear_response(
     q: np.ndarray, qd: np.ndarray, u: np.ndarray, dt: float, frequency: np.ndarray, damping: np.ndarray
 ) -> np.ndarray:
-    """Return the positions of second-order servos, exact for commands that are constant in each interval.
+    """Return the positions of second-order servos, the exact solution for commands that are constant in each interval.
 
     Args:
         q: (..., n) initial positions [rad, m].
@@ -64,7 +74,7 @@ def linear_response(
     Returns:
         (..., K, n) positions at the end of each interval [rad, m].
     """
-    system = np.zeros((len(frequency), 3, 3))  # state: position, velocity, command
+    system = np.zeros((len(frequency), 3, 3))  # The state has three entries: position, velocity, command.
     system[:, 0, 1] = 1.0
     system[:, 1, 0], system[:, 1, 2] = -(frequency**2), frequency**2
     system[:, 1, 1] = -2 * damping * frequency

@@ -14,7 +14,7 @@ from spelgen.logs.trajectory import LogRows
 from spelgen.logs.windows import Windows, thinned
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
-GAMMA = 1 - 0.5**0.5  # parameter of the Rosenbrock method that makes it L-stable
+GAMMA = 1 - 0.5**0.5  # The Rosenbrock method is L-stable with this parameter.
 
 
 State = tuple[Tensor, Tensor, Tensor]
@@ -43,7 +43,7 @@ def roll_out_stiff(
     positions = torch.full_like(windows.q[:, 1:], torch.nan)
     velocities = positions.clone()
     for k in range(windows.dt.shape[1]):
-        step = windows.dt[:, k].unsqueeze(-1) / substeps  # (W, 1)
+        step = windows.dt[:, k].unsqueeze(-1) / substeps  # (W, 1) [s]
         for _ in range(substeps):
             q, qd, z = advance((q, qd, z), windows.tau[:, k], step)
         inside = ((qd.abs() <= TUNING.bounds * largest) & q.isfinite()).all(dim=-1, keepdim=True)
@@ -58,10 +58,10 @@ def roll_out_stiff(
 def _stepper(
     dynamics: object, width: Tensor, disturbance: Tensor
 ) -> Callable[[State, Tensor, Tensor], State]:
-    """Return the function that computes one integrator step of M qdd = force from a state, under torques tau.
+    """Return a function that computes one integrator step of M qdd = force from (state, torque, step length).
 
-    width: (n,) finite-difference steps of velocity [rad/s, m/s]. disturbance: (W, n) a force [Nm, N] if the state of
-    the dynamics contains momenta, else an acceleration [rad/s^2, m/s^2].
+    width: finite-difference steps of velocity for the Jacobian of friction, (n,) [rad/s, m/s]. disturbance: (W, n), a
+    force [Nm, N] if the state of the dynamics contains momenta, else an acceleration [rad/s^2, m/s^2].
     """
     pose_at = equations_of(dynamics)
     is_force = isinstance(dynamics, PortHamiltonian)
@@ -80,14 +80,14 @@ def _stepper(
         pose = pose_at(q)
         damping, stiffness = _friction_slopes(dynamics, pose, qd, z, width)
         h = GAMMA * step
-        # The position is eliminated from the equations of both stages. The remaining matrix, M + h D + h^2 K (n, n), is
-        # factorised once.
+        # Both stages solve equations with the matrix 1 - h A. After elimination of the position, the matrix is
+        # M + h D + h^2 K (n, n), which is factorised once for both stages.
         factors, pivots, _ = torch.linalg.lu_factor_ex(
             pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
         )
 
         def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force), with h = GAMMA * step."""
+            """Return the solution (v, a), (W, n) each, of (1 - h A) (v, a) = (velocity, M^-1 force)."""
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
@@ -115,13 +115,15 @@ def _friction_slopes(
 
     Both are diagonals, (W, n): friction depends on the motion of its own joint only.
     """
-    # Central differences, because dry friction changes steeply at standstill.
+    # Central differences are used, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
-    # Negative damping (friction that decreases with velocity) is omitted from D, and so integrated explicitly.
+    # Negative damping (friction that decreases with velocity) is omitted from D, so that the matrix M + h D + h^2 K
+    # remains positive definite. The method then treats this part of friction explicitly.
     damping = slope.clamp(min=0)
     if not z.shape[-1]:
         return damping, torch.zeros_like(damping)
-    # The finite-difference step has the direction of motion, in which bristles deflect.
+    # The finite-difference step of position has the sign of the velocity, because the stiffness of a bristle differs
+    # between further deflection and reversal.
     displacement = TUNING.displacement_step * torch.where(qd < 0, -1.0, 1.0).to(qd)
     bent = pose.friction(qd, memory_after(dynamics, z, displacement))
     return damping, ((bent - pose.friction(qd, z)) / displacement).clamp(min=0)
@@ -135,15 +137,14 @@ class PredictorTuning:
     most_substeps: int = 16
     # [s] Shortest integrator step: only diverging dynamics would need shorter steps.
     shortest_step: float = 1e-3
-    # [1] Allowed change of a prediction if the number of steps is doubled, divided by the error of the dynamics. With
-    # this value reported figures change by a thousandth.
+    # [1] A number of steps is accepted if twice as many steps change the predicted velocities by less than this
+    # fraction of their RMS error. With this value reported errors change by a thousandth.
     tolerance: float = 5e-2
-    # [1] The allowed change is `tolerance` times the relative error of the prediction (RMS error / RMS motion), or
-    # times this value if the error is smaller.
+    # [1] Lower bound of the RMS error that is multiplied by `tolerance`, divided by the RMS change of velocity.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16
-    # [1] A predicted velocity above this multiple of the largest measured velocity counts as diverged.
+    # [1] A prediction has diverged if a velocity exceeds this multiple of the largest measured velocity.
     bounds: float = 100.0
     # [1] Finite-difference step of friction with respect to velocity, as a fraction of a joint's largest velocity.
     velocity_step: float = 1e-5
@@ -174,12 +175,16 @@ class Solver:
 
 
 def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
-    """Return the solver with the fewest steps per sample interval for which doubling the steps changes little."""
+    """Return the solver with the fewest steps per sample interval that is accurate enough.
+
+    A number of steps is accurate enough if twice as many steps change the predictions of the `probe` windows by less
+    than `TUNING.tolerance` times the error of the predictions.
+    """
     windows = thinned(probe, TUNING.probed_windows)
     motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
     solver = Solver(dynamics, 1)
     coarse = solver(windows)[1]
-    # The step length has a lower bound: diverging dynamics cannot be predicted with shorter steps either.
+    # The step length has a lower bound, because no step length is accurate enough for dynamics that diverge.
     max_substeps = min(TUNING.most_substeps, windows.dt.mean().item() / TUNING.shortest_step)
     while 2 * solver.substeps <= max_substeps:
         finer = replace(solver, substeps=2 * solver.substeps)
@@ -194,10 +199,10 @@ def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
 
 @dataclass(frozen=True)
 class Predictor:
-    """Predictor of motion: for windows of K samples, q and qd (W, K-1, n) from the first sample and the torques.
+    """Predictor of the motion in windows, from their first samples and their torques.
 
-    solver: a `Solver` if the prediction integrates dynamics, else any function of the windows. dynamics: the integrated
-    dynamics, or None.
+    solver: function that returns q and qd of W windows at all samples except the first, (W, K-1, n) each; a `Solver` if
+    the prediction integrates dynamics. dynamics: the integrated dynamics, or None.
     """
 
     name: str
@@ -211,19 +216,19 @@ def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor
 
 
 class CommandFollower(Protocol):
-    """Predictor of positions under position commands. about: name of the predictor and method of its fit."""
+    """Predictor of positions under position commands. about: text for users about the predictor and its fit."""
 
     @property
     def about(self) -> str: ...
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the positions at the end of each sample interval.
+        """Return the predicted positions of each segment at the end of each sample interval.
 
         Args:
-            parts: rows of logs, each with K sample intervals.
+            parts: segments of logs; K is the number of sample intervals of a segment.
             q: (parts, n) initial positions [rad, m].
             qd: (parts, n) initial velocities [rad/s, m/s].
 
         Returns:
-            Positions (K, n) [rad, m] of each part.
+            One array of positions per segment, (K, n) [rad, m].
         """

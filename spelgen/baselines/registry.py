@@ -40,10 +40,13 @@ LinearServoRecord = Mapping[str, Any]
 class EvaluatedArm:
     """The information about an arm under torques that baselines may use.
 
-    joints: names of the joints in the order of q. urdf: path of the URDF, None if unknown. fitted: baselines fitted to
-    the training logs. fitted_arm: arm for which these baselines were fitted; None without fitted baselines. probe:
-    windows from which the number of integrator steps is chosen. notes: list to which a baseline appends diagnostics,
-    for example the reason of its absence.
+    Attributes:
+        joints: Names of the joints in the order of q.
+        urdf: Path of the URDF; None if unknown.
+        fitted: Content of least_squares.json: baselines that were fitted to the training logs.
+        fitted_arm: Arm of the fitted baselines; None if there are none.
+        probe: Windows from which the number of integrator steps is chosen.
+        notes: List to which a baseline appends diagnostics, for example the reason why it is absent.
     """
 
     joints: Sequence[str]
@@ -68,27 +71,28 @@ def constant_velocity(arm: EvaluatedArm) -> list[Predictor]:
 
 def hold_velocity(windows: Windows) -> States:
     """Return q [rad, m] and qd [rad/s, m/s], (W, K-1, n), at samples 1..K-1, for constant velocity from sample 0."""
-    elapsed = windows.dt.cumsum(dim=1).unsqueeze(-1)  # (W, K-1, 1)
+    elapsed = windows.dt.cumsum(dim=1).unsqueeze(-1)  # (W, K-1, 1) [s]
     qd = windows.qd[:, :1]
     return windows.q[:, :1] + qd * elapsed, qd.expand(-1, elapsed.shape[1], -1)
 
 
 def urdf_values(arm: EvaluatedArm) -> list[Predictor]:
-    """Return the baselines with the URDF's inertial parameters: rigid bodies, and rigid bodies with drives.
+    """Return one or two baselines with the inertial parameters of the URDF.
 
-    The second baseline is omitted if the settings of the URDF specify neither rotors nor friction. If Pinocchio is
-    absent or cannot read the URDF, the list is empty and a note is added to ``arm.notes``.
+    The first baseline has only rigid bodies. The second baseline also has rotors and friction; it is omitted if the
+    settings of the URDF specify neither of them. If Pinocchio is absent or cannot read the URDF, the list is empty and
+    a note is added to ``arm.notes``.
     """
     if arm.urdf is None:
         arm.notes.append(_missing("robot.urdf", "no arm is known"))
         return []
     try:
-        # Imported here, because Pinocchio is an optional dependency.
+        # Pinocchio is an optional dependency, so the import is in this function.
         from spelgen.dynamics.pinocchio_dynamics import drives_known, urdf_dynamics
 
         plain = urdf_dynamics(arm.urdf, arm.joints)
         predictors = [of_dynamics(URDF, plain, arm.probe)]
-        # Without drives in the URDF both predictors would be equal.
+        # Without rotors and friction the second baseline would be equal to the first one.
         if drives_known(arm.urdf, arm.joints):
             driven = urdf_dynamics(arm.urdf, arm.joints, drives=True)
             predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, arm.probe))
@@ -107,11 +111,14 @@ FRICTION = {
     LEAST_SQUARES: ("parameters", FrictionModel()),
     LEAST_SQUARES_WITH_MEMORY: ("parameters_with_memory", FrictionModel(memory=True)),
 }
-"""Name of a predictor -> key of its parameters in least_squares.json, and its friction model."""
+"""{name of a predictor: (key of its parameters in least_squares.json, its friction model)}."""
 
 
 def least_squares(arm: EvaluatedArm) -> list[Predictor]:
-    """Return rigid bodies, armature and friction from `fit_baselines`, a predictor for each friction model."""
+    """Return one predictor per friction model, with the parameters that `fit_baselines` has identified.
+
+    The list is empty if these parameters are unknown.
+    """
     if arm.fitted_arm is None or "parameters" not in arm.fitted:
         return []
     drives = arm.fitted_arm.actuation.drives()
@@ -136,22 +143,23 @@ def torque_predictors(arm: EvaluatedArm) -> list[Predictor]:
 
 
 def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> FittedBaselines:
-    """Return the baselines fitted to the training and validation logs, and the coverage of these logs.
+    """Return the content of least_squares.json: the coverage of the logs, and identified parameters.
 
-    The result has a least-squares identification and its parameters (K,) per friction model, except for logs without
-    accelerations. preprocessing: preprocessing of the fit, in which all default values are resolved.
+    Parameters are identified by linear least squares, (K,) for each friction model. They are absent if the logs have no
+    torques or no accelerations. preprocessing: preprocessing of the fit, in which all default values are resolved.
     """
-    # The assessment compares the range of motion in test logs with the coverage of the training logs.
+    # The coverage is stored for the assessment, which compares the range of motion in test logs with it.
     fitted: FittedBaselines = {"coverage": coverage(logs)}
     methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
     try:
         require_torques(logs)
         identified = identify_by(arm, logs, methods, preprocessing)
-    # An error in a baseline is ignored, so that it does not stop the fit of the model.
+    # An error of the identification is ignored, because the model can be fitted without this baseline.
     except (LogError, np.linalg.LinAlgError):
         return fitted
     fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
-    # Of the friction model with bristles only the parameters are recorded, of the other one the whole identification.
+    # The whole identification is recorded for the friction model without bristles. For the friction model with
+    # bristles, only the parameters are recorded.
     parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
     return {**fitted, **fits["parameters"].to_dict(), **parameters}
 
@@ -159,7 +167,7 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
 def command_followers(
     linear_servos: LinearServoRecord | None, notes: list[Diagnostic]
 ) -> dict[str, CommandFollower]:
-    """Return all baselines for an arm under position commands, by name.
+    """Return {name: baseline} for an arm under position commands.
 
     linear_servos: parameters of linear servos in the record of the fit. For a model without a record it is None; the
     result is then empty, and a note is added.

@@ -1,4 +1,4 @@
-"""Relations between the axes of joints that hold at every configuration, and balance of the last body.
+"""Tests of relations between joint axes that hold at every configuration, and of the balance of the last body.
 
 A relation is tested in exact arithmetic at two random rational configurations. A relation that does not hold at every
 configuration fails this test with a probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
@@ -36,8 +36,9 @@ class Axes:
         self.assume = assume
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
         generator = random.Random(0)  # The seed is fixed, so that reports are reproducible.
-        # For each configuration, the directions (n, 3) and the twists (n, 6) of the axes. Two configurations suffice:
-        # at one, a false relation holds by chance with a probability of about its polynomial degree divided by 1e6.
+        # Each configuration has the directions (n, 3) and the twists (n, 6) of the axes. Two configurations suffice:
+        # the probability that a false relation holds by chance at one of them is about (degree of its polynomial) /
+        # 1e6.
         self._configurations = [_configuration(arm, generator) for _ in range(2)]
 
     def parallel(self, a: int, b: int) -> bool:
@@ -53,19 +54,19 @@ class Axes:
         return {axes[a] @ axes[b] for axes, _ in self._configurations}
 
     def opposed(self, a: int, b: int) -> bool:
-        """Whether the axes of two joints have opposite directions; they must be parallel at every configuration."""
+        """Whether the axes of two joints have opposite directions; only for axes that are always parallel."""
         # The cosine of the angle between parallel unit vectors is 1 or -1, equal at all configurations.
         return max(self._cosines(a, b)) < 0
 
     def same_twist(self, a: int, b: int) -> bool:
-        """Whether two joints have equal or opposite twists.
+        """Whether two joints have equal or opposite twists: they are coaxial or, if prismatic, parallel.
 
-        Unit velocities of the two joints then give the bodies that both joints carry equal or opposite velocities.
+        A body that both joints carry then has equal or opposite velocities for unit velocities of the two joints.
         """
         return all(_are_parallel(twists[a], twists[b]) for _, twists in self._configurations)
 
     def commute(self, a: int, b: int) -> bool:
-        """Whether motion of one joint does not move the axis of the other: the Lie bracket of both twists is zero."""
+        """Whether the motions of two joints commute: the Lie bracket of their twists is zero."""
         for _, twists in self._configurations:
             (v, w), (v_b, w_b) = np.split(twists[a], 2), np.split(twists[b], 2)
             if np.cross(w, w_b).any() or (np.cross(w, v_b) - np.cross(w_b, v)).any():
@@ -73,13 +74,14 @@ class Axes:
         return True
 
     def keep_offset(self, slider: int, hinge: int) -> bool:
-        """Whether all bodies that the prismatic joint ``slider`` moves keep their distance from a plane.
+        """Whether all bodies that the prismatic joint ``slider`` carries keep their distance from a plane.
 
-        The plane contains the axis of the revolute joint ``hinge``, which is nearer the root, and is parallel to the
-        axis of ``slider``. All joints between ``hinge`` and the tip may move.
+        The plane contains the axis of the revolute joint ``hinge`` and is parallel to the axis of ``slider``. The
+        distance must be constant for any motion of the joints from ``hinge`` to the tip; ``hinge`` is nearer the root
+        than ``slider``.
         """
         if not all(self.prismatic[hinge + 1 : slider]):
-            return False  # A revolute joint between the two joints may rotate the plane.
+            return False  # A revolute joint between both joints could change the direction of ``slider``.
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]
         for axes, twists in self._configurations:
             normal = np.cross(axes[slider], axes[hinge])
@@ -94,13 +96,16 @@ class Axes:
 
     @cached_property
     def balanced(self) -> bool:
-        """Whether the axis of the last joint is a principal axis through the centre of mass (dynamic balance)."""
+        """Whether the last body is dynamically balanced.
+
+        The axis of the last joint is then a principal axis of inertia through the centre of mass of the body.
+        """
         xz, yz = self._last_inertia[6], self._last_inertia[8]
         return self.centred and not xz and not yz
 
     @cached_property
     def symmetric(self) -> bool:
-        """Whether the inertia of the last body, seen from the body before, does not depend on the last joint."""
+        """Whether the inertia of the last body, in the frame of its parent, does not depend on the last joint."""
         xx, xy, yy = self._last_inertia[4], self._last_inertia[5], self._last_inertia[7]
         return self.balanced and xx == yy and not xy
 
@@ -114,8 +119,8 @@ class Axes:
         body = self.arm.bodies[-1]
         if self.assume == "inertials" and body.inertia is not None and body.joint_type == "revolute":
             return body.inertia
-        # Only a revolute joint with known inertials can be balanced. In all other cases all parameters are set to 1,
-        # for which every test of balance is False.
+        # The tests of balance are for a revolute joint with known inertials. In all other cases the inertial parameters
+        # are set to 1, for which all these tests are False.
         return (Fraction(1),) * 10
 
     def is_weightless(self, joint: int) -> bool:
@@ -125,13 +130,14 @@ class Axes:
 
 
 def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the axes and twists of the n joints in the root frame, at a random configuration, as fractions.
+    """Return (axes, twists) of the n joints in the root frame at a random configuration, as exact fractions.
 
-    axes: n unit vectors (3,). twists: n vectors (6,), the velocity of a body for a unit velocity of the joint: linear
-    velocity (3,) at the origin of the root frame, then angular velocity (3,).
+    axes: n unit vectors (3,). twists: n vectors (6,), for a unit velocity of the joint: linear velocity (3,) of the
+    body's point at the origin of the root frame, then angular velocity (3,).
     """
     axes, twists = [], []
-    # Range of random numerators and denominators: the larger the range, the fewer relations hold by chance.
+    # Random numerators and denominators are from this range: the larger it is, the fewer false relations hold by
+    # chance.
     numbers = range(1, 10**6)
     rotation, origin = IDENTITY, ZERO
     for body in arm.bodies:
@@ -145,7 +151,7 @@ def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarra
             origin = origin + t * axis
         else:
             twists.append(np.concatenate([np.cross(origin, axis), axis]))
-            # t is the tangent of half the angle: cosine and sine are rational.
+            # t is the tangent of half the angle, so that cosine and sine are rational.
             norm = 1 + t * t
             rotation = rotation @ turn_about(2, (1 - t * t) / norm, 2 * t / norm)
     return axes, twists
@@ -158,6 +164,6 @@ def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _is_orthogonal(twist: np.ndarray, direction: np.ndarray) -> bool:
-    """Whether a joint with this twist (6,) gives no point of its body a velocity along the direction (3,)."""
+    """Whether no point of a body with this twist (6,) has a velocity component along the direction (3,)."""
     v, w = np.split(twist, 2)
     return not v @ direction and not np.cross(w, direction).any()

@@ -1,10 +1,9 @@
 """SymPy expressions from the polynomials of an arm, and their output as text, LaTeX and Python.
 
-Products of cosines and sines of the angles of consecutive joints with parallel axes become cosines and sines of sums of
-these angles. Other forms (powers of single angles, common factors of several terms) are not used: they shorten long
-formulas by 20 %, but not the formulas that are short enough to be read. Printed decimals have at most twelve digits;
-Python for SymPy has exact fractions. Before lines are wrapped, blanks at which a line must not be broken are replaced
-by no-break spaces.
+For consecutive joints with parallel axes, products of cosines and sines are expressed as cosines and sines of sums of
+angles. Other simplifications (powers of single angles, common factors of several terms) are not used: they shorten long
+formulas by 20 %, but not the formulas that are short enough to be read. Decimals in text and LaTeX have at most twelve
+digits; Python for SymPy has exact fractions.
 """
 
 import re
@@ -22,8 +21,8 @@ from spelgen.arm.arm import Chain
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.structure.recursion import base_denominators
 
-FLOAT_DIGITS = 17  # significant decimal digits that determine a double
-_FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at this character.
+FLOAT_DIGITS = 17  # number of significant decimal digits that suffice for any double
+_FIXED = "\N{NO-BREAK SPACE}"  # replaces blanks at which textwrap must not break a line
 Terms = dict[Expr, fmpq]
 """A linear combination {product of distances, cosines and sines: coefficient}, with nonzero coefficients."""
 
@@ -40,7 +39,7 @@ def parameter(name: str) -> Symbol:
 
 
 def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
-    """Return the sum of expressions multiplied by coefficients; terms: expression -> coefficient."""
+    """Return the sum of coefficient * expression for terms {expression: coefficient}."""
     products = []
     # Without this setting SymPy expands 2*(a + b) to 2*a + 2*b.
     with distribute(False):
@@ -52,28 +51,29 @@ def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
 class PolynomialWriter:
     """Conversion of polynomials of an arm to SymPy terms.
 
-    The variables of the polynomials are s1, c1, q1, s2, ...: sine, cosine and position per coordinate (`Expansion`).
+    The variables of the polynomials are s1, c1, q1, s2, ...: sine, cosine and position of each coordinate (see
+    `Expansion`).
     """
 
     def __init__(self, arm: Chain, context: fmpq_mpoly_ctx):
         generators = context.gens()
         waves = zip(generators[::3], generators[1::3], strict=True)
         self._circles = [sine**2 + cosine**2 - 1 for sine, cosine in waves]
-        # s and c are sine and cosine of q / d with the coordinate q and an integer d, because the angles of mimic
-        # joints are integer multiples of q / d.
+        # s and c are the sine and cosine of q / d, with the coordinate q and an integer d: the angles of mimic joints
+        # are integer multiples of q / d.
         fractions = enumerate(base_denominators(arm))
         self._angles = [coordinate(joint) / denominator for joint, denominator in fractions]
         self._runs = parallel_runs(arm)
 
     def reduced(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
-        """Return the polynomial of the same function in which the power of every sine is at most 1."""
+        """Return a polynomial with the same values, in which the power of every sine is at most 1."""
         for circle in self._circles:
             # The remainder modulo s^2 + c^2 - 1, with s as the leading variable, has no s^2.
             polynomial %= circle
         return polynomial
 
     def terms(self, polynomial: fmpq_mpoly) -> Terms:
-        """Return a polynomial as terms, with cosines and sines of sums of angles in place of their products."""
+        """Return a polynomial as {term: coefficient}, with cosines and sines of sums of angles in place of products."""
         result: Terms = {}
         for exponents, coefficient in polynomial.terms():
             distances = Integer(1)
@@ -94,7 +94,8 @@ class PolynomialWriter:
 def parallel_runs(arm: Chain) -> list[list[int]]:
     """Return groups of consecutive revolute coordinates whose axes are parallel at every configuration.
 
-    In an arm with mimic joints or branches, each coordinate is a group of its own.
+    A coordinate without a parallel neighbour is a group of one; in an arm with mimic joints or branches, all groups
+    are.
     """
     turning = sorted({body.coordinate for body in arm.bodies if body.joint_type == "revolute"})
     if not is_plain(arm):
@@ -111,12 +112,11 @@ def parallel_runs(arm: Chain) -> list[list[int]]:
 
 @lru_cache(4096)
 def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
-    """Return a product of powers of sines and cosines as a sum.
+    """Return a product of powers of sines and cosines as a sum {cosine or sine of a sum of angles: coefficient}.
 
-    powers: one tuple (angle, power of the sine, power of the cosine) per angle. Each term of the sum is a constant, or
-    a multiple of a cosine or sine of a sum of angles.
+    powers: one tuple (angle, power of its sine, power of its cosine) per angle of the product.
     """
-    # A key (angle, k) of `waves` represents cos(angle - k pi/2); sin(x) = cos(x - pi/2) has k = 1.
+    # A key (angle, k) of `waves` represents cos(angle - k pi/2), for example k = 1: cos(x - pi/2) = sin(x).
     waves: dict[tuple[Expr, int], fmpq] = {(Integer(0), 0): fmpq(1)}
     for angle, sines, cosines in powers:
         for quarter in [1] * sines + [0] * cosines:
@@ -139,21 +139,21 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
 
 
 def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
-    """Return the sum of parameters times functions.
+    """Return the sum of parameter * function over all pairs (parameter, function).
 
-    Parameters with proportional functions are combined: (a + 2 b) f in place of a f + b (2 f), with parameters a and b.
-    functions: pairs of the symbol of a parameter and its function.
+    Parameters a and b with proportional functions f and 2 f are combined: (a + 2 b) f in place of a f + b (2 f).
     """
     groups: dict[tuple[tuple[Expr, fmpq], ...], dict[Expr, fmpq]] = {}
     for symbol, terms in functions:
         leading = next(iter(terms.values()))
-        # Functions are proportional if their coefficients, divided by the coefficient of the first term, are equal.
+        # Functions are proportional if their coefficients are equal after division by the coefficient of the first
+        # term.
         unit = tuple((function, value / leading) for function, value in terms.items())
         groups.setdefault(unit, {})[symbol] = leading
     total = []
     for unit, parameters in groups.items():
-        # If only one parameter has a function, the coefficients of the function are not normalised: they are lengths
-        # of the arm, which users recognise.
+        # The coefficients of a function with a single parameter are not normalised: they are lengths of the arm, which
+        # users recognise.
         factor = abs(next(iter(parameters.values()))) if len(parameters) == 1 else fmpq(1)
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))
@@ -167,7 +167,7 @@ def text(expression: Expr) -> str:
 
 
 def latex(expression: Expr) -> str:
-    r"""Return an expression in LaTeX, with \bigl( in place of \left(, which cannot span lines."""
+    r"""Return an expression in LaTeX. Brackets are \bigl(, since \left( must be closed in the same line."""
     names = {symbol: _latex_name(symbol.name) for symbol in expression.free_symbols}
     printer = LatexPrinter({"full_prec": False, "mul_symbol": r" \, ", "symbol_names": names})
     formula: str = printer.doprint(_rounded(expression, 1, 12))
@@ -175,7 +175,7 @@ def latex(expression: Expr) -> str:
 
 
 def python(expression: Expr) -> str:
-    """Return an expression as Python code for SymPy, exact except for fractions with more digits than a float."""
+    """Return an expression as Python code for SymPy; fractions with more than 17 digits are rounded."""
     result: str = _PythonPrinter({"sympy_integers": True}).doprint(
         _rounded(expression, 10**FLOAT_DIGITS, FLOAT_DIGITS)
     )
@@ -183,12 +183,12 @@ def python(expression: Expr) -> str:
 
 
 def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
-    """Return ``start``, a formula and ``end`` as lines of at most ``width`` characters.
+    """Return start + formula + end as lines of at most ``width`` characters.
 
-    A line is longer if it has no permitted break.
+    A line without a permitted break may be longer.
     """
     indent = " " * (len(start) - len(start.lstrip()) + 4)
-    # A line must not be broken after a sign, nor within arguments of cos and sin and short brackets.
+    # Lines are not broken after a sign, within an argument of cos or sin, or within short brackets.
     formula = re.sub(r"([+-]) ", rf"\1{_FIXED}", formula)
     brackets = re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula)
     angles = re.findall(r"(?:cos|sin)\b.*?\)", formula)
@@ -203,7 +203,7 @@ def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
 
 class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
-        """Print a long sum as one call, because Python cannot nest thousands of additions."""
+        """Print a long sum as one call of ``Add``, because Python cannot parse thousands of nested additions."""
         if len(expression.args) <= 20:
             result: str = super()._print_Add(expression, order)
             return result
@@ -211,9 +211,9 @@ class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
 
 
 def _rounded(expression: Expr, largest: int, digits: int) -> Expr:
-    """Return the expression with long fractions replaced by decimals of ``digits`` digits.
+    """Return the expression with decimals of ``digits`` digits in place of some fractions.
 
-    A fraction is long if its numerator or denominator exceeds ``largest``.
+    A fraction is replaced if its numerator or denominator exceeds ``largest``.
     """
     decimals = {}
     for number in expression.atoms(Rational):
@@ -225,7 +225,7 @@ def _rounded(expression: Expr, largest: int, digits: int) -> Expr:
 
 
 def _latex_name(name: str) -> str:
-    """Return a name such as ``Izz1R`` in LaTeX: I with the index zz,1R."""
+    """Return the name of a parameter in LaTeX, for example ``I_{zz,1R}`` for ``Izz1R``."""
     letter, axes, number = re.findall(r"(.)([a-z]*)(.*)", name)[0]
     index = ",".join(filter(None, [axes, number]))
     return f"{letter}_{{{index}}}" if index else str(letter)

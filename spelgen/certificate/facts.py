@@ -1,10 +1,13 @@
-"""The structure of M and V in words: zero, constant and equal entries of M, joints without effect on M or V, reasons.
+"""The structure of M and V in words, with reasons.
 
-A reason is given only if the exact geometry of the arm proves it. The entry of M of joints a and b is the integral of
-v_a . v_b over the mass that both joints move, where v_a is the velocity field for a unit velocity of joint a; the
-reasons are properties of this integral. A function that returns a reason returns None if it finds none. One
-reason may be valid for several entries of M. Its text names the joint that these entries have in common; the
-placeholder ``{joints}`` represents the other joints of the entries, ``{axes}`` the axes of the other joints.
+The facts are about zero, constant and equal entries of M, and about joints on which M or V does not depend. A reason is
+given only if the exact geometry of the arm proves it. M[a, b] is the integral of v_a . v_b over the mass that joints a
+and b both move, where v_a is the velocity field for a unit velocity of joint a; the reasons are properties of this
+integral.
+
+Functions that return a reason return None if they find none. One reason may be valid for several entries of M. Its text
+names the joint that the entries have in common; the placeholder ``{joints}`` represents their other joints, ``{axes}``
+the axes of the other joints.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -24,8 +27,11 @@ EntryReason = Callable[[Axes, MassEntry], Reason]
 class Fact:
     """A property of M or V at all configurations.
 
-    ``statement`` is the property, ``means`` its consequence for the model. ``reason`` is None if the geometry gives no
-    simple reason, or if the arm has branches or mimic joints; the fact is then known from exact zeros and ranks only.
+    Attributes:
+        statement: sentence with the property.
+        means: sentence with its consequence for the model.
+        reason: None if the geometry gives no simple reason, or if the arm has branches or mimic joints; the property is
+            nevertheless exact.
     """
 
     statement: str
@@ -39,7 +45,8 @@ class Fact:
 
 def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
     """Return the properties of M and V at all configurations, with simple geometric reasons if there are any."""
-    # A coordinate with mimic joints moves several joints, for which reasons about pairs of axes are not valid.
+    # The reasons are about pairs of axes, so they are not valid for a coordinate that moves several joints
+    # (mimic joints).
     words = _Sentences(structure, Axes(arm, structure.assume) if is_plain(arm) else None)
     zero = ("always zero", "Nothing is learned for it", "Nothing is learned for them")
     constant = ("constant", "It needs one parameter and no network", "They need parameters and no networks")
@@ -54,7 +61,10 @@ def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
 
 @dataclass(frozen=True)
 class _Sentences:
-    """The facts of a structure. axes: None for an arm with branches or mimic joints; no reasons are then given."""
+    """The facts about a structure, as sentences.
+
+    axes: tests that prove reasons; None for an arm with branches or mimic joints, whose facts have no reasons.
+    """
 
     structure: Structure
     axes: Axes | None
@@ -65,7 +75,7 @@ class _Sentences:
     def entries(
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
     ) -> Iterator[Fact]:
-        """Yield facts about the zero or the constant entries of M, one fact for all entries with the same reason.
+        """Yield facts about the zero or the constant entries of M; entries with the same reason have one fact.
 
         Args:
             kind: "zero" or "constant".
@@ -82,8 +92,8 @@ class _Sentences:
         # Entries without a reason are listed last.
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # The placeholders get the joint of the column of each entry, which is closer to the root. If this joint
-                # is prismatic, they get the joint of the row.
+                # The placeholders are replaced by the joint of each entry's column or, if this joint is prismatic, of
+                # its row.
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
@@ -102,8 +112,8 @@ class _Sentences:
                 terms.setdefault((row, column), {})[number] = factor
         groups: dict[tuple[tuple[int, Fraction], ...], dict[tuple[int, int], bool]] = {}
         for entry, factors in sorted(terms.items()):
-            # The factors of an entry are multiplied by -1 if the first one is negative, so that opposite entries have
-            # equal factors and are in the same group.
+            # If the first factor of an entry is negative, all its factors are multiplied by -1: opposite entries are
+            # then in the same group.
             positive = next(iter(factors.values())) > 0
             if not positive:
                 factors = {number: -factor for number, factor in factors.items()}
@@ -140,7 +150,7 @@ class _Sentences:
 
 
 def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason for an entry of M that is zero."""
+    """Return the reason why an entry of M is zero at all configurations."""
     later, earlier = entry.row, entry.column
     slider = later if axes.prismatic[later] else earlier
     if axes.prismatic[later] != axes.prismatic[earlier] and axes.parallel(later, earlier):
@@ -152,7 +162,7 @@ def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason for an entry of M that is constant."""
+    """Return the reason why an entry of M is constant."""
     later, earlier = entry.row, entry.column
     if later == earlier:
         return _diagonal_reason(axes, later)
@@ -188,10 +198,10 @@ def _diagonal_reason(axes: Axes, joint: int) -> Reason:
 
 
 def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason why an entry in the last row of M is constant or zero, if the last body is balanced.
+    """Return why M[n, i] is constant or zero, if the last body is dynamically balanced; n: last joint.
 
-    The entry of the last joint and an earlier joint is then Izz of the last body times the cosine of the angle between
-    the axes of both joints. Return None if the body is not balanced or the entry is in another row.
+    M[n, i] is then Izz of the last body times the cosine of the angle between the axes of joints n and i. Return None
+    if the body is not balanced, or if the entry is in another row of M.
     """
     last, earlier = len(axes.prismatic) - 1, entry.column
     if not axes.balanced or entry.row != last:
@@ -210,14 +220,13 @@ def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
-    """Return the reason that entries of one row of M are equal or opposite.
+    """Return the reason why entries in one row of M are equal or opposite.
 
-    Unit velocities of the joints of the columns give the bodies that the joint of the row carries the same velocity
-    field; for a single balanced body, the same angular velocity suffices.
-
-    entries: (row, column) of each entry, 0-based.
+    The bodies that the joint of the row carries then have the same velocity field for unit velocities of the joints of
+    all columns. If the joint carries one balanced body, the same angular velocity suffices. entries: (row, column) of
+    each entry, counted from 0.
     """
-    # Entries of different rows are integrals over different loads, for whose equality there is no simple reason.
+    # Entries in different rows are integrals over different bodies, for whose equality there is no simple reason.
     rows, columns = map(sorted, zip(*entries, strict=True))
     if rows[0] != rows[-1]:
         return None
@@ -235,11 +244,11 @@ def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
 
 
 def idle_reason(axes: Axes, joint: int) -> Reason:
-    """Return the reason that M does not depend on the position of ``joint``."""
+    """Return the reason why M does not depend on the position of ``joint``."""
     if joint == 0:
         return "it moves the whole arm as one rigid body"
-    # M does not depend on the first joint, which moves the whole arm. A joint whose motion commutes with all joints
-    # nearer the root could be exchanged with the first joint, so that M does not depend on it either.
+    # A joint whose motion commutes with the motions of all joints nearer the root could be the first joint. M does not
+    # depend on the position of the first joint, which moves the whole arm.
     nearer = list(range(joint))
     if all(axes.commute(joint, earlier) for earlier in nearer):
         return f"its motion commutes with {joints_in_words(nearer)}, as if it were the first joint"
@@ -249,7 +258,7 @@ def idle_reason(axes: Axes, joint: int) -> Reason:
 
 
 def weightless_reason(axes: Axes, joint: int) -> Reason:
-    """Return the reason that V does not depend on the position of ``joint``."""
+    """Return the reason why V does not depend on the position of ``joint``."""
     if axes.is_weightless(joint):
         if axes.prismatic[joint]:
             return "gravity does no work in a translation orthogonal to it"
@@ -261,7 +270,7 @@ def weightless_reason(axes: Axes, joint: int) -> Reason:
 
 
 def potential_reason(axes: Axes) -> Reason:
-    """Return the reason that V is zero at all configurations."""
+    """Return the reason why V is zero at all configurations."""
     if not any(axes.arm.gravity):
         return "gravity is zero"
     if all(axes.is_weightless(joint) for joint in range(len(axes.prismatic))):

@@ -1,7 +1,7 @@
 """Closed forms as text for a terminal, a JSON object, LaTeX for documents with amsmath, and Python for SymPy.
 
-Names in formulas consist of letters and numbers of joints. In files, names from the URDF occur only in comments, as
-JSON strings, which contain neither line ends nor control characters.
+The names of symbols consist of letters and numbers of joints. Names from the URDF occur in files only in comments, as
+JSON strings without line ends and control characters.
 """
 
 import json
@@ -19,8 +19,8 @@ from spelgen.labels import printable, short_name
 _LATEX_WIDTH = 140
 _PYTHON_WIDTH = 100
 
-# The file starts with this docstring, not with the comments that contain names from the URDF, because a comment in the
-# first two lines could declare an encoding (PEP 263).
+# The file starts with this docstring. The comments with names from the URDF follow later, since a comment in the first
+# two lines could declare an encoding (PEP 263).
 _HEAD = '''"""Closed forms of a serial arm's mass matrix M(q) and potential energy V(q), by spelgen.
 
 q: the joints' positions [rad, m]. entries: {(row, column): entry of M}, counted from 1, lower triangle.
@@ -84,14 +84,14 @@ def _parameters(formulas: Formulas, width: int) -> list[str]:
     lines = ["Base parameters, and the URDF's values" if values else "Base parameters"]
     for symbol, definition in formulas.base_parameters.items():
         value = f" [{float(values[symbol]):.6g}]" if symbol in values else ""
-        # A base parameter that equals an inertial parameter needs no equation.
+        # A base parameter that equals a single inertial parameter has its name, so no equation is printed.
         name = "" if definition.is_Symbol else f"{symbol.name} = "
         lines += expressions.lines(expressions.text(definition), f"  {name}", width, value)
     return lines
 
 
 def _legend(formulas: Formulas) -> str:
-    # A body has ten inertial parameters, so that index // 10 is the index of the body.
+    # A body has ten inertial parameters, so index // 10 is the index of the body.
     bodies = {index // 10 for base in formulas.base for index, _ in base.weights}
     names = [f"{body + 1} {short_name(formulas.arm.bodies[body].name)}" for body in sorted(bodies)]
     return (
@@ -104,7 +104,7 @@ def _legend(formulas: Formulas) -> str:
 def latex(formulas: Formulas) -> str:
     """Return LaTeX: the formulas, and the definitions of the base parameters, in two ``align*`` environments."""
     rows = {Symbol(row.name): row.expression for row in formulas.written}
-    # A base parameter that equals a single inertial parameter has its name and needs no definition.
+    # A base parameter that equals a single inertial parameter has its name, so no definition is printed.
     definitions = {name: x for name, x in formulas.base_parameters.items() if not x.is_Symbol}
     result = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
     result += _comments(formulas, "%")

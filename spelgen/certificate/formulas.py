@@ -41,8 +41,11 @@ Entry = tuple[int, int] | Literal["V"]
 class Formula:
     """Closed form of an entry of the lower triangle of M, or of V.
 
-    terms: number of terms, that is, products of a base parameter and a monomial in cosines, sines and distances; None
-    if the expansion exceeds its budget. expression: SymPy expression; None if the entry is too long.
+    Attributes:
+        entry: (row, column) counted from 1, or "V".
+        terms: number of products of a base parameter and a monomial in cosines, sines and distances; None if the
+            expansion exceeds its budget.
+        expression: SymPy expression; None if the entry is too long.
     """
 
     entry: Entry
@@ -64,9 +67,12 @@ class Formula:
 
 @dataclass(frozen=True, repr=False)
 class Formulas:
-    """Closed forms of M, and of V up to a constant, of ``arm`` in the base parameters ``base``.
+    """Closed forms of M, and of V up to a constant, in the base parameters of an arm.
 
-    If ``assume`` is ``inertials``, terms that vanish for the inertials of the URDF are omitted.
+    Attributes:
+        assume: with ``inertials``, terms that are zero for the inertials of the URDF are omitted.
+        base: base parameters.
+        rows: one closed form per entry of the lower triangle of M, then V.
     """
 
     arm: Chain
@@ -81,9 +87,9 @@ class Formulas:
 
     @cached_property
     def entries(self) -> dict[tuple[int, int], Expr]:
-        """Expressions of the entries of M that are not too long, {(row, column): expression}.
+        """{(row, column): expression} of the entries in the lower triangle of M that have an expression.
 
-        The entries are in the lower triangle; rows and columns are counted from 1.
+        Rows and columns are counted from 1.
         """
         return {row.entry: row.expression for row in self.written if row.entry != "V"}
 
@@ -102,10 +108,10 @@ class Formulas:
 
     @property
     def base_parameters(self) -> dict[Symbol, Expr]:
-        """Definition of each base parameter as a sum of inertial parameters of the bodies.
+        """{base parameter: its definition, a linear combination of inertial parameters of the bodies}.
 
-        m is a mass [kg], h = m c a first moment [kg m] and I an inertia tensor [kg m2] about the origin of the joint's
-        frame, whose z axis is the axis of the joint.
+        In the names of inertial parameters, m is a mass [kg], h = m c a first moment [kg m] and I an inertia tensor
+        [kg m2] about the origin of the joint's frame, whose z axis is the axis of the joint.
         """
         definitions = {}
         for base in self.base:
@@ -120,7 +126,7 @@ class Formulas:
 
     @property
     def trusted(self) -> str:
-        """Text that states the inertial values for which the formulas are valid."""
+        """Text about the inertial parameters for which the formulas are valid: any, or with the zeros of the URDF."""
         return (
             "the URDF's inertial zeros and symmetries"
             if self.assume == "inertials"
@@ -152,7 +158,7 @@ class Formulas:
 def formulas(
     arm: Chain, structure: Structure, *, entry: Entry | None = None, longest: int | None = None
 ) -> Formulas:
-    """Return closed forms of all entries of M and of V, or of one entry.
+    """Return closed forms of all entries of M and of V, or only of one entry.
 
     Args:
         arm: The arm.
@@ -176,7 +182,7 @@ def formulas(
         # Entries of up to 40 terms, about three lines of a terminal, can be read.
         longest = 40 if entry is None else WRITABLE
     writer = _Writer(arm, structure)
-    budget = Budget(2_000_000)  # multiplications of terms, about 2 s
+    budget = Budget(2_000_000)  # number of multiplications of terms, about 2 s
     # Entries of joints close to the tip are short. They are expanded first, so that they are complete if the budget
     # does not suffice for all entries.
     rows = [writer.formula(x, longest, budget) for x in reversed(entries)]
@@ -189,7 +195,7 @@ def formulas(
 
 
 class _Writer:
-    """Computes the formulas of single entries; the recursion and the base parameters of the arm are computed once."""
+    """Computes closed forms of single entries; recursion and base parameters of the arm are computed once."""
 
     def __init__(self, arm: Chain, structure: Structure):
         self._at_urdf_values = structure.assume == "inertials"
@@ -198,7 +204,10 @@ class _Writer:
         self._writer = PolynomialWriter(arm, self._expansion.context)
 
     def formula(self, entry: Entry, longest: int, budget: Budget) -> Formula:
-        """Return the formula of an entry, without expression if it exceeds ``longest`` terms or the budget."""
+        """Return the closed form of an entry, without expression if it has more than ``longest`` terms.
+
+        An expansion that exceeds the budget has no expression either.
+        """
         try:
             polynomials = self._polynomials(entry, budget)
         except TooLarge:
@@ -214,14 +223,17 @@ class _Writer:
         return Formula(entry, terms, grouped(functions))
 
     def _polynomials(self, entry: Entry, budget: Budget) -> dict[str, fmpq_mpoly]:
-        """Return the polynomial coefficient of each base parameter, without the constant of V. Raises TooLarge."""
+        """Return {base parameter: its polynomial coefficient in an entry}, without the constant of V.
+
+        Raises TooLarge if the expansion exceeds the budget.
+        """
         energies = self._expansion.energies
         element = energies.potential if entry == "V" else energies.mass[entry[0] - 1, entry[1] - 1]
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:
-            # The coefficient of a base parameter in M or V is the coefficient of its first inertial parameter, which
-            # occurs in no other base parameter.
+            # The first inertial parameter of a base parameter occurs in no other base parameter. Its coefficient in M
+            # or V is therefore the coefficient of the base parameter.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index, budget))
             # V is determined up to a constant: constant terms are omitted.
             if entry == "V":
@@ -230,8 +242,8 @@ class _Writer:
             total += rational(base.value or Fraction(0)) * polynomial
         if not self._at_urdf_values:
             return polynomials
-        # For the inertials of the URDF, terms of different parameters with the same monomial may cancel: monomials with
-        # a total coefficient of zero are removed.
+        # For the inertials of the URDF, terms of different base parameters with the same monomial may cancel. Monomials
+        # whose total coefficient is zero are removed.
         remaining = set(total.monoms())
         for name, polynomial in polynomials.items():
             terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}

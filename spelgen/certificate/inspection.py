@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # These modules are not imported at run time, since they impo
 class Inspection:
     """The result of ``spelgen inspect`` for an arm: structure, inputs and diagnostics.
 
-    input: whether the inputs of the arm are torques, or positions of servos.
+    actuation: the input matrix G. input: "torque", or "position" for an arm with position servos.
     """
 
     arm: Chain
@@ -119,8 +119,8 @@ class Inspection:
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
         if self.input == "torque":
             return {"entries": entries}
-        # Logs of position servos determine only ratios of parameters, which are listed. Logs of torques determine all
-        # base parameters.
+        # Logs of torques determine all base parameters. Logs of position servos determine only ratios of parameters, so
+        # the undetermined parameters are listed.
         rank = servo_rank(self.arm)
         undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
         ratios = list(map(self._names, rank.groups))
@@ -128,9 +128,9 @@ class Inspection:
         return {**content, "entries": entries}
 
     def _servo_needs(self) -> str:
-        """Return a text with the parameters that logs of position servos determine."""
-        # Logs of positions do not determine the scale of torques: kp, mass and friction of a group of joints may be
-        # multiplied by a common factor. One known parameter of the group determines this factor.
+        """Return a text about the parameters that logs of position servos determine, and the ones that they do not."""
+        # Logs of positions do not determine the scale of torques: they do not change if kp, mass and friction of a
+        # group of joints are multiplied by a common factor. One known parameter of the group determines this factor.
         rank = servo_rank(self.arm)
         determined = f"those of {' or of '.join(map(joints_in_ranges, rank.groups))}"
         if len(rank.groups) == 1:
@@ -178,7 +178,7 @@ class Inspection:
         return {(entry.row, entry.column): cell_text(entry) for entry in self.structure.entries}
 
     def _matrix(self) -> str:
-        """Return the lower triangle of M as an aligned text, with the joints on which each entry depends."""
+        """Return the lower triangle of M as a table in text form; a cell has the joints on which the entry depends."""
         cells, n = self._cells(), len(self.structure.joints)
         lines = ["Mass matrix: joints each entry depends on; C constant, 0 always zero"]
         # Each column is as narrow as its widest cell, so that M of seven joints fits into 80 characters.
@@ -191,17 +191,18 @@ class Inspection:
         return "\n".join(lines)
 
     def needs(self) -> dict[str, str]:
-        """Return texts about the functions and constants that a model of M(q), V(q) and G needs.
+        """Return {"M(q)", "V(q)", "G" or "base": text about the functions and constants that a model needs}.
 
-        The keys are "M(q)", "V(q)", "G" and "base", for the number of base parameters.
+        "base" is the number of base inertial parameters.
         """
         structure = self.structure
-        # Outputs are counted per set of joints, because outputs that depend on the same joints are one network.
+        # Outputs are counted per set of joints, because one network computes all outputs that depend on the same
+        # joints.
         counts = Counter(output.joints for output in structure.outputs)
         outputs, constants = len(structure.outputs), len(structure.constants)
         mass = f"{counted(outputs, 'output')} and {counted(constants, 'constant')}"
         mass += f" make all {len(structure.entries)} entries"
-        # An arm whose M is constant needs no networks, and has no groups to list.
+        # An arm with constant M has no outputs, so there is nothing to list.
         if counts:
             groups = [f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items()]
             mass += f": {'; '.join(groups)}"
@@ -223,7 +224,7 @@ class Inspection:
 
 
 def _rows(entries: Iterable[InputEntry]) -> str:
-    """Return the joints of the rows in G of these entries as text."""
+    """Return the joints in whose rows of G these entries are, as text."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
 
 

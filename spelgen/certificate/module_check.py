@@ -14,8 +14,11 @@ from spelgen.structure.structure import derive
 class CheckResult:
     """Result of ``check``.
 
-    ``urdf`` is the path of the URDF. ``fresh`` is True if the module is up to date; otherwise ``reasons`` state the
-    differences. ``proof`` is the numerical verification of the structure.
+    Attributes:
+        urdf: path of the URDF.
+        fresh: True if the module is up to date and the verification finds no error.
+        reasons: the differences and errors, if any.
+        proof: numerical verification of the structure.
     """
 
     urdf: Path
@@ -25,7 +28,9 @@ class CheckResult:
 
 
 def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
-    """Generate a module again with the options of its build, compare the two, and verify the structure numerically.
+    """Test whether a module is up to date with its URDF.
+
+    The module is generated again with the options of its build and compared, and the structure is verified numerically.
 
     Raises ModuleError if the URDF is not found, or if the file is not a module of spelgen.
 
@@ -39,7 +44,8 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
     stated = parse_spec(text, module)
     path = Path(urdf) if urdf is not None else find_urdf(module, stated.urdf)
     arm = arm_of_spec(stated, path)
-    # The digest of the URDF is compared and not its path, because the file may have been moved since the build.
+    # The URDF is compared by its digest. Its path is taken from the module, since the file may have been moved since
+    # the build.
     spec = replace(derive_spec(arm, stated.options), urdf=stated.urdf)
     reasons = []
     if spec.urdf_sha256 != stated.urdf_sha256:
@@ -49,7 +55,7 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
     # The text is compared with both forms of the module, standalone or not, because it does not state its form.
     if text not in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         reasons.append("the text of the module differs from that of `spelgen build`")
-    # The comparison cannot detect an error of the derivation, which would be in both texts. The verification by
+    # The comparison cannot detect an error of the derivation, which both texts would contain. The verification by
     # Pinocchio is independent of the derivation.
     proof = verify(arm.robot, arm.chain, derive(arm.chain, stated.options.assume))
     reasons += [str(difference) for difference in proof.differences]

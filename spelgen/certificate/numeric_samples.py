@@ -1,12 +1,12 @@
-"""Computations by Pinocchio for the verification of a structure: random samples, and a second reading of the URDF.
+"""Computations by Pinocchio for the verification of a structure: random samples and a reading of the URDF.
 
-The samples are mass matrices, gravity torques and torque regressors of a chain at random configurations. Random
-inertial parameters are physically consistent: their pseudo-inertia is positive definite (Wensing, Kim and Slotine, RA-L
-3(1), 2018).
+The samples are mass matrices, gravity torques and torque regressors at random configurations, computed from the chain
+that was read from the URDF. Random inertial parameters are physically consistent: their pseudo-inertia is positive
+definite (Wensing, Kim and Slotine, RA-L 3(1), 2018).
 
-The URDF is also read by Pinocchio, and axes of joints, masses and inertias are compared with the chain. This detects
-errors in the reading of the file, which the samples cannot detect, because they start from the chain. Pinocchio does
-not round angles: it is compared with a chain without rounding, and the effect of rounding is computed separately.
+Errors in the reading of the URDF would not be detected by these samples. Therefore Pinocchio reads the URDF, too, and
+axes of joints, masses and inertias are compared with the chain. Pinocchio does not round angles: its values are
+compared with a chain without rounding, and the effect of rounding is computed separately.
 """
 
 import hashlib
@@ -32,11 +32,13 @@ TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 @dataclass(frozen=True)
 class NumericSamples:
-    """Samples of M and of the gravity torque.
+    """Samples of M and of the gravity torque at S random configurations.
 
-    mass: lower triangles of M divided by ``scale``, (1 + n, S, n(n+1)/2); block 1 + k has the positions of block 0,
-    except for coordinate k (k from 0). scale: sqrt(mean M_ii * mean M_jj) for the entry (i, j), (n(n+1)/2,), with means
-    over the samples. gravity: gravity torque dV/dq divided by its largest magnitude, (S, n).
+    Attributes:
+        mass: (1 + n, S, n(n+1)/2), entries of the lower triangle of M, divided by ``scale``. mass[0] is M at the S
+            configurations; for mass[1 + k], coordinate k has another random position.
+        scale: (n(n+1)/2,), sqrt(mean M_ii * mean M_jj) for the entry (i, j), with means over the samples.
+        gravity: (S, n), gravity torque dV/dq divided by its largest magnitude.
     """
 
     mass: np.ndarray
@@ -45,7 +47,7 @@ class NumericSamples:
 
     @property
     def changes(self) -> np.ndarray:
-        """Differences of M between each further block and block 0, (n, S, n(n+1)/2)."""
+        """Changes of M / scale due to a change of one coordinate, (n, S, n(n+1)/2): mass[1:] - mass[0]."""
         result: np.ndarray = self.mass[1:] - self.mass[0]
         return result
 
@@ -53,7 +55,7 @@ class NumericSamples:
 def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:
     """Return samples at ``count`` random configurations.
 
-    random_inertials: whether each sample has other random inertial parameters; otherwise they are from the URDF.
+    random_inertials: True: each sample has its own random inertial parameters; False: all have the ones of the URDF.
     """
     n = len(arm.coordinates)
     rows, columns = np.tril_indices(n)
@@ -71,7 +73,7 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
     diagonal = np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1))
     scale = np.sqrt(np.outer(diagonal, diagonal))[rows, columns]
     scale[scale == 0] = 1.0
-    # Without gravity all torques are zero, and are not divided.
+    # Without gravity, all torques are zero and are divided by 1.
     largest = np.abs(gravity).max() or 1.0
     return NumericSamples(mass[:, :, rows, columns] / scale, scale, gravity / largest)
 
@@ -101,11 +103,11 @@ def _positions(arm: Chain, rng: np.random.Generator) -> np.ndarray:
 
 
 def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
-    """Return the arm with random inertial parameters of all bodies, which are physically consistent."""
+    """Return the arm with random, physically consistent inertial parameters of all bodies."""
     translations = np.array([body.translation for body in arm.bodies], dtype=float)
     size = float(np.linalg.norm(translations, axis=1).mean()) or 1.0
-    # A A^T is a positive definite pseudo-inertia for a random A, `factors`. Centres of mass and radii of gyration are
-    # of the magnitude of the distances between joints.
+    # For random matrices A (`factors`), A A^T are positive definite pseudo-inertias. Centres of mass and radii of
+    # gyration have the magnitude of the distances between joints.
     factors = rng.normal(size=(len(arm.bodies), 4, 4)) * np.array([[size], [size], [size], [1.0]])
     bodies = []
     for body, inertia in zip(arm.bodies, parameters_of(factors @ factors.mT).tolist(), strict=True):
@@ -115,10 +117,10 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
 
 @dataclass(frozen=True)
 class ReadingDifference:
-    """Largest differences of a quantity, relative to its magnitude.
+    """Largest differences of a quantity between readings of a URDF, divided by the quantity's magnitude [1].
 
-    difference: between the chain without rounding and the reading by Pinocchio. rounding: between the chain without
-    rounding and the chain of the arm.
+    difference: between Pinocchio and the chain without rounding. rounding: between the arm's chain and the chain
+    without rounding of angles.
     """
 
     quantity: str
@@ -127,10 +129,10 @@ class ReadingDifference:
 
 
 def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingDifference]:
-    """Read the URDF by Pinocchio, and return the differences of the chain of ``arm`` from the result.
+    """Return the differences between the chain of ``arm`` and Pinocchio's reading of the URDF.
 
-    Axes, masses and inertias are compared at random configurations. seed: seed of the configurations. Raises any
-    exception of Pinocchio, and ValueError if the file has changed.
+    Axes, masses and inertias are compared at random configurations. seed: seed of the configurations. Exceptions of
+    Pinocchio are raised, and ValueError if the file has changed.
     """
     dynamics = _pinocchio_dynamics(robot, arm)
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, len(arm.coordinates)))
@@ -142,9 +144,9 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
         del written["masses and inertias"]
     differences = []
     for quantity, values in written.items():
-        # Differences are relative to the magnitude of each number, so that errors of light bodies are detected. A
-        # thousandth of the largest magnitude is added, so that rounding errors of numbers close to zero are not
-        # reported as differences.
+        # Each difference is divided by the magnitude of its own number, so that errors of light bodies are detected. A
+        # thousandth of the largest magnitude is added to this divisor, so that rounding errors of numbers close to zero
+        # are not reported.
         scale = np.abs(values).max(axis=0) + (1e-3 * np.abs(values).max() or 1.0)
         pair = (np.abs(samples[quantity] - values) / scale for samples in (theirs, ours))
         differences.append(ReadingDifference(quantity, *(float(apart.max()) for apart in pair)))
@@ -173,17 +175,16 @@ def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
 def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
     bodies = []
     for body in arm.bodies:
-        # A body without inertial has no mass when Pinocchio reads the URDF: the chain must agree.
+        # Pinocchio reads a body without <inertial> as massless, so the chain gets zero mass, too.
         bodies.append(replace(body, inertia=body.inertia or (Fraction(0),) * 10))
     return arm_dynamics(replace(arm, bodies=tuple(bodies)), Settings())
 
 
 def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Return kinematic and dynamic quantities of the B moving bodies of an arm at positions q (S, n).
+    """Return {quantity: values} of the B moving bodies of an arm at positions q (S, n).
 
-    The key "axes of the joints" has the twists for unit velocities in the root frame, (S, 6, B). "masses and inertias",
-    (S, B, B + 1), has the upper triangle of M plus its transpose, that is, M of the B joints with doubled diagonal
-    entries, and the gravity torque as the last column.
+    "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
+    (S, B, B + 1): M of the B joints with doubled diagonal entries, then the gravity torque as the last column.
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]

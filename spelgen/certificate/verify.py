@@ -1,8 +1,9 @@
 """Numerical verification of a structure by Pinocchio at random configurations.
 
-For a structure with ``assume="kinematics"`` each sample has other random inertial parameters; for ``inertials`` all
-samples have the inertial parameters of the URDF. The verification and the derivation of the structure have only the
-chain in common. The chain is therefore compared with a reading of the URDF by Pinocchio (``numeric_samples``).
+For a structure with ``assume="kinematics"``, each sample has its own random inertial parameters; for ``inertials``, all
+samples have the inertial parameters of the URDF. The verification and the derivation of the structure both start from
+the chain that spelgen read from the URDF. Therefore the chain is also compared with the reading of the URDF by
+Pinocchio (see ``numeric_samples``).
 """
 
 import textwrap
@@ -33,10 +34,13 @@ _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 
 @dataclass(frozen=True)
 class FactCheck:
-    """A derived fact, the result of an independent computation (``found``), and whether the two agree.
+    """Result of the verification of one derived fact.
 
-    A verdict of ``undecided`` means that the fact is neither confirmed nor refuted, because of rounding errors in
-    double precision, or because Pinocchio cannot read the file.
+    Attributes:
+        fact: name of the fact.
+        derived: result of the derivation.
+        found: result of the independent computation.
+        verdict: "agrees", "differs", or "undecided" if rounding errors are too large or Pinocchio cannot read the file.
     """
 
     fact: str
@@ -50,9 +54,13 @@ class FactCheck:
 
 @dataclass(frozen=True, repr=False)
 class Verification:
-    """The checks of an arm at ``samples`` random configurations, which depend on ``seed``.
+    """Result of the verification of an arm's structure.
 
-    ``means``: text that states the program, the number of configurations and the inertial values.
+    Attributes:
+        means: text that states the program, the number of configurations and the inertial values.
+        samples: number of random configurations.
+        seed: seed of the configurations.
+        checks: one result per fact.
     """
 
     means: str
@@ -62,12 +70,12 @@ class Verification:
 
     @property
     def agrees(self) -> bool:
-        """Whether no check contradicts the derivation, or the chain."""
+        """Whether no check contradicts the derivation or the chain."""
         return not self.differences
 
     @property
     def differences(self) -> tuple[FactCheck, ...]:
-        """The checks that contradict the derivation of the structure, or the chain."""
+        """The checks that contradict the derivation of the structure or the chain."""
         return tuple(check for check in self.checks if check.verdict == "differs")
 
     def __repr__(self) -> str:
@@ -106,21 +114,25 @@ Magnitude = tuple[str, float, bool]
 class _DerivedFact:
     """A derived fact, with the sampled numbers that confirm or refute it.
 
-    fact: name of the fact. derived: result of the derivation, as text. magnitudes: tuples (name, number, is_nonzero).
-    If the fact is true, the number is nonzero for is_nonzero = True, and zero for False.
+    Attributes:
+        fact: name of the fact.
+        derived: result of the derivation, as text.
+        magnitudes: list of (name, number, is_nonzero). The fact is true if the numbers with is_nonzero = True are
+            nonzero and all others are zero.
     """
 
     fact: str
     derived: str
     magnitudes: list[Magnitude]
-    # [1] Numbers up to this fraction of their scale are regarded as zero: they are rounding errors.
+    # [1] Numbers (divided by their scale) up to this value count as zero, since they may be rounding errors.
     rounding: float = 1e-12
 
     def check(self, is_fine: bool) -> FactCheck:
         """Return the result of the check.
 
-        is_fine: whether the arm has such small dimensions that nonzero numbers may be lost in rounding errors. A number
-        that should be nonzero, but is not, then makes the check undecided.
+        is_fine: True if numbers of the arm are so small that nonzero results may be lost in rounding errors (see
+        `_is_fine`). If a number that should be nonzero counts as zero, the check is then undecided instead of
+        "differs".
         """
         zeros = [(name, value) for name, value, is_nonzero in self.magnitudes if not is_nonzero]
         nonzeros = [(name, value) for name, value, is_nonzero in self.magnitudes if is_nonzero]
@@ -144,7 +156,8 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
 
     seed: seed of the configurations.
     """
-    # r samples suffice for a space of the derived rank r; six more samples would reveal a larger rank.
+    # A derived rank is at most the number of entries, so this number of samples suffices to confirm it. Six more
+    # samples would reveal a larger rank.
     count = len(structure.entries) + 6
     rng = np.random.default_rng(seed)
     is_random = structure.assume == "kinematics"
@@ -174,8 +187,8 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
         yield FactCheck("reading of the file", "the moving bodies", result, "undecided")
         return
     is_rounded = any(remark.code.startswith("snapped-") for remark in arm.diagnostics)
-    # [1] Tolerance, 1e-9 per joint: the chain drops offsets of less than 1e-9 m, and its rational rotations have errors
-    # of 1e-11 rad each.
+    # [1] The tolerance is 1e-9 per joint: the chain has no offsets of less than 1e-9 m, and the errors of its rational
+    # rotations are 1e-11 rad each.
     allowed = 1e-9 * len(robot.joints)
     for difference in differences:
         verdict: Verdict = "agrees"
@@ -190,7 +203,7 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
 def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
     """Yield two facts: which entries of M are zero, and on which joints each entry depends."""
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
-    # Largest change of each entry of M with each joint, (entries, n).
+    # (entries, n), largest change of each entry of M when only one joint moves
     largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()
     zeros: list[Magnitude] = []
     pairs: list[Magnitude] = []
@@ -209,9 +222,9 @@ def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_Derived
 
 
 def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFact:
-    """Return the fact that M = sum_k c_k A_k + sum_j f_j B_j, where each f_j depends only on its joints.
+    """Return the fact that M = sum_k c_k A_k + sum_j f_j(q) B_j with constants c_k and outputs f_j.
 
-    The c_k must not depend on any joint.
+    Each f_j must depend only on its own joints, the c_k on none. A_k and B_j are constant matrices.
     """
     n = len(structure.joints)
     remainder = samples.mass
@@ -220,43 +233,45 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFac
         functional = row_of(term.functional, n)
         values = samples.mass @ (functional * samples.scale)
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
-        # Changes of the value are relative to the sum of the magnitudes of the summands of the functional.
+        # The value of a term is a linear functional of M. Its changes are divided by the sum of the magnitudes of the
+        # functional's summands.
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
-        # The joints of the term may change its value: only changes caused by other joints contradict the fact.
+        # Changes caused by the joints of the term are allowed; only changes caused by other joints contradict the fact.
         changes[list(term.joints)] = 0.0
         name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
         magnitudes.append((f"change of {name}", float(changes.max()), False))
     magnitudes.append(("remainder of M", float(np.abs(remainder).max(initial=0.0)), False))
-    # The bound of rounding errors is larger than for other facts, because long fractions are replaced by floats.
+    # The bound of rounding errors is larger than for other facts, because the fractions of the functionals are rounded
+    # to floats.
     derived = f"outputs: {len(structure.outputs)}, constants: {len(structure.constants)}, which give M"
     return _DerivedFact("smallest form", derived, magnitudes, rounding=1e-6)
 
 
 def _ranks(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield facts about numbers of terms of M, each of which is equal to a rank of samples.
+    """Yield facts about numbers of terms of M; each number must be equal to the rank of a matrix of samples.
 
-    The facts are the number of outputs (varying terms), the number of outputs and constants, and the numbers of outputs
-    that do not depend on the first 0, 1, ... joints.
+    The numbers are: outputs (terms that vary with q); outputs and constants; and, for k = 0, 1, ..., the outputs that
+    do not depend on the first k joints.
     """
     changes, outputs = samples.changes, len(structure.outputs)
     width = changes.shape[-1]
     yield _rank("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield _rank("outputs and constants together", samples.mass[0], together)
-    # For each joint k, the selection of outputs maximises the number of outputs that depend only on the joints from k
-    # to the tip. This number is checked for each k.
+    # The outputs are chosen such that, for each k, as many of them as possible do not depend on the first k joints.
+    # This number is checked for each k.
     counts, magnitudes = [str(outputs)], []
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)
         counts.append(str(without))
-        # The rank of the changes of M caused by the first joints is the number of outputs that depend on these joints.
+        # The rank of the changes of M caused by the first joints is the number of outputs that depend on them.
         name = f"outputs before joint {first + 1}"
         magnitudes += _rank(name, changes[:first].reshape(-1, width), outputs - without).magnitudes
     yield _DerivedFact("outputs without the first 0, 1, ... joints", ", ".join(counts), magnitudes)
 
 
 def _potential(structure: Structure, samples: NumericSamples) -> _DerivedFact:
-    """Return the fact that V depends on certain joints only: the gravity torque of all other joints is zero."""
+    """Return the fact that V depends only on the derived joints: the gravity torque of all other joints is zero."""
     magnitudes = []
     for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):
         name = f"torque of gravity at joint {joint + 1}"
@@ -266,7 +281,7 @@ def _potential(structure: Structure, samples: NumericSamples) -> _DerivedFact:
 
 
 def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
-    """Return the fact that rows (m, k) have this rank, which is the number of nonzero singular values.
+    """Return the fact that the matrix ``rows`` (m, k) has this rank, the number of its nonzero singular values.
 
     fact: name of the fact.
     """
@@ -274,7 +289,7 @@ def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
         # The triangular factor of the QR decomposition has the same singular values and fewer rows.
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
     values = np.linalg.svd(rows, compute_uv=False)
-    # Singular values are relative to the largest, because the rows have no common unit.
+    # The singular values are divided by the largest one, because the scale of the rows is arbitrary.
     values = values / (values.max(initial=0.0) or 1.0)
     values = np.pad(values, (0, max(0, rank - len(values))))
     magnitudes = []
@@ -284,7 +299,11 @@ def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
 
 
 def _is_fine(arm: Chain, structure: Structure) -> bool:
-    """Whether a nonzero number of the arm is so small that its products may be lost in rounding errors."""
+    """Whether the arm has nonzero numbers below 1e-3, whose products may be lost in rounding errors.
+
+    The numbers are the entries of the rotations and, if the structure depends on inertials, relative moments of
+    inertia.
+    """
     numbers = [np.array(body.rotation, dtype=float).ravel() for body in arm.bodies]
     if structure.assume == "inertials":
         for body in arm.bodies:

@@ -46,7 +46,7 @@ def inspect(
     inspection = inspect_arm(arm, assume=assume)
     proof = None
     if verify:
-        # Imported here, because Pinocchio and SymPy take seconds to import.
+        # Pinocchio and SymPy take seconds to import, so they are imported only for --verify.
         from spelgen.certificate.verify import verify as verified
 
         proof = verified(arm.robot, arm.chain, inspection.structure)
@@ -54,10 +54,11 @@ def inspect(
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE
 
-        # JSON and SymPy files are read by programs, so their formulas have no length limit as in text and LaTeX.
+        # JSON and SymPy files are read by programs, so they contain formulas up to the largest length that can be
+        # written. Text and LaTeX contain formulas up to the default length.
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
-    # The result is printed in any case; --strict and a failed proof only affect the exit code.
+    # The result is printed before --strict and a failed proof end the command with an error code.
     deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
     if strict:
         refuse_warnings(
@@ -72,7 +73,7 @@ def _text(
     format: str, inspection: Inspection, closed: Formulas | None, proof: Verification | None, urdf: Path
 ) -> str:
     """Return the text of the inspection in a format, with a line end. closed: closed-form formulas of M and V."""
-    if closed:  # SymPy is slow to import and needed for formulas only
+    if closed:  # SymPy is slow to import, so it is imported only if formulas are written.
         from spelgen.certificate import formula_files
     if format == "html":
         from spelgen.render.arm_pages import inspection_page
@@ -86,7 +87,7 @@ def _text(
             data["verification"] = proof.to_dict()
         return json.dumps(data, indent=2) + "\n"
     if closed and format in ("latex", "sympy"):
-        # The file contains formulas only: the proof and the names of omitted formulas are printed to stderr.
+        # A LaTeX or SymPy file contains only formulas, so the proof and the names of omitted formulas go to stderr.
         names = [formula.name for formula in closed.unwritten]
         if names:
             note(f"too long to be written: {', '.join(names)}")
@@ -139,7 +140,7 @@ def identify(
         note(diagnostic)
 
     def page() -> str:
-        # Pages and charts are slow to import and needed for this format only.
+        # Pages and charts are slow to import, so they are imported only for the format html.
         from spelgen.render.arm_pages import identification_page
 
         return identification_page(result, arm)

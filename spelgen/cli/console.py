@@ -22,10 +22,10 @@ from spelgen.labels import counted, printable
 
 METAVARS: dict[object, str] = {int: "N", float: "X", str: "TEXT", Path: "FILE"}
 FAILED = 1
-INTERRUPTED = 130  # exit code of shells: 128 + SIGINT
-BROKEN_PIPE = 141  # exit code of shells: 128 + SIGPIPE
+INTERRUPTED = 130  # Shells use the exit code 128 + signal number; SIGINT is 2.
+BROKEN_PIPE = 141  # Shells use the exit code 128 + signal number; SIGPIPE is 13.
 
-# Top-level module -> extra of spelgen that installs the module.
+# {top-level module: optional dependency group ("extra") of spelgen that installs the module}
 EXTRAS = {"pinocchio": "simulate", "ray": "parallel"}
 EXTRAS |= dict.fromkeys(("casadi", "mujoco", "onnxruntime", "onnxscript", "safetensors"), "deploy")
 
@@ -40,7 +40,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
     """
     groups: dict[str, type] = {}
     options: list[inspect.Parameter] = []
-    # eval_str: annotations are strings, because of `from __future__ import annotations`.
+    # `eval_str` turns annotations into types: `from __future__ import annotations` makes them strings.
     for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
         if isinstance(parameter.annotation, type) and is_dataclass(parameter.annotation):
             groups[name] = parameter.annotation
@@ -56,7 +56,8 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
             for name, group in groups.items():
                 values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
             command(**values)
-            sys.stdout.flush()  # a closed pipe raises its error here and not at the exit of the interpreter
+            # A closed pipe raises its error here, where it is reported, and not at the exit of the interpreter.
+            sys.stdout.flush()
         except (typer.Exit, typer.Abort, typer.BadParameter):
             raise
         except BaseException as error:
@@ -64,7 +65,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
 
     for option in options:
         _name_values(option.annotation, option.default)
-    # Typer reads the options from the signature and the annotations.
+    # Typer reads the options of a command from its signature and annotations, so both are replaced.
     parameters = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
     vars(run)["__signature__"] = inspect.Signature(parameters)
     run.__annotations__ = {option.name: option.annotation for option in options}
@@ -147,8 +148,11 @@ def note(text: object) -> None:
 
 
 def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
-    """Print the result of a command. form: "text" prints `lines`, "json" prints `record` as one line of JSON."""
-    # JSON has one line, as log files of pipelines have one record per line.
+    """Print the result of a command.
+
+    form: "text" prints `lines`, the result as lines of text; "json" prints `record`, the same result, as JSON.
+    """
+    # The JSON has one line, because log files of pipelines have one record per line.
     if form == "json":
         print(json.dumps(record, default=str))
         return

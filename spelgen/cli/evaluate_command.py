@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 Format = Literal["text", "json", "csv"]
-LIMIT_EXCEEDED = 3  # exit code if a figure exceeds --limit; usage errors have code 2
+LIMIT_EXCEEDED = 3  # Exit code if an error exceeds --limit. Code 2 is used by usage errors.
 LIMIT_HELP = f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each."
 
 
@@ -42,7 +42,7 @@ def evaluate(
     The result begins with an assessment of the model. The result is also written to evaluation.json in the run folder,
     and no other file is changed.
     """
-    # Limits are checked first, so that a misspelt name is reported before minutes of rollouts.
+    # Options --limit are checked first, so that a misspelt name is reported before minutes of rollouts.
     paths = options.logs(data, extra_logs)
     limits = list(map(_limit, limit or []))
     from spelgen.evaluation.evaluate import SECONDS, STEPS
@@ -74,7 +74,7 @@ def evaluate(
         note(diagnostic)
     forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
     options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
-    # Limits are tested after the result is printed, so that a script gets the figures in any case.
+    # Limits are tested after the result is printed, so that a script gets the errors also if one exceeds its limit.
     values = {figure.name: figure.value for figure in figures(results)}
     exceeded = []
     for name, limit_value in limits:
@@ -126,7 +126,8 @@ def estimate(
     path = output or Path(run) / "estimate.html"
     options.choose_format(None, path, ["html"])
     fit = load_run(run)
-    # Models of position servos predict no torques, which the estimator needs: the error is raised before logs are read.
+    # The estimator needs predicted torques, and models of position servos predict none. `torque_model` raises the error
+    # for such a model before logs are read.
     torque_model(fit)
     levels = noise_levels(fit)
     joints = list(fit.model.joint_names)

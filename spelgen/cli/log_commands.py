@@ -69,7 +69,8 @@ def excite(
 
     for path in (output, trajectory, html):
         if path is not None:
-            options.require_free(path, force=force)  # checked before the search, which takes minutes
+            # Outputs are checked before the search for a motion, because the search takes minutes.
+            options.require_free(path, force=force)
     arm = chosen_arm.load()
     with progress_bar("searching") as progress:
         motion = design_motion(arm, progress=progress, **design.arguments())
@@ -78,7 +79,7 @@ def excite(
     if trajectory is not None:
         written.append(str(write_text(trajectory, motion.joint_trajectory())))
     if html is not None:
-        # Imported here, because pages need packages that are slow to import.
+        # Pages need packages that are slow to import, so they are imported only if a page is written.
         from spelgen.render.arm_pages import motion_page
 
         written.append(str(write_text(html, motion_page(motion, arm))))
@@ -110,7 +111,6 @@ def simulate(
     from spelgen.simulation.simulate import simulate as simulate_arm
 
     arm = chosen_arm.load()
-    # Columns have the joint names of the URDF, so that the logs need no mapping.
     names = arm.chain.joint_names
     motions = [read_motion(file, names) for file in motion or ()]
     truth = output / "as_built.urdf"
@@ -122,7 +122,7 @@ def simulate(
         say(f"wrote {truth} and as_built.yaml, the true arm")
     with progress_bar("simulating") as progress:
         logs = simulate_arm(arm, seed=seed, motions=motions, progress=progress)
-    # Logs are in SI units with the joint names of the URDF, so that they need no mapping.
+    # Logs are written in SI units, with the joint names of the URDF as column names, so that they need no mapping.
     for path, trajectories in zip(paths.values(), (logs.train, logs.test), strict=True):
         if trajectories:
             write_logs(path, trajectories, names)
@@ -165,7 +165,7 @@ def logs(
         say(result.text())
     else:
         say(json.dumps(result.to_dict(), indent=2))
-    # The page is written for logs with errors too, because charts may show the cause.
+    # The page is also written for logs with errors, because charts may show the cause.
     if html is not None:
         from spelgen.render.arm_pages import logs_page
 
@@ -173,7 +173,7 @@ def logs(
         note(f"wrote {write_text(html, text)}")
     if result.errors:
         note(SpelgenErrors(result.errors))
-    # With --strict, warnings give the same exit code as the errors below, and a line on stderr.
+    # Warnings with --strict and errors in the logs have the same exit code.
     if strict:
         refuse_warnings("", len(result.warnings))
     if result.errors:

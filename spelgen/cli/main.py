@@ -31,7 +31,7 @@ class Command(TyperCommand):
     """A command whose help shows arguments by name only, without the type that typer adds."""
 
     def get_help(self, ctx: Any) -> str:
-        """Return the help text."""
+        """Return the help text of the command."""
         # Typer would add the type, such as `PATH`, to arguments whose metavar states it already.
         for parameter in self.params:
             if isinstance(parameter, TyperArgument):
@@ -120,7 +120,8 @@ def common(
 
 def main() -> None:
     """Entry point of the command `spelgen`."""
-    # Set before BLAS and torch are imported. One thread makes runs deterministic, and is fast for small matrices.
+    # The variable is set before BLAS and torch are imported, because they read it only once. One thread makes runs
+    # deterministic, and is fastest for small matrices.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):
         # Names from a file may contain characters that the encoding of the terminal does not have.

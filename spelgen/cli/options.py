@@ -36,11 +36,15 @@ def option(
     min: float | None = None,
     max: float | None = None,
 ) -> Declared:
-    """Return an option of a command, in place of the default value of a parameter.
+    """Return the declaration of an option, which is the default value of a parameter of a command.
 
-    metavar: placeholder of the value in the help; "" for a placeholder by type. text: help. names: names of the option;
-    by default the name of the parameter. default: value without the option; ... for an option that is required. min,
-    max: bounds of the value.
+    Args:
+        metavar: Placeholder of the value in the help; "": a placeholder for the type of the value.
+        text: Help text.
+        names: Names of the option, such as "-o"; by default the name of the parameter.
+        default: Value if the option is not given; ... makes the option required.
+        min: Smallest permitted value.
+        max: Largest permitted value.
     """
     return typer.Option(default, *names, metavar=metavar or None, help=text, min=min, max=max)
 
@@ -62,7 +66,7 @@ def output_option(metavar: str, text: str, default: object = None) -> Declared:
 
 SUFFIXES = {"": "text", ".txt": "text", ".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex"}
 SUFFIXES |= {".py": "sympy"}
-"""Suffix of an output file -> format of its content; a name without a suffix means text."""
+"""{suffix of an output file: format of its content}; a name without a suffix means text."""
 
 TextOrJson = Literal["text", "json"]
 
@@ -101,7 +105,7 @@ def result_format() -> Declared:
 def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
     """Return the format of a result: `format`, else the format for the suffix of the output file, else text.
 
-    formats: formats of the command. Raises a usage error for a suffix of another format.
+    formats: formats of the command. Raises a usage error if the suffix belongs to none of these formats.
     """
     if format or output is None:
         return format or "text"
@@ -114,7 +118,7 @@ def choose_format(format: str | None, output: Path | None, formats: Container[st
 
 
 def write_result(format: str | None, output: Path | None, forms: Mapping[str, Callable[[], str]]) -> None:
-    """Print a result, or write it to a file. forms: format -> function that returns the text of the result."""
+    """Print a result, or write it to a file. forms: {format: function that returns the result in this format}."""
     deliver(forms[choose_format(format, output, forms)]() + "\n", output)
 
 
@@ -185,7 +189,7 @@ class ArmOptions:
     angle_tolerance: float = ANGLE_TOLERANCE
 
     def load(self) -> Arm:
-        """Return the arm."""
+        """Return the arm that these options select."""
         from spelgen.arm.configured_arm import load_arm
 
         return load_arm(self.robot, names(self.joints), self.tip, self.angle_tolerance)

@@ -53,12 +53,12 @@ def train(
     Defaults come from `training` in the robot's settings; --set takes the same keys, which docs/cli_runs.md lists.
     A key that does not apply to the objective is an error.
     """
-    start_time = time.monotonic()  # max_minutes includes the time to read the logs
+    start_time = time.monotonic()  # The limit `max_minutes` includes the time to read the logs.
     # Keys are checked before any file is read, so that a misspelt key costs no time.
     request = Request(objective, read_assignments(assignments or []))
     if source is not None:
         if module is not None:
-            # With --from there is no argument MODULE, so the first argument is a log, too.
+            # With --from there is no argument MODULE, so the first argument is also a log.
             extra_logs = [module, *(extra_logs or [])]
         robot = robot or _urdf_of_run(source)
         request = _warm_start(request)
@@ -67,7 +67,7 @@ def train(
     elif module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, extra_logs)
-    # With --resume the first argument may be the run folder instead of a module.
+    # With --resume the first argument may be the run folder, and `folder` is then this argument.
     folder = output or _default_folder(module, source, resume=resume)
     spec, recorded = _specification(module, folder if resume else source)
     # A resumed run uses the settings in its record, since the settings file of the robot may have changed.
@@ -75,7 +75,8 @@ def train(
     from spelgen.emission.specify import arm_of_spec
     from spelgen.log_checks.check_logs import require_sound_logs
 
-    # The arm is needed to check the logs, and the names in a mapping, which may have every joint of the URDF.
+    # The arm is loaded to check the logs and the mapping. A mapping may name all joints of the URDF, also joints that
+    # are not in the model.
     arm = None if urdf is None else arm_of_spec(spec, urdf)
     settings = TrainingSettings() if arm is None else arm.settings.training
     log_mapping = options.log_mapping(arm or spec.joint_names, mapping or recorded, accept)
@@ -100,7 +101,7 @@ def train(
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
-    # Whether an option applies is known only after the logs determined the objective.
+    # The logs determine the objective, so only `train_files` finds options that do not apply to the objective.
     except OptionError as error:
         option = "--objective" if error.element == "objective" else f"--set {error.element}"
         raise UsageError(f"{option}: {error.got}") from error
@@ -108,11 +109,11 @@ def train(
 
 
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
-    """Write the noise levels of the estimator; return the payload in the logs of a fit with `adapt=load`, else None.
+    """Write the noise levels of the estimator into the run folder; return the payload in the logs if it is estimated.
 
-    source: the run that was adapted. Its model and its noise levels estimate the payload, and the adapted run gets a
-    copy of these noise levels; without noise levels in the source run there is no payload. A fit without a source run
-    gets noise levels from its own logs.
+    source: the run that was adapted; None: the fit is new, and its noise levels are estimated from its own logs. An
+    adapted run gets a copy of the noise levels of `source`. The payload is estimated only for `adapt=load`, by the
+    model and the noise levels of `source`; otherwise, or if `source` has no noise levels, the result is None.
     """
     from spelgen.live.levels import cross_validated_levels, keep_levels, stored_levels
     from spelgen.live.replay import carried_payload
@@ -129,7 +130,7 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
 
     original = load_run(source)
     levels = stored_levels(original)
-    # Runs of earlier versions, and runs with too short logs, have no noise levels.
+    # Runs of earlier versions and runs with too short logs have no noise levels, so no payload can be estimated.
     if levels is None:
         return None
     keep_levels(fit, levels)
@@ -145,7 +146,7 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
     posterior = fit.posterior if fit.checkpoint.posterior else None
     record: dict[str, object] = {"run": str(folder), "status": fit.status, "objective": fit.config.objective}
     record |= {"steps": fit.steps, "epochs": fit.epochs, "seconds": fit.seconds}
-    # The loss of a diverged rollout is infinite, which JSON cannot represent.
+    # The loss of a diverged rollout is infinite. JSON has no infinity, so it is written as null.
     record["validation_loss"] = fit.best_validation if math.isfinite(fit.best_validation) else None
     record["torque_nmse"] = fit.torque_nmse
     record["posterior"] = None if posterior is None else posterior.to_dict()
@@ -160,7 +161,7 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
     listings = () if posterior is None else posterior.listings[: 1 if fit.record.servo else None]
     outcome += [table.text() for table in listings]
     answer(format, record, *outcome, f"run folder: {folder}")
-    # By the exit code, a script can distinguish an interrupted fit from a finished one, as in shells.
+    # An interrupted fit has the exit code that shells use, so that scripts can distinguish it from a finished fit.
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)
@@ -174,7 +175,8 @@ def _outcome(fit: Fit) -> tuple[str, str]:
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
-    if not isinstance(config, Rollout):  # other objectives use windows only to evaluate the model
+    # Only fits with the rollout objective have epochs, which the sentences below state.
+    if not isinstance(config, Rollout):
         summary = servo_summary(fit.record.servo)
         if summary is not None:
             result = summary.text
@@ -190,7 +192,10 @@ def _outcome(fit: Fit) -> tuple[str, str]:
 
 
 def _warm_start(request: Request) -> Request:
-    """Return the request of a warm start; by default the objective is "torque", for which `adapt` is "load"."""
+    """Return the request of a warm start: the default of the objective is "torque" and the default of `adapt` "load".
+
+    `adapt` applies only to the objective "torque".
+    """
     objective, values = request.objective or "torque", dict(request.values)
     if objective == "torque":
         values.setdefault("adapt", "load")

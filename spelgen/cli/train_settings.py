@@ -46,7 +46,8 @@ class Assignments(TrainingSettings):
 class Request:
     """The options of the command `train`.
 
-    values: key of `--set` -> value. warm_start: whether the model was fitted before.
+    objective: value of `--objective`; None: the logs determine the objective. values: {key of `--set`: value}.
+    warm_start: whether the fit starts from the parameters of an earlier run.
     """
 
     objective: str | None
@@ -54,22 +55,23 @@ class Request:
     warm_start: bool = False
 
     def values_of(self, keys: Iterable[str]) -> dict[str, Any]:
-        """Return key -> value, without keys that `--set` has not set."""
+        """Return {key: value} of the given keys that `--set` has set."""
         return {name: self.values[name] for name in keys if name in self.values}
 
 
 def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
-    """Return key -> checked value for texts `KEY=VALUE`; `prior.bodies=0.1` sets one field of a group.
+    """Return {key: checked value} for texts `KEY=VALUE`.
 
-    Raises a usage error for an unknown key, with the nearest known one, and for an invalid value.
+    A key such as `prior.bodies` sets one field of a group. Raises a usage error for an invalid value and for an unknown
+    key; the message suggests the most similar known key.
     """
-    keys = Assignments.model_fields.keys() - {"objective"}  # `objective` has the option --objective
+    keys = Assignments.model_fields.keys() - {"objective"}  # The objective is set by the option --objective.
     # All assignments are collected before they are checked, since the fields of a group are checked together.
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         name, _, field = key.strip().replace("-", "_").partition(".")
-        # A missing `=` is reported first: the user may have typed a blank in its place, after a valid key.
+        # A missing `=` is reported before an unknown key, because the user may have typed a blank in place of `=`.
         if not equals:
             raise UsageError(f"--set: got {assignment!r}, expected KEY=VALUE")
         if name not in keys:
@@ -105,6 +107,7 @@ def fit_options(request: Request, defaults: TrainingSettings | None) -> FitOptio
         # In a warm start no torque fit precedes the rollout: it would discard the source run's parameters.
         settings["torque_first"] = False
     if objective is None and TIME_LIMIT in options:
-        # The objective is chosen later from the logs. As a default, the limit is ignored by objectives without one.
+        # The logs determine the objective later, and some objectives have no time limit. For these objectives an option
+        # would be an error, but a default value is ignored.
         settings[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return FitOptions(objective, options, settings)

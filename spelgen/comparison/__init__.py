@@ -1,1 +1,1 @@
-"""Train presets on the same logs and compare them: arms x presets x seeds x splits."""
+"""Train presets on the same logs and compare their errors, for several arms, seeds and splits of the logs."""

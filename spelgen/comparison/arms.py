@@ -66,12 +66,18 @@ class ComparedArm(Group):
 class Comparison(Group):
     """A comparison: every preset is trained on every arm, with every seed and split.
 
-    presets: names or YAML files of designs; by default closed-form and hybrid on logs, and all presets on a simulated
-    arm. seeds: number of seeds 0, 1, ...; by default 1 on logs, and `comparison.seeds` of the settings of a simulated
-    arm. splits: 1: train on the logs train.* and test on the logs test.*; without such files, test on a quarter of the
-    trajectories. k > 1: k-fold cross-validation over whole trajectories. width, depth: size of the hidden layers.
-    training: training settings for all arms, with the keys of a robot's settings. steps: number of training steps on
-    simulated arms.
+    Attributes:
+        arms: {name: arm}.
+        presets: Names of presets, or YAML files of designs. Default: closed-form and hybrid for an arm with logs, and
+            all presets for a simulated arm.
+        seeds: Number of seeds 0, 1, ... Default: 1 for an arm with logs, and `comparison.seeds` in the settings of a
+            simulated arm.
+        splits: Number of folds of a cross-validation over whole trajectories. 1: no cross-validation; the logs train.*
+            are for training and the logs test.* for testing, or a quarter of the trajectories if there is no test.*.
+        width: Number of units of a hidden layer.
+        depth: Number of hidden layers.
+        training: Training settings for all arms, with the keys of a robot's settings.
+        steps: Number of training steps on a simulated arm.
     """
 
     arms: Annotated[dict[Name, ComparedArm], Field(min_length=1)]
@@ -85,7 +91,7 @@ class Comparison(Group):
 
 
 def ablation_designs() -> dict[str, str | Design]:
-    """Return name -> design, a sequence from phnode to hybrid in which each design changes one property."""
+    """Return {name: design}, in an order from phnode to hybrid in which each design changes one property."""
     friction = replace(load_design("phnode"), dissipation="per-joint")
     inputs = replace(friction, input="derived")
     return {
@@ -111,7 +117,7 @@ def load_comparison(path: Path) -> Comparison:
         errors.append(SettingsError(got, file=path, line=line, element=element, do=do))
     collect(errors)
     arms = {name: arm.in_folder(path.parent) for name, arm in comparison.arms.items()}
-    # Names of presets are kept; only paths of YAML files are resolved against the folder.
+    # A preset is a name or the path of a YAML file. Only paths are relative to the folder.
     presets = comparison.presets
     if presets is not None:
         presets = tuple(str(path.parent / name) if _is_file(name) else name for name in presets)
@@ -123,7 +129,7 @@ def _is_file(preset: str) -> bool:
 
 
 def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Location, str, str]]:
-    """Yield location, error and advice for each unknown preset and for each absent file."""
+    """Yield (location in the YAML file, error, advice) for each unknown preset and for each absent file."""
     for number, preset in enumerate(comparison.presets or ()):
         if preset not in (*PRESET_NAMES, *ablation_designs()) and not _is_file(preset):
             yield ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
@@ -139,8 +145,8 @@ Progress = Callable[[int, int], None]
 class ArmInputs(ComparedArm):
     """The files that all runs on one arm read.
 
-    urdf: URDF from which models are built. truth: URDF of the simulated arm; None for logs of the user. digest: hash of
-    the URDF, the settings and the logs.
+    urdf: URDF from which models are built. truth: URDF with the true parameters of a simulated arm; None for logs of
+    the user. digest: hash of the URDF, the settings and the logs.
     """
 
     truth: Path | None = None
@@ -160,7 +166,7 @@ class ArmInputs(ComparedArm):
         A single split tests on the logs test.*, or on a quarter of all trajectories. Several splits are the folds of a
         cross-validation. The seed of the choice is fixed, so all models are tested on the same trajectories.
         """
-        # Each worker loads the arm again, because jobs contain paths and not arms.
+        # Each worker process loads the arm from its files: a job contains only their paths.
         arm = self.load()
         train = read_logs(self.data, arm, self.mapping, "train")
         test = []
@@ -193,7 +199,7 @@ def arm_inputs(
     mapping = log_source(loaded, arm.mapping).mapping
     files, errors = log_files(arm.data)
     collect(errors)
-    # These keys of the settings do not affect runs, so they are omitted from the digest.
+    # The digest omits keys of the settings that do not affect the result of a run.
     apart: dict[str, bool | set[str]] = {"about": True, "comparison": {"seeds", "published"}}
     settings = [loaded.settings.model_dump_json(exclude_unset=True, exclude=apart)]
     settings.append(mapping.model_dump_json(exclude_unset=True))
@@ -205,7 +211,7 @@ def arm_inputs(
         changes = {"urdf": folder / "known.urdf", "truth": arm.urdf, "data": (folder,)}
         inputs = inputs.model_copy(update=changes | {"joints": loaded.joints, "tip": loaded.tip})
         _simulate(inputs, loaded, folder, progress)
-    # The first split is made now, so that too few logs are an error before hours of training.
+    # The first split is made here only to raise its error, for example about too few logs, before hours of training.
     inputs.split(0, splits)
     return inputs
 
@@ -216,7 +222,8 @@ def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress |
     Models are built from a copy of the URDF without inertials, drives and friction, so that no model starts from the
     true parameters.
     """
-    # Imported here, because Pinocchio is an extra that logs of the user do not need.
+    # The simulation needs Pinocchio, an optional dependency. A comparison on logs of the user does not need it, so the
+    # import is in this function.
     from spelgen.simulation.simulate import simulate
 
     if loaded.settings.input == "position":
@@ -243,7 +250,7 @@ def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress |
 
 def _kinematics(urdf: Path) -> bytes:
     """Return a URDF without inertials, friction, visuals and collision bodies."""
-    # Size and entities of the URDF were checked when `load_arm` read it.
+    # The parser needs no limits of size and entities, because `load_arm` has checked them when it read the URDF.
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     tree = etree.ElementTree(etree.fromstring(urdf.read_bytes(), parser))
     for element in list(tree.iter("dynamics", "visual", "collision", "inertial")):

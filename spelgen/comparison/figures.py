@@ -35,19 +35,21 @@ if TYPE_CHECKING:
 class ComparisonTuning:
     """Constants of `spelgen compare`."""
 
-    # Largest number of windows from which a loss is computed; a larger set is subsampled evenly.
+    # [1] Approximate largest number of windows from which a loss is computed: windows start at larger distances in
+    # longer logs.
     windows: int = 512
-    # Number of timed training steps. Their median is used, because other programs run at the same time.
+    # [1] Number of training steps whose time is measured. The median of their times is used, because other programs on
+    # the machine delay some of them.
     timed_steps: int = 5
-    # Time over which motions are predicted [s], as in Wang et al., Sci Rep 15:33179 (2025).
+    # [s] Time over which motions are predicted, as in Wang et al., Sci Rep 15:33179 (2025).
     horizon: float = 1.0
-    # Time of the measurements after the training of a run [s]. This constant and the next two only serve to estimate
-    # the time of a comparison; they were measured with robots/two_link.urdf.
+    # [s] Duration of the evaluation of a run after its training, for the estimated duration of a comparison. Measured
+    # with robots/two_link.urdf, like the next two values.
     measuring: float = 10.0
-    # Time of a training step with the momentum objective, divided by the time of a step with the rollout objective.
-    # The ratio is below 1 because the momentum objective integrates no differential equation.
+    # [1] Duration of a training step with the momentum objective, divided by the duration of a step with the rollout
+    # objective. A momentum step is shorter, because it needs no numerical integration.
     momentum_cost: float = 0.5
-    # Assumed time of a run on logs [s], used until a run of the same arm and preset is finished.
+    # [s] Estimated duration of a run on logs of the user, until a run of the same arm and preset is finished.
     run_on_logs: float = 60.0
 
 
@@ -55,19 +57,21 @@ TUNING = ComparisonTuning()
 
 
 Figures = dict[str, int | float | None]
-"""Row of a table -> figure; None for a figure that is not finite."""
+"""{row of a table: figure}; the figure is None if it is not finite."""
 
 NETWORKS = {"mass": "M", "friction": "D", "input_network": "G", "potential": "V"}
-"""Part of the name of a network -> the matrix or the potential energy that the network computes."""
+"""{part of the name of a network: the matrix or the potential energy that the network computes}."""
 
 
 @dataclass(frozen=True)
 class SimulatedFigures:
     """Figures of a model of a simulated arm.
 
-    losses: squared errors of predictions, and the relative error of M (see `mass_error`). sizes: sizes of the networks,
-    time of a training step, and invariants. example: a test motion and its prediction; None if no test motion lasts
-    1 s. mass: (T, n, n) learned M at the measured positions of the example.
+    Attributes:
+        losses: {row of a table: squared prediction error, or relative error of M (see `mass_error`)}.
+        sizes: {row of a table: size of a network, duration of a training step, or invariant}.
+        mass: Learned M at the measured positions of `example`, (T, n, n); None without an example.
+        example: A test motion and its prediction; None if no test motion lasts 1 s.
     """
 
     losses: Figures
@@ -79,13 +83,14 @@ class SimulatedFigures:
 def simulated_figures(
     fit: Fit, training: Sequence[Trajectory], testing: Sequence[Trajectory], truth: Path
 ) -> SimulatedFigures:
-    """Measure a fit on the simulated logs of the arm whose true parameters are in the URDF `truth` and its settings."""
+    """Return the figures of a fit to simulated logs. truth: URDF with the true parameters of the simulated arm."""
     model, substeps = fit.model, int(fit.substeps)
     decimation = fit.preprocessing.decimation or 1
     config = fit.config if isinstance(fit.config, Rollout) else Rollout()
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
-    # Positive definiteness of M is tested within the joint limits, the error of M is measured at logged positions.
+    # `low` and `high` are the joint limits, between which M must be positive definite. The error of M is computed only
+    # at logged positions.
     joints = fit.record.joints
     ranges = list(map(working_range, load_arm(truth, joints).chain.coordinates))
     low, high = torch.tensor(ranges, dtype=torch.float64).T
@@ -95,7 +100,8 @@ def simulated_figures(
     loss, position, velocity = prediction_loss(model, far, substeps)
     losses: Figures = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
     losses["M, relative error"] = mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints))
-    # These two losses are of windows as long as in training.
+    # The training loss and the test loss are computed from windows as long as the windows of the training, and not from
+    # windows of 1 s.
     for label, logs in (("training loss", training), ("test loss", testing)):
         windows = spread_windows(logs, config.window, decimation)
         losses[label] = prediction_loss(model, windows, substeps)[0]
@@ -123,19 +129,24 @@ def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, d
 
 
 def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
-    """Return at most about `TUNING.windows` windows, evenly spread over the logs."""
-    # Windows start at multiples of the decimation: the simulated controller changes its torque at such samples only.
+    """Return windows that are evenly spread over the logs, about `TUNING.windows` at most.
+
+    A window contains `samples` samples: every `decimation`-th sample of a log.
+    """
+    # The simulated controller changes its torque only at samples that are multiples of the decimation, so a window
+    # starts at such a sample.
     starts = sum(max(0, len(log) - (samples - 1) * decimation) for log in logs)
     stride = -(-max(1, -(-starts // TUNING.windows)) // decimation) * decimation
     return cut_windows(logs, samples, stride, decimation, measured=False)
 
 
 def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> tuple[float | None, ...]:
-    """Return three squared errors of predictions from the first sample of the windows.
+    """Return the total, the position and the velocity error of predictions from the first sample of each window.
 
-    They are sums over joints and means over windows and samples, in units of rad, m and s: the sum of both other errors
-    (eq. 8 of the paper), the position error (for revolute joints the geodesic distance), and the velocity error. None:
-    the error is not finite. substeps: integrator steps per sample.
+    The position error is the squared error of q, summed over joints and averaged over windows and samples; the error of
+    a revolute position is the geodesic distance. The velocity error is computed from qd in the same way. The total is
+    the sum of the position and the velocity error (eq. 8 of the paper). Units are rad, m and s. An error that is not
+    finite is None. substeps: integrator steps per sample.
     """
     with torch.no_grad():
         q, qd = roll_out(model, windows, substeps)
@@ -146,18 +157,20 @@ def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> tuple[f
 
 
 def sizes(model: ArmModel) -> Figures:
-    """Return the numbers of outputs of the networks of M, D, G and V, residual networks included.
+    """Return {row of a table: size of the model}.
 
-    Also return the number of inputs of the network of M, and the number of trained parameters of the model.
+    The rows are the number of outputs of each network (of M, D, G and V, residual networks included), the number of
+    inputs of the network of M, and the number of trained parameters.
     """
     figures: Figures = {f"outputs of {matrix}": 0 for matrix in NETWORKS.values()}
-    # Friction without a network counts as one output per joint.
+    # The damping D has one output per joint if it is not computed by a network.
     figures |= {"outputs of D": model.n, "inputs of M": 0}
     for name, module in model.named_modules():
         masks = [x for key, x in module.named_buffers(recurse=False) if key.startswith("mask")]
         for quantity in NETWORKS.keys() & name.split("."):
             if masks:
-                # Outputs without inputs are not counted: V of an arm without gravity has one such output.
+                # An output that depends on no input is not counted. The network of V has such an output if the arm has
+                # no gravity torque.
                 outputs = int(masks[-1].flatten(1).any(dim=1).sum())
                 figures[f"outputs of {NETWORKS[quantity]}"] = outputs
             if masks and quantity == "mass":
@@ -168,11 +181,15 @@ def sizes(model: ArmModel) -> Figures:
 def predict_example(
     predictor: Predictor, logs: Sequence[Trajectory], steps: int, decimation: int
 ) -> PredictedMotion | None:
-    """Predict the middle of the first log that has `steps` steps of `decimation` samples; None without such a log."""
+    """Return the measured and predicted motion in the middle of the first log that is long enough; None without one.
+
+    The motion has `steps` steps of `decimation` samples.
+    """
     span = steps * decimation
     for log in logs:
         if len(log) > span:
-            # The start is a multiple of the decimation, because the controller holds its torque for that many samples.
+            # The simulated controller changes its torque only at samples that are multiples of the decimation, so the
+            # motion starts at such a sample.
             start = (len(log) - 1 - span) // (2 * decimation) * decimation
             piece = log[start : start + span + 1]
             window = cut_windows([piece], steps + 1, decimation=decimation, measured=False)

@@ -43,8 +43,9 @@ Errors = dict[str, dict[str, float | None]]
 class RunResult:
     """Figures of a finished run.
 
-    key: hash of all inputs of the run. seconds: time of training [s]. parameters: number of trained parameters that the
-    model uses. simulated: further figures for a simulated arm, whose true parameters are known.
+    key: hash of all inputs of the run, see `Job.key`. seconds: duration of the training [s]. parameters: number of
+    trained parameters that the model uses. errors: {measure: {predictor: error}}; the first measure ranks the models.
+    simulated: further figures for a simulated arm, whose true parameters are known.
     """
 
     key: str
@@ -87,7 +88,7 @@ class Job(Group):
 
     @property
     def preset(self) -> str:
-        """Return the name of the design without folder and suffix."""
+        """Return the name of the design; for a YAML file, its name without folder and suffix."""
         return Path(self.design).stem
 
     @property
@@ -98,11 +99,14 @@ class Job(Group):
 
     @property
     def key(self) -> str:
-        """Return a hash of all inputs of the run; paths of files are not included."""
+        """Return a hash of all inputs of the run: logs, URDF, settings, design, options and version of spelgen.
+
+        Paths of files do not affect the hash.
+        """
         protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
         options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
-        # The content of the design is included, and not its name, since a YAML file may have changed.
-        # The version is included, since results may differ between versions of spelgen.
+        # The hash contains the content of the design and not its name, since a YAML file may have changed. It contains
+        # the version of spelgen, since versions may give different results.
         sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
         return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
 
@@ -125,7 +129,7 @@ class Job(Group):
         return result if result.key == self.key else None
 
     def config(self, model: ArmModel) -> FitConfig | FitOptions:
-        """Return the configuration of the fit to simulated logs, or the options of the fit to logs of the user."""
+        """Return the configuration of the fit: the same for all models of a simulated arm, else from the settings."""
         if self.inputs.truth is not None:
             return self.equal_steps()
         objective = self.training.objective
@@ -135,7 +139,10 @@ class Job(Group):
         return FitOptions(objective, {}, self.training.options)
 
     def equal_steps(self) -> Rollout:
-        """Return a rollout fit with the same number of steps for all models, without a prior from the URDF."""
+        """Return the configuration of a rollout fit to simulated logs.
+
+        All models of a comparison take the same number of training steps, without regularization towards the URDF.
+        """
         epochs, decay = -(-self.protocol.steps // WINDOWS.epoch_steps), self.protocol.weight_decay
         options = self.training.options | {"urdf_weight": 0.0, "epochs": epochs, "patience": epochs}
         options |= {"momentum_steps": self.protocol.momentum_steps}
@@ -151,7 +158,9 @@ class Job(Group):
 
 
 def run_job(job: Job) -> RunResult:
-    """Train and evaluate a model, write result.json and return it; an interrupted run is resumed from its checkpoint.
+    """Train and evaluate a model, write result.json, and return its content.
+
+    An interrupted run is resumed from its checkpoint. A finished run is not repeated.
 
     Raises the errors of `fit` and `evaluate`, and KeyboardInterrupt if the process is asked to terminate.
     """
@@ -182,7 +191,7 @@ def run_job(job: Job) -> RunResult:
         errors = _errors(results)
     else:
         simulated = simulated_figures(trained, training, testing, job.inputs.truth)
-        # The first loss ranks the models.
+        # Models of a simulated arm are ranked by the first loss, the prediction loss over 1 s, so no other is returned.
         errors = {label: {MODEL: loss} for label, loss in list(simulated.losses.items())[:1]}
     result = RunResult(
         key=job.key, arm=job.arm, preset=job.preset, seed=job.seed, split=job.split, seconds=seconds,
@@ -197,18 +206,19 @@ def _own_checkpoint(job: Job, run: RunFolder) -> bool:
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()
-    run.config.unlink(missing_ok=True)  # without config.json the folder is no run, and a new fit starts
+    # A folder without config.json is not a run folder, so a new fit starts.
+    run.config.unlink(missing_ok=True)
     write_json(owner, {"key": job.key})
     return False
 
 
 def _errors(results: Results) -> Errors:
-    """Return measure -> predictor -> error, in the order replays, horizons (longest first), torque."""
+    """Return {measure: {predictor: error}}: first the errors of replays, then of horizons, then of torques."""
     errors: Errors = {}
     for replay in results.replays:
         measure = f"position RMS, {replay.name} [{thousandths(results.joint_types)}]"
         errors[measure] = {name: 1000 * error.mean for name, error in replay.errors.items()}
-    # The first measure ranks the models: long horizons come first, since they are the most difficult.
+    # The longest horizon is first, because the first measure ranks the models and long horizons are most difficult.
     for horizon in reversed(results.horizons):
         open_loop = [name for name in horizon.errors if not name.endswith(observed(""))]
         relative = {name: horizon.errors[name].mean_relative_rms for name in open_loop}

@@ -30,8 +30,8 @@ SIMULATED_PRESETS: tuple[str, ...] = ("phnode", "spel", "spel-kan", "minimal", "
 class Study:
     """A comparison that is ready to run.
 
-    jobs: all runs. results: name of a finished run -> result. failures: name of an arm or run -> reason.
-    estimates: name of an unfinished run -> expected time [s].
+    jobs: all runs. results: {name of a finished run: result}. failures: {name of an arm or run: reason}. estimates:
+    {name of an unfinished run: expected duration [s]}.
     """
 
     folder: Path
@@ -42,7 +42,7 @@ class Study:
 
     @property
     def arms(self) -> dict[str, list[RunResult]]:
-        """Return name of an arm -> results of its finished runs, in the order of the jobs."""
+        """Return {name of an arm: results of its finished runs}, in the order of the jobs."""
         arms: dict[str, list[RunResult]] = {}
         for job in self.jobs:
             if job.name in self.results:
@@ -50,7 +50,10 @@ class Study:
         return arms
 
     def announcement(self, parallel: int) -> str:
-        """Return the number of runs, and an estimate of the time of the unfinished ones."""
+        """Return a text with the number of runs, and the estimated duration of the unfinished runs.
+
+        parallel: number of runs at the same time.
+        """
         dimensions = zip(*((job.arm, job.design, job.seed, job.split) for job in self.jobs), strict=True)
         nouns = ("arm", "preset", "seed", "split")
         counts = [counted(len(set(values)), noun) for values, noun in zip(dimensions, nouns, strict=True)]
@@ -59,16 +62,16 @@ class Study:
             text += f", {len(self.results)} finished before"
         if not self.estimates:
             return text
-        # Lower bound of the time: equal load of all workers, and at least the time of the longest run.
+        # The estimate assumes that all workers are equally loaded. It is at least the duration of the longest run.
         seconds = max(sum(self.estimates.values()) / parallel, *self.estimates.values(), 0.0)
         return f"{text}; estimated time {duration(seconds)}"
 
 
 def prepare_study(comparison: Comparison, folder: Path, progress: Progress | None = None) -> Study:
-    """Prepare the inputs of all arms, find finished runs, and estimate the time of the others.
+    """Prepare the inputs of all arms, find finished runs, and estimate the duration of the unfinished runs.
 
-    An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist, and
-    RunError if no arm can be used; if there is only one arm, the error of this arm is raised instead.
+    An arm whose inputs cannot be prepared becomes an entry of `Study.failures`. Raises SettingsError for a preset that
+    does not exist, and RunError if no arm can be used. If there is only one arm, its error is raised.
     """
     # Presets are checked first, so that a misspelt name is an error before logs are simulated.
     for preset in set(comparison.presets or ()) - ablation_designs().keys():
@@ -86,7 +89,7 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     if not jobs:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
         raise RunError(f"no arm that can be compared ({reasons})")
-    # `Job.result` returns only a result with the key of the job: results of other options or inputs are not used.
+    # A stored result is used only if it was computed from the same options and inputs, which `Job.result` checks.
     finished = {job.name: job.result() for job in jobs}
     results = {name: result for name, result in finished.items() if result is not None}
     waiting = [job for job in jobs if job.name not in results]
@@ -120,14 +123,17 @@ def run_study(study: Study, note: Callable[[str], None], jobs: int = 1, address:
             line += f"; about {duration((time.monotonic() - start) * (total / done - 1))} left"
         note(f"{count}/{len(waiting)} {job.name}: {line}")
     finished = replace(study, results=results, failures=failures, estimates={})
-    # Curves are omitted here: result.json of each run contains them.
+    # The file contains no curves of simulated arms, because they are in result.json of each run.
     figures = [record(replace(result, simulated=None)) for result in results.values()]
     write_json(study.folder / "comparison.json", {"schema": 1, "failures": failures, "results": figures})
     return finished
 
 
 def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) -> list[Job]:
-    """Return the runs of an arm ordered by seed: an interrupted comparison has all presets for the first seeds."""
+    """Return the runs of an arm, ordered by seed.
+
+    In this order an interrupted comparison has results of all presets for the first seeds.
+    """
     settings = load_settings(inputs.truth or inputs.urdf)
     protocol, simulated = settings.comparison, inputs.truth is not None
     presets = comparison.presets or (SIMULATED_PRESETS if simulated else PRESETS_ON_LOGS)
@@ -150,9 +156,10 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
 
 
 def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
-    """Return the expected time of a run [s]: the median time of finished runs of the same arm and preset.
+    """Return the expected duration of a run [s]: the median duration of finished runs of the same arm and preset.
 
-    Without such runs it is, on simulated arms, the number of training steps times the measured time of a step.
+    If there is no such run, the duration is the number of training steps times the measured duration of a step for a
+    simulated arm, and a constant for logs of the user.
     """
     finished = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
     if finished:

@@ -42,10 +42,10 @@ def arm_sections(study: Study) -> list[ArmResults]:
 
 
 def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFigures]) -> list[Table]:
-    """Return the tables of an arm, the main result first. published: preset -> figures of a publication."""
+    """Return the tables of an arm, the main result first. published: {preset: figures of a publication}."""
     runs = _by_preset(results)
     figures = {name: [run.simulated for run in x if run.simulated] for name, x in runs.items()}
-    # Logs of the user have no known true parameters: models are ranked by their errors on test logs only.
+    # The true parameters of a user's arm are unknown, so its only table has the errors on the test logs.
     if not all(figures.values()):
         return [_ranking(runs)]
     of_seeds: dict[str, Numbers] = {}
@@ -67,13 +67,13 @@ def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFi
 
 
 def arm_sentence(results: Sequence[RunResult]) -> str:
-    """Return a sentence: the best model of an arm, and the factors between its error and the errors of all others."""
+    """Return a sentence that names the best model of an arm and compares its error with the errors of all others."""
     runs, measure = _by_preset(results), next(iter(results[0].errors))
     errors = {name: error for name, error in _medians(runs, measure).items() if error is not None}
     models = [name for name in errors if name in runs]
     if not models:
         return f"No model has a finite {measure}."
-    # Medians are sorted, so the first model has the smallest error.
+    # `_medians` sorts by error, so the first model has the smallest error.
     best = errors[models[0]]
     # Models with errors equal to three digits are named together, for example closed-form and hybrid without residual
     # terms, which are the same model.
@@ -83,7 +83,7 @@ def arm_sentence(results: Sequence[RunResult]) -> str:
     for name, error in errors.items():
         if name not in equal and error < best:
             smaller.append(f"{name} ({number(error)})")
-        # If the best error is zero, factors are undefined.
+        # Ratios to the best error are omitted if the best error is zero.
         elif name not in equal and best:
             larger.append(f"{number(error / best)} times smaller than with {name}")
     if larger:
@@ -102,7 +102,8 @@ def comparison_sentence(sections: Sequence[ArmResults]) -> str:
     wins: dict[str, int] = {}
     for section in sections:
         runs, measure = _by_preset(section.results), next(iter(section.results[0].errors))
-        # Medians are sorted and contain baselines: the first name with runs is the best model.
+        # `_medians` sorts by error and contains baselines, which have no runs. The first name with runs is the best
+        # model.
         best = next(name for name in _medians(runs, measure) if name in runs)
         wins[best] = wins.get(best, 0) + 1
     best_first = sorted(wins.items(), key=lambda item: -item[1])
@@ -130,7 +131,7 @@ def _ranking(runs: Runs) -> Table:
 
 
 def _medians(runs: Runs, measure: str) -> Numbers:
-    """Return model or baseline -> median error, in ascending order; errors that are not finite are last."""
+    """Return {model or baseline: median error}, sorted by error; errors that are not finite are last."""
     values: dict[str, list[float | None]] = {}
     for preset, of_preset in runs.items():
         for run in of_preset:
@@ -146,11 +147,12 @@ def _losses(figures: Mapping[str, Sequence[Figures]], published: Mapping[str, Pu
         medians = _summary(figures, label, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        # The baseline's loss divided by each loss is added: absolute losses depend on the units and the sample rate.
+        # A row with the ratio of the baseline's loss to each loss is added, because absolute losses depend on units and
+        # on the sample rate.
         if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))
-    # Only presets with published figures have a column.
+    # Rows of published figures contain only presets that the publication evaluates.
     records = {name: published[name].model_dump(exclude_none=True) for name in figures if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}
@@ -166,12 +168,15 @@ def _losses(figures: Mapping[str, Sequence[Figures]], published: Mapping[str, Pu
 def _summary(
     figures: Mapping[str, Sequence[Figures]], label: str, combine: Callable[[list[float]], float]
 ) -> Numbers:
-    """Return preset -> the figure of a row, combined over the runs of the preset. combine: median, for example."""
+    """Return {preset: figure}, for the row `label` of a table.
+
+    The figures of all runs of a preset are combined to one number. combine: function for this, such as the median.
+    """
     return {name: _combined([run[label] for run in runs], combine) for name, runs in figures.items()}
 
 
 def _combined(values: Sequence[float | None], combine: Callable[[list[float]], float]) -> float | None:
-    """Return the values combined to one number; None if the result is not finite."""
-    # None counts as infinity: if it were omitted, a model that diverges with one of two seeds would rank by the other.
+    """Return combine(values), in which None is replaced by infinity; None if the result is not finite."""
+    # None is not omitted: otherwise a model that diverges with one of two seeds would be ranked by the other seed.
     combined = combine([math.inf if value is None else value for value in values])
     return combined if math.isfinite(combined) else None

@@ -1,4 +1,4 @@
-"""The constraint from the coordinates of an arm to the joints of its bodies; it needs no Pinocchio."""
+"""Joint positions of all bodies as a linear function of the coordinates of an arm; it needs no Pinocchio."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from spelgen.dynamics.constraint import Constraint
 
 
 def body_constraint(arm: Chain) -> Constraint:
-    """Return the constraint from the coordinates of the arm to the joints of all bodies, mimic joints included."""
+    """Return the constraint that gives the joint positions of all bodies, including mimic joints, from q (n,)."""
     jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
     for row, body in enumerate(arm.bodies):
         jacobian[row, body.coordinate] = float(body.multiplier)

@@ -1,7 +1,7 @@
 """Conversions of inertial parameters, the regressor of the joint torques, and base parameters.
 
-The base parameters of `base_combinations` are computed numerically. Their inertial parts are equal to the exact base
-parameters of `structure.base_parameters`.
+`base_combinations` computes base parameters of bodies and armatures numerically. Their inertial parts (without
+armatures) are equal to the exact base parameters of `structure.base_parameters`.
 """
 
 import numpy as np
@@ -54,9 +54,9 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
         q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     count = len(chain.parents)
-    # T (4 x 4) is the homogeneous transform of a body, T' its time derivative, and J the pseudo-inertia. The kinetic
-    # energy, 1/2 tr(T' J T'^T), is linear in J. `forward` transforms points: with the columns of the identity as
-    # points, the result is T.
+    # The kinetic energy of a body is 1/2 tr(T' J T'^T): linear in its pseudo-inertia J (4 x 4), with T' the time
+    # derivative of its homogeneous transform T. `forward` returns T times four given points; the columns of the
+    # identity as points give T itself.
     pose = chain.forward(q, torch.eye(4 * count).to(q))
     rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
     rises = torch.unflatten(rises, -1, (3, count, 4))
@@ -96,7 +96,7 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     columns is regrouped into their parameters (Gautier and Khalil, IEEE T-RA 6:368, 1990).
     """
     n, inertial = len(motors), 10 * len(chain.parents)
-    # In BASE_ORDER, the parameters of a body that other parameters usually absorb come last: the result then has the
+    # The last parameters in BASE_ORDER (Iyy, hz, m) are regrouped into the others if possible. The result then has the
     # conventional base parameters.
     order = [
         10 * body + INERTIAL_PARAMETERS.index(name) for body in range(inertial // 10) for name in BASE_ORDER

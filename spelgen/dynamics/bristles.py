@@ -14,11 +14,14 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 @dataclass(frozen=True, eq=False)
 class BristleReach:
-    """Break-away displacements of the K bristles of each drive.
+    """Break-away displacements of the K bristles of each of n drives.
 
-    values: (n, K) [rad, m]; K is 0 without bristles. motors: matrix C, (n, n): the velocities of the drives are C qd
-    (see ``Actuation.motor_speeds``); None: each drive moves its own joint. smoothing_velocity: width of the tanh of dry
-    friction without bristles, (n,) [rad/s, m/s]; None: unknown.
+    Attributes:
+        values: (n, K) [rad, m]; K is 0 without bristles.
+        motors: matrix C, (n, n): the velocities of the drives are C qd (see ``Actuation.motor_speeds``); None: each
+            drive moves its own joint.
+        smoothing_velocity: width of the smooth sign of velocity for dry friction without bristles, (n,) [rad/s, m/s];
+            None: unknown.
     """
 
     values: np.ndarray
@@ -27,12 +30,12 @@ class BristleReach:
 
     @property
     def elements(self) -> int:
-        """Number of bristles per joint, K."""
+        """Number of bristles per drive, K."""
         return int(self.values.shape[1])
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
-    """Return typical break-away displacements, (n, K) [rad, m].
+    """Return the typical break-away displacements of the joints.
 
     kinds: type of each joint (revolute or prismatic). motors: see `BristleReach`.
     """
@@ -40,12 +43,12 @@ def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleR
 
 
 def bristle_reach(model: PortHamiltonian) -> BristleReach:
-    """Return the break-away displacements of a model."""
+    """Return the break-away displacements of a model; K is 0 for a model without bristles."""
     if not isinstance(model, RigidBodyDynamics) or not model.elements:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
     tensors = (model.friction.reach, motors_of(model), width)
-    # Paths are computed by NumPy in double precision, for models on any device.
+    # The arrays are NumPy arrays in double precision, as measured positions are, also for a model on a GPU.
     arrays = [x.detach().cpu().double().numpy() for x in tensors]
     return BristleReach(*arrays)
 
@@ -64,8 +67,8 @@ def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Ten
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     """Return the friction state z, (T, n, K) [rad, m], along positions q (T, n) [rad, m]; z[0] is zero.
 
-    Between two reversals of a drive, z depends on the state at the first reversal and the displacement since then.
-    Only the reversals are therefore computed one after the other.
+    q: measured positions, from which encoder jitter is removed first. After a reversal of a drive, z depends only on z
+    at this reversal and the displacement since then: the loop is over reversals, not over samples.
     """
     path = encoded(q)
     if bristles.motors is not None:
@@ -81,7 +84,7 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
         at_corners = [np.zeros_like(reach)]
         for displacement in np.diff(positions[corners]):
             at_corners.append(np.clip(at_corners[-1] + displacement, -reach, reach))
-        # The latest reversal before each sample, or at the sample.
+        # Index in `corners` of the latest reversal before or at each sample.
         latest = np.searchsorted(corners, np.arange(len(q)), side="right") - 1
         moved = positions - positions[corners[latest]]
         z[:, drive] = np.clip(np.stack(at_corners)[latest] + moved[:, None], -reach, reach)
@@ -89,13 +92,14 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
 
 
 def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:
-    """Return the direction in [-1, 1] of dry friction without bristles, (T, n), at velocities qd (T, n).
+    """Return the smooth sign of the velocity of each drive, (T, n); qd: joint velocities, (T, n).
 
-    The result is None if the smoothing velocity is unknown.
+    It is the factor, from -1 to 1, of dry friction of a drive without bristles. None if the smoothing velocity is
+    unknown.
     """
     if bristles.smoothing_velocity is None:
         return None
-    # This smooth sign must be the one of `runtime.friction_laws`: any difference is an error of the friction torque.
+    # The formula must be equal to the smooth sign in `runtime.friction_laws`, which the trained model uses.
     speed = qd if bristles.motors is None else qd @ bristles.motors.T
     return np.asarray(speed / np.hypot(speed, bristles.smoothing_velocity))
 
@@ -103,7 +107,8 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
 def encoded(q: np.ndarray) -> np.ndarray:
     """Return the path (T, n) [rad, m] without encoder jitter.
 
-    q: measured path, (T, n), which is passed through a backlash of one encoder step in either direction.
+    q: measured path, (T, n). The result changes only if q would differ from it by more than one encoder step, as behind
+    a gear with backlash.
     """
     step = encoder_step(q)
     if not step.any():
@@ -124,7 +129,7 @@ def encoder_step(q: np.ndarray) -> np.ndarray:
     """Return the encoder step (n,) [rad, m] of positions (T, n); 0 for a joint whose positions are not quantised."""
     steps = np.zeros(q.shape[1])
     for joint, values in enumerate(q.T):
-        # Positions of an encoder repeat exactly. They are regarded as quantised if each value occurs more than four
+        # Positions of an encoder repeat exactly. A joint is regarded as quantised if each value occurs more than four
         # times on average.
         levels = np.unique(values)
         if len(levels) > 1 and len(levels) < len(values) / 4:

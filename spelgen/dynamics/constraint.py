@@ -12,7 +12,10 @@ from spelgen.urdf.robot import Robot
 class Constraint:
     """Positions of b joints as a function of n coordinates: jacobian @ q + offset.
 
-    names: names of the b joints. jacobian: matrix K, (b, n). offset: joint positions at q = 0, (b,) [rad, m].
+    Attributes:
+        names: names of the b joints.
+        jacobian: matrix K, (b, n).
+        offset: joint positions at q = 0, (b,) [rad, m].
     """
 
     names: tuple[str, ...]

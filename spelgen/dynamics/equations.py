@@ -19,8 +19,10 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 class MotionEquations:
     """Equations of motion of W rollouts at fixed positions (W, n).
 
-    mass: mass matrix M, (W, n, n). force: function of (qd, tau, z) that returns M qdd, (W, n) [Nm, N]. friction:
-    function of (qd, z) that returns the friction torque, (W, n) [Nm, N].
+    Attributes:
+        mass: mass matrix M, (W, n, n).
+        force: function of (qd, tau, z) that returns M qdd, (W, n) [Nm, N].
+        friction: function of (qd, z) that returns the friction torque, (W, n) [Nm, N].
     """
 
     mass: Tensor
@@ -40,7 +42,10 @@ class OwnEquations(Protocol):
 
 
 def equations_of(dynamics: object) -> EquationsAt:
-    """Return a function of q (W, n) that returns the equations of motion; it is valid until the parameters change."""
+    """Return a function of q (W, n) that returns the equations of motion of W rollouts at q.
+
+    The function uses cached values of the parameters: it is valid until a parameter changes.
+    """
     if isinstance(dynamics, PortHamiltonian):
         return partial(_of_model, dynamics, dynamics.prepare())
     return dynamics.equations_at if isinstance(dynamics, OwnEquations) else partial(_of_any, dynamics)
@@ -71,7 +76,7 @@ def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
         """Return the force M qdd, (W, n) [Nm, N]."""
-        # `RigidDynamics` has no method for the force of the inputs, so M qdd is computed from the acceleration.
+        # `RigidDynamics` has no method that returns M qdd, so the acceleration qdd is multiplied by M.
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
 
@@ -88,8 +93,13 @@ def runge_kutta(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return q, p and z after one step of the classical Runge-Kutta method, and q' at the start of the step.
 
-    Hairer et al., Solving ODEs I, II.1. rhs: function of (q, p, z) that returns q' and p'. p: momenta or velocities,
-    (..., n). z: friction state, (..., n, K); its update is exact for a given displacement. step: duration [s].
+    Hairer et al., Solving ODEs I, II.1.
+
+    Args:
+        rhs: function of (q, p, z) that returns q' and p'.
+        p: momenta or velocities, (..., n).
+        z: friction state, (..., n, K); it is not integrated, but computed from the displacement of the joints.
+        step: duration [s].
     """
 
     qd1 = qd = pd = torch.zeros_like(p)
@@ -97,8 +107,7 @@ def runge_kutta(
     # For each stage, its time as a fraction of the step, and its weight in the mean.
     for fraction, weight in ((0.0, 1), (0.5, 2), (0.5, 2), (1.0, 1)):
         stage = fraction * step
-        # The friction state of a stage is z, the state at the start of the step, after the displacement from the
-        # start of the step to the stage.
+        # z is the friction state at the start of the step; `memory_after` adds the displacement since then.
         qd, pd = rhs(q + stage * qd, p + stage * pd, memory_after(dynamics, z, stage * qd))
         if fraction == 0:
             qd1 = qd
@@ -108,16 +117,19 @@ def runge_kutta(
 
 
 def unbounded(mass: Tensor) -> Tensor:
-    """Return ones, (...), for mass matrices M, (..., n, n).
+    """Return the factor t = 1, (...), for mass matrices M, (..., n, n): an indefinite M is not corrected.
 
-    The function replaces ``DerivedMass.fraction``, so that an indefinite M is not corrected.
+    The function replaces ``DerivedMass.fraction``, which returns t < 1 for an indefinite M.
     """
     return mass.new_ones(mass.shape[:-2])
 
 
 @contextmanager
 def mass_as_learned(model: nn.Module) -> Iterator[None]:
-    """Disable the correction of an indefinite mass matrix of a network; other models are unchanged."""
+    """Context manager that switches off the correction of an indefinite M by ``DerivedMass``.
+
+    Models with other mass matrices are unchanged.
+    """
     mass = model.mass if isinstance(model, NetworkDynamics) else None
     if not isinstance(mass, DerivedMass):
         yield

@@ -25,9 +25,12 @@ class DampedJoint(Protocol):
 class DriveFriction:
     """Friction of n drives; arrays are (n,), in Nm and rad/s, or N and m/s for prismatic joints.
 
-    forward: Coulomb torque for velocities > 0, not negative. backward: Coulomb torque for velocities < 0, not positive.
-    smoothing_velocity: width of the tanh that replaces the sign of the velocity. speeds: matrix C, (n, n): the
-    velocities of the drives are C qd (see `motor_speeds`); None: each drive moves its own joint.
+    Attributes:
+        forward: Coulomb torque for velocities > 0, not negative.
+        backward: Coulomb torque for velocities < 0, not positive.
+        smoothing_velocity: width of the tanh that replaces the sign of the velocity.
+        speeds: matrix C, (n, n): the velocities of the drives are C qd (see `motor_speeds`); None: each drive moves its
+            own joint.
     """
 
     viscous: np.ndarray
@@ -52,11 +55,11 @@ class DriveFriction:
     def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the joint friction torque (..., n) [Nm, N] at joint velocities qd (..., n).
 
-        direction: direction of dry friction per drive, (..., n) in [-1, 1]: tanh(v / smoothing_velocity), or a function
-        of the friction state.
+        direction: factor of the dry friction of each drive, from -1 to 1, (..., n): tanh(v / smoothing_velocity) with
+        the velocity v of the drive, or a function of the friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
-        # s (f - b) / 2 + s^2 (f + b) / 2 is f at s = 1, b at s = -1, and has no jump between them.
+        # With the direction s, forward f and backward b: s (f - b)/2 + s^2 (f + b)/2 is f at s = 1 and b at s = -1.
         odd, even = self.forward - self.backward, self.forward + self.backward
         torque: np.ndarray = self.viscous * v + 0.5 * direction * (odd + direction * even)
         return torque if self.speeds is None else torque @ self.speeds
@@ -68,9 +71,12 @@ def joint_friction(
     smoothing_velocity: float,
     speeds: np.ndarray | None,
 ) -> DriveFriction:
-    """Return the friction of joints, from the settings of their drives or else from <dynamics> of the URDF.
+    """Return the friction of joints: from ``drives`` for joints in it, from <dynamics> of the URDF for the others.
 
-    joints: joints of a URDF, or coordinates of an arm. speeds: matrix C, (n, n), see ``DriveFriction``.
+    Args:
+        joints: joints of a URDF, or coordinates of an arm.
+        drives: {name of a joint: settings of its drive}.
+        smoothing_velocity, speeds: see ``DriveFriction``.
     """
     # Settings replace the whole <dynamics> element: both describe the same losses, so adding them would count
     # the losses twice.
@@ -93,12 +99,16 @@ BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolu
 
 @dataclass(frozen=True)
 class FrictionModel:
-    """Columns of the regressor for armature, viscous and Coulomb friction, torque offset, and optional effects.
+    """Friction of drives that is linear in its coefficients: columns of the regressor.
 
-    coulomb_smoothing_velocity: width of the tanh that replaces the sign of the velocity [rad/s, m/s]. stribeck: adds
-    dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991). polynomial: adds qd |qd| and qd^3. memory: dry
-    friction is a function of the deflection of bristles (see ``runtime.friction_laws``), with one column per bristle,
-    instead of the tanh.
+    The effects are armature, viscous and Coulomb friction, and torque offset; the following are optional.
+
+    Attributes:
+        stribeck: dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991).
+        polynomial: qd |qd| and qd^3.
+        memory: if True, Coulomb friction depends on the deflections of bristles (see ``runtime.friction_laws``), with a
+            column per bristle; if False, on a tanh of the velocity, with the width coulomb_smoothing_velocity [rad/s,
+            m/s].
     """
 
     coulomb_smoothing_velocity: float = 0.01

@@ -31,14 +31,13 @@ class ParameterInfo:
 
 
 NETWORK = ParameterInfo("network", "1")
-"""Weights and biases, which no part declares."""
+"""Group and unit of the weights and biases of networks, which no module declares."""
 
 
 def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
-    """Return the group and unit of each parameter of a model, by name, and of each buffer that a fit may set.
+    """Return {name of a parameter of a model: its group and unit}, including buffers that a fit may set.
 
-    Modules of the model declare such buffers for quantities that only some logs determine, for example the friction
-    compensation of a drive.
+    Such buffers are quantities that only some logs determine, for example the friction compensation of a drive.
     """
     table = {name: NETWORK for name, _ in model.named_parameters()}
     for path, module in model.named_modules():
@@ -65,15 +64,16 @@ def parameters_of_kind(model: nn.Module, *kinds: str) -> tuple[str, ...]:
 Model = TypeVar("Model", bound=nn.Module)
 Result = TypeVar("Result")
 NamedTensors = Mapping[str, Tensor]
-"""Tensors by the names of a model's parameters and buffers."""
+"""{name of a parameter or buffer of a model: tensor}."""
 
 
 def idle_residuals(model: object) -> list[str]:
-    """Return the names of the parameters of the residual terms that are zero."""
+    """Return the names of all parameters that belong to residual terms whose value is zero for all q."""
     terms = residual_terms(model)
     if terms is None:
         return []
-    # Only parameters of single joints are tested for zeros here, since hidden layers of networks are never zero.
+    # Terms of single joints are zero if their parameters are zero. Networks have nonzero hidden layers, and `_is_idle`
+    # tests their last layer.
     idle = [name for name, weights in terms.named_parameters(recurse=False) if not weights.any()]
     for prefix, network in (("mass", terms.mass), ("potential", terms.potential)):
         if _is_idle(network):
@@ -82,7 +82,7 @@ def idle_residuals(model: object) -> list[str]:
 
 
 def used_parameter_count(model: nn.Module) -> int:
-    """Return the number of parameters of a model, without residual terms that are zero."""
+    """Return the number of parameters of a model, without the parameters in `idle_residuals`."""
     idle = idle_residuals(model)
     return sum(weights.numel() for name, weights in model.named_parameters() if name not in idle)
 
@@ -96,7 +96,10 @@ def without_residuals(model: Model) -> Model:
 
 
 def without_idle_residuals(model: Model) -> Model:
-    """Return a copy of the model without residual terms that are zero; the copy must not be trained."""
+    """Return a copy of the model without residual terms that are zero, which takes less time to evaluate.
+
+    The copy must not be trained, since the removed terms could become nonzero in a training.
+    """
     # Copy the model, since the caller may train it further.
     reduced = copy.deepcopy(model)
     if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:

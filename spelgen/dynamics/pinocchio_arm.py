@@ -1,4 +1,4 @@
-"""Rigid-body dynamics of an arm by Pinocchio, with the rotor inertia of its settings."""
+"""Rigid-body dynamics of an arm by Pinocchio, with the rotor inertia from the settings file of the URDF."""
 
 from collections.abc import Callable
 from functools import partial
@@ -46,12 +46,15 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
 
 
 def kinematic_model(arm: Chain) -> pin.Model:
-    """Return a model without inertia: for each body of the arm, in order, a joint about or along z."""
+    """Return a Pinocchio model with one joint per body of the arm, in the same order, and zero inertia.
+
+    A joint rotates about or translates along the z axis of its frame.
+    """
     model = pin.Model()
     model.name = arm.name
     model.gravity.linear = np.array(arm.gravity, dtype=float)
     for body in arm.bodies:
-        # The z axis of a body's frame is the axis of its joint, so that two types of joints are enough.
+        # The axis of each joint is the z axis of the body's frame: two joint types of Pinocchio are enough.
         joint = pin.JointModelPZ() if body.joint_type == "prismatic" else pin.JointModelRZ()
         placement = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
         model.addJoint(body.parent + 1, joint, placement, body.name)

@@ -25,18 +25,18 @@ from spelgen.urdf.read import read_urdf
 
 
 def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
-    """Decorate a method of arrays: arguments (..., n) may also be tensors, and their batch dimensions are broadcast."""
+    """Return a method of NumPy arrays (..., n) that also accepts tensors and broadcasts batch dimensions."""
 
     @wraps(method)
     def on_arrays(self: PinocchioDynamics, *states: Any) -> object:
         first = states[0]
-        # Integrators pass single states, for which broadcasting would take longer than the dynamics: skip it.
+        # Broadcasting is skipped for single states, which integrators pass: it would take longer than the dynamics.
         if isinstance(first, np.ndarray) and first.ndim == 1:
             return method(self, *states)
         result = method(self, *np.broadcast_arrays(*map(np.asarray, states)))
         if isinstance(first, np.ndarray):
             return result
-        # A method of the argument makes the tensor, since this file must be importable without torch.
+        # `new_tensor` of the argument is used, because this file must be importable without torch.
         return first.new_tensor(result)
 
     return on_arrays
@@ -45,9 +45,11 @@ def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
 class PinocchioDynamics:
     """Dynamics of an arm of n coordinates (see ``RigidDynamics``).
 
-    model: Pinocchio model of b joints, with the rotor inertia as armature. constraint: mimic joints; joints of the
-    model that it does not name are locked. friction: function of the velocity (..., n) that returns the torque (...,
-    n); None: no friction. inputs: input matrix G, (n, n); None: each input is the torque of its joint.
+    Args:
+        model: Pinocchio model of b joints, with the rotor inertia as armature.
+        constraint: mimic joints; joints of the model that it does not name are locked.
+        friction: function of the velocity (..., n) that returns the torque (..., n); None: no friction.
+        inputs: input matrix G, (n, n); None: each input is the torque of its joint.
     """
 
     def __init__(
@@ -107,11 +109,14 @@ class PinocchioDynamics:
 
     @_takes_tensors
     def inverse_dynamics(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """Return the inputs, (..., n), for the accelerations qdd; at a passive joint, the torque required there."""
+        """Return the inputs tau, (..., n), for the accelerations qdd.
+
+        A passive joint has no input: its element is the torque that a motor at the joint would need.
+        """
         speeds, rates = qd @ self.jacobian.T, qdd @ self.jacobian.T
         torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
         torque = torque + self.friction(qd)
-        # The row of a passive joint in G is zero, which makes G singular: use the row of the identity.
+        # The row of a passive joint in G is zero, which makes G singular. It is replaced by the row of the identity.
         passive = np.diag(~self.inputs.any(axis=1))
         return np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
 
@@ -121,7 +126,7 @@ class PinocchioDynamics:
             q = q @ self.jacobian.T + self.offset
         if self.model.nq == self.model.nv:
             return q
-        # No coordinate moves planar and floating joints: they remain at the neutral configuration.
+        # Planar and floating joints are not coordinates: they remain at Pinocchio's neutral configuration.
         configuration = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
         for joint in self.model.joints[1:]:
             position = q[..., joint.idx_v]
@@ -131,7 +136,10 @@ class PinocchioDynamics:
         return configuration
 
     def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
-        """Call an algorithm of Pinocchio for each state of a batch (..., nq), (..., nv), ...; return a batch."""
+        """Return the results of an algorithm of Pinocchio for each state of a batch.
+
+        states: arguments of the algorithm, (..., nq) or (..., nv).
+        """
         batch = states[0].shape[:-1]
         if not batch:
             return algorithm(self.model, self.data, *states)

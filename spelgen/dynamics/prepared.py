@@ -29,9 +29,13 @@ class State(NamedTuple):
 class PreparedModel:
     """A copy of a model with constant parameters.
 
-    Arguments q, qd, qdd and tau of the methods are (..., n), in rad and Nm, or m and N. The friction state z is
-    (..., n, K); its default is the steady state of motion at the velocity qd. tip: kinematics of the tip, see
-    ``tip_kinematics``. elements: number of bristles per joint, K. dtype: type of the parameters and states.
+    Arguments q, qd, qdd and tau of the methods are (..., n), in rad and Nm, or m and N. The friction state z is (...,
+    n, K); its default is the steady state of motion at the velocity qd.
+
+    Attributes:
+        tip: kinematics of the tip, see ``tip_kinematics``.
+        elements: number of bristles per joint, K.
+        dtype: type of the parameters and states.
     """
 
     def __init__(
@@ -92,8 +96,8 @@ class PreparedModel:
     ) -> State:
         """Return q, qd and z after dt [s] under a constant input tau.
 
-        The result is of ``substeps`` steps of the classical Runge-Kutta method. q, qd, tau: (..., n). z: friction
-        state, (..., n, K), by default ``memory(qd)``; its update is exact for a given displacement.
+        Integration by ``substeps`` steps of the classical Runge-Kutta method. q, qd, tau: (..., n). z: friction state,
+        (..., n, K), by default ``memory(qd)``; it is not integrated, but computed from the displacement of the joints.
         """
         z = self.memory(qd) if z is None else z
 
@@ -109,7 +113,10 @@ class PreparedModel:
     def rollout(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
     ) -> State:
-        """Return q and qd, (steps + 1, ..., n), and the last z; each tau of (steps, ..., n) is constant for dt [s]."""
+        """Return q and qd, (steps + 1, ..., n), and z, (steps + 1, ..., n, K), from the initial state on.
+
+        tau: inputs, (steps, ..., n), each constant for dt [s]. substeps: Runge-Kutta steps for each input.
+        """
         states = [State(q, qd, self.memory(qd) if z is None else z)]
         for held_tau in tau:
             q, qd, z = states[-1]
@@ -133,7 +140,7 @@ class PreparedModel:
         """
         n = self.n
         z = self.memory(qd) if z is None else z
-        # torch.func cannot differentiate compiled functions, so the copy has the method that is not compiled.
+        # torch.func cannot differentiate compiled functions: in this copy, forward dynamics is not compiled.
         plain = copy.copy(self)
         vars(plain).pop("forward_dynamics", None)
 
@@ -168,7 +175,7 @@ class PreparedModel:
         return result
 
     def _at(self, q: Tensor, *others: Tensor) -> object:
-        """Return the model's configuration cache, the quantities that depend on q only, at q (..., n).
+        """Return the model's configuration cache at q, (..., n): the quantities that depend on q only.
 
         others: further vectors (..., n), whose dtypes and shapes are checked.
         """
@@ -181,7 +188,12 @@ class PreparedModel:
 
 
 def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: Tensor) -> tuple[Tensor, ...]:
-    """Return the Jacobians, (batch, m, n), of a function with respect to each of its first ``variables`` inputs."""
+    """Return the Jacobians, (batch, m, n), of a function with respect to each of its first ``variables`` inputs.
+
+    Args:
+        function: function of the states without batch dimension, (n,) each, with the result (m,).
+        states: (batch, n) each.
+    """
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
     # In torch 2.13, vmap of a derivative of linalg.solve is wrong in forward mode, and if autograd is disabled:

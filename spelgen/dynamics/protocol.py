@@ -40,7 +40,10 @@ class RigidDynamics(Protocol):
         """Return the accelerations qdd, (..., n), under the inputs tau."""
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Return the inputs, (..., n), for the accelerations qdd; at a passive joint, the torque required there."""
+        """Return the inputs tau, (..., n), for the accelerations qdd.
+
+        A passive joint has no input: its element is the torque that a motor at the joint would need.
+        """
 
 
 @runtime_checkable
@@ -64,8 +67,8 @@ def residual_terms(model: object) -> ResidualTerms | None:
 
 
 def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
-    """Return True if friction depends on the state z of bristles, which is then the last argument of all methods."""
-    if isinstance(dynamics, RigidBodyDynamics):  # ten times as fast as the check of a protocol
+    """Return True if friction depends on the deflections z of bristles (friction state)."""
+    if isinstance(dynamics, RigidBodyDynamics):  # isinstance of a protocol takes ten times as long
         return dynamics.elements > 0
     return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 
@@ -106,11 +109,12 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the friction state z and the direction, which are the last arguments of the methods of `dynamics`.
+    """Return (z, direction), (z,) or (): the arguments that describe past motion to the methods of `dynamics`.
 
-    Arguments that `dynamics` does not have are omitted. z: (..., n, K) [rad, m] for K bristles. direction: direction in
-    [-1, 1] of dry friction without bristles, (..., n); it is required if tau was filtered, and must have passed the
-    same filter.
+    Args:
+        z: friction state, (..., n, K) [rad, m]; omitted if friction has no state.
+        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles. It is
+            needed only if tau was filtered: it must have passed the same filter.
     """
     if z is None or not z.shape[-1] or not is_stateful(dynamics):
         return ()
@@ -120,11 +124,11 @@ def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = No
 
 
 class VelocityState:
-    """Adapter with which rollouts integrate dynamics that have no momenta: the state is (q, qd) in place of (q, p)."""
+    """Adapter for rollouts of dynamics that provide no momenta p: the methods of p use qd in its place."""
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        # Rollouts call the methods of the friction state on this object: it has the methods of `dynamics`.
+        # Rollouts also call the methods of the friction state on the adapter: they are copied from `dynamics`.
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements

@@ -48,10 +48,14 @@ def _row(values: tuple[object, ...]) -> Row:
 class RegressorDynamics:
     """Dynamics of an arm of n coordinates and B bodies with given inertial parameters (see ``RigidDynamics``).
 
-    parameters: inertial parameters, (10 B,), in the order of ``regressor``. armature: armature of the drives, (n,)
-    [kg m^2, kg]. friction: function of velocities (T, n), and of the friction state z (T, n, K) or None, that returns
-    torques (T, n) [Nm, N]. bristle_reach: break-away displacements, (n, K) [rad, m]; None: friction has no state.
-    drives: matrices G of the inputs and C of the motors (see ``Drives``); None: each input is the torque of its joint.
+    Args:
+        parameters: inertial parameters, (10 B,), in the order of ``regressor``.
+        armature: armature of the drives, (n,) [kg m^2, kg].
+        friction: function of velocities (T, n), and of the friction state z (T, n, K) or None, that returns torques (T,
+            n) [Nm, N].
+        bristle_reach: break-away displacements, (n, K) [rad, m]; None: friction has no state.
+        drives: matrices G of the inputs and C of the motors (see ``Drives``); None: each input is the torque of its
+            joint.
     """
 
     def __init__(
@@ -63,8 +67,8 @@ class RegressorDynamics:
         drives: Drives | None = None,
         bristle_reach: np.ndarray | None = None,
     ) -> None:
-        # Least-squares parameters may be physically inconsistent. The Cholesky factors that trained models use may
-        # then not exist.
+        # This class uses pseudo-inertias in place of the Cholesky factors of trained models: least-squares parameters
+        # may be physically inconsistent, and have no Cholesky factors then.
         self.chain, self.friction = body_chain(arm), friction
         by_body = torch.from_numpy(parameters).double().reshape(-1, 10)
         self.inertia = torch.block_diag(*pseudo_inertia(by_body))
@@ -99,13 +103,13 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the configuration cache of the B bodies at q, and their momenta per joint velocity, (..., n, 12 B).
+        """Return the configuration cache of the B bodies at q, and the derivatives of their momenta with respect to qd.
 
-        The momentum of a body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and
-        its pseudo-inertia J.
+        The derivatives are (..., n, 12 B). The momentum of a body is T' J, 3 x 4 elements, with the time derivative T'
+        of its homogeneous transform and its pseudo-inertia J.
         """
         # The kinetic energy of a body, 1/2 tr(T' J T'^T), is linear in J, so that J may be physically inconsistent.
-        # `forward` transforms points: with the columns of the identity as points, the result is T.
+        # `forward` returns T times four given points; the columns of the identity as points give T itself.
         chain = self.chain.forward(q, torch.eye(len(self.inertia)).to(q))
         jacobian = torch.unflatten(self.chain.ratios.mT @ chain.jacobian, -1, (3, -1))
         return chain, (jacobian @ self.inertia).flatten(-2)
@@ -118,16 +122,18 @@ class RegressorDynamics:
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the accelerations qdd, (..., n), under the inputs tau (..., n)."""
         equations = self.equations_at(q)
-        # With a last dimension of 1, M and tau may have different batch dimensions.
+        # `solve` broadcasts the batch dimensions of M and tau only if the force is a matrix with one column.
         force = equations.force(qd, tau, z).unsqueeze(-1)
         qdd: Tensor = torch.linalg.solve(equations.mass, force)
         return qdd.squeeze(-1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the inputs, (..., n), for the accelerations qdd; at a passive joint, the torque required there."""
+        """Return the inputs tau, (..., n), for the accelerations qdd.
+
+        A passive joint has no input: its element is the torque that a motor at the joint would need.
+        """
         passive = (self.inputs == 0).all(dim=1).double()
-        # The row of a passive joint in G is zero. A one on its diagonal makes G invertible; the result for this
-        # joint is then the torque required there.
+        # The row of a passive joint in G is zero, which makes G singular. It is replaced by the row of the identity.
         inverse: Tensor = torch.linalg.inv(self.inputs + torch.diag(passive))
         return self.joint_torque(q, qd, qdd, z) @ inverse.mT
 

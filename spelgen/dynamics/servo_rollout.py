@@ -1,11 +1,11 @@
 """Rollouts of arms with position servos under their commands.
 
-The springs of the servos and dry friction are stiff, so both are integrated implicitly. Springs are linearised at the
-start of a step (Rosenbrock; Hairer and Wanner, Solving ODEs II, IV.7, with the weights of the theta method). A few
-steps between samples are then stable for any gain. Theta is computed for each step such that decaying motion has its
-true rate of decay to third order (exponential fitting: Liniger and Willoughby, SIAM J. Numerical Analysis 7:47, 1970).
-Theta is 1/2 for slow motion, without numerical damping, and tends to 1 for motion that is too fast for a step. The
-update of the friction state is exact for a given displacement.
+The springs of the servos and dry friction are stiff. Both are integrated implicitly, so that a few steps between
+samples are stable for any gain. Springs are linearised at the start of a step (Rosenbrock method with the weights of
+the theta method; Hairer and Wanner, Solving ODEs II, IV.7). Theta is computed for each step: decaying motion then has
+its true rate of decay to third order (exponential fitting; Liniger and Willoughby, SIAM J. Numerical Analysis 7:47,
+1970). Theta is 1/2 for slow motion, without numerical damping, and tends to 1 for motion that is too fast for the step.
+The friction state is not integrated, but computed from the displacement in the step.
 """
 
 from typing import NamedTuple
@@ -23,14 +23,14 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class ServoDrives(NamedTuple):
     """Constants of the servos and of friction, (..., n).
 
-    Constants of the K bristles are (K, ..., n): this layout takes two thirds of the time of (..., n, K).
+    Constants of the K bristles are (K, ..., n): a rollout takes two thirds of the time that it takes with (..., n, K).
     """
 
     servo: ServoConstants
     friction: FrictionConstants
     offset: Tensor  # torque offset [Nm, N]
     reach: Tensor  # break-away displacements, (K, ..., n) [rad, m]
-    # Derivative of the direction of dry friction, from -1 to 1, with respect to the deflection of each bristle.
+    # Bristle fraction / break-away displacement. Times dry friction, it is the stiffness of a bristle.
     steepness: Tensor  # (K, ..., n) [1/rad, 1/m]
 
 
@@ -43,10 +43,13 @@ class ServoState(NamedTuple):
 
 
 class Load(NamedTuple):
-    """Load of the drives in a step.
+    """Inertia and torques of the rigid bodies that a step uses.
 
-    inertia: mass matrix M, (..., n, n), or the diagonal of M, (..., n), if not ``coupled``. bias: Coriolis, centrifugal
-    and gravity torque, (..., n). gravity: gravity torque, (..., n).
+    Attributes:
+        inertia: mass matrix M, (..., n, n), if ``coupled``; otherwise only its diagonal, (..., n), so that joints are
+            independent.
+        bias: Coriolis, centrifugal and gravity torque, (..., n).
+        gravity: gravity torque, (..., n).
     """
 
     inertia: Tensor
@@ -56,12 +59,12 @@ class Load(NamedTuple):
 
 
 def servo_drives(model: PortHamiltonian) -> ServoDrives:
-    """Return the constants of a model with servos."""
+    """Return the constants of servos and friction of a model with servos."""
     assert isinstance(model, RigidBodyDynamics) and model.servo is not None
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
-    # Batch dimensions of the constants. Constants without batch dimensions get one of length 1.
+    # Batch dimensions of the constants, at least one.
     batch = steepness.shape[1:-1] or (1,)
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
@@ -69,10 +72,10 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return the state at q and qd in which the bristles balance all other torques, as at rest or in steady motion.
+    """Return q, qd and the friction state with which the arm has no acceleration, as at rest or in steady motion.
 
-    Dry friction is at its limit if it cannot balance the other torques. q, u: positions and commands, (..., n)
-    [rad, m]. qd: velocities, (..., n) [rad/s, m/s].
+    Dry friction balances all other torques, up to its largest magnitude. q, u: positions and commands, (..., n) [rad,
+    m]. qd: velocities, (..., n) [rad/s, m/s].
     """
     servo = drives.servo
     torque = servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd
@@ -98,8 +101,8 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     stiffness = (strength * (qd.sign() * z < drives.reach)).sum(dim=0)
     decay = h * (damping + h * (servo_stiffness / 2 + stiffness)) / inertia
     theta = (3 + decay) / (6 + decay)
-    # Springs are evaluated at the fraction theta of the step. Bristles, which are the stiffest, are evaluated at
-    # the end of the step.
+    # The springs of the servos are evaluated after the fraction theta of the step; the bristles, which are stiffer, at
+    # its end.
     impulse, bristle_stiffness = theta * h * force, theta * h * h * strength
     damping = theta * h * (damping + h * theta * servo_stiffness)
     # The unknown is the mean velocity of the step, so displacements are divided by h.
@@ -122,16 +125,20 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
 
 
 def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Tensor) -> Tensor:
-    """Return the displacement x, (..., n), that solves slope x + sum_k strength_k (z_k(x) - z_k) = push, (..., n).
+    """Return the displacement x, (..., n), that solves slope x + sum_k strength_k (z_k(x) - z_k) = push.
 
-    push: force on the joint. slope: stiffness without bristles, (..., n). strength: stiffness of each bristle. z,
-    reach: deflections and break-away displacements. strength, z and reach are (K, ..., n), the shortest break-away
-    displacement first. Bristles that are deflected in the same direction begin to slide in this order. With k sliding
-    bristles the equation is linear in x; the solution is the largest of the solutions of these K + 1 linear equations.
+    z_k(x) is the deflection of bristle k after the displacement x. If k bristles slide, the equation is linear in x: of
+    these K + 1 linear equations, the one with the largest |x| is valid.
+
+    Args:
+        push: force on the joint, (..., n).
+        slope: stiffness without bristles, (..., n).
+        strength, z, reach: stiffness, initial deflection and break-away displacement of each bristle, (K, ..., n), the
+            shortest break-away displacement first: bristles begin to slide in this order.
     """
     direction, stiffness = push.sign(), slope + strength.sum(dim=0)
-    # For each number k = 0 .. K of sliding bristles, cumulative sums give the force that remains for all elements that
-    # do not slide, and the stiffness of these elements.
+    # Cumulative sums over k = 0 .. K sliding bristles: push minus the force of these bristles, and the stiffness of the
+    # spring and the bristles that do not slide.
     remaining = torch.cat([push.abs().unsqueeze(0), -strength * (reach - direction * z)]).cumsum(dim=0)
     resisting = torch.cat([stiffness.unsqueeze(0), -strength]).cumsum(dim=0)
     return direction * (remaining / resisting).amax(dim=0)
@@ -140,16 +147,19 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
 def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:
     """Integrate W windows under their commands; return the positions (W, I, n) [rad, m] after each of I intervals.
 
-    q, qd: initial positions and velocities, (W, n). commands: delayed commands, (W, I, S, n), with S steps per
-    interval. dt: durations of the intervals, (W, I) [s]. M and the gravity torque are evaluated once per interval.
+    M and the gravity torque are evaluated once per interval.
+
+    Args:
+        q, qd: initial positions and velocities, (W, n).
+        commands: delayed commands, (W, I, S, n), with S steps per interval.
+        dt: durations of the intervals, (W, I) [s].
     """
     with torch.no_grad():
         drives, prepared, positions = servo_drives(model), model.prepare(), []
         state, previous_bias = None, None
         for now, interval in zip(commands.unbind(1), dt.unbind(1), strict=True):
             pose = model.configuration(q, prepared)
-            # Between samples, M and gravity change slowly, in contrast to springs and friction, so they are evaluated
-            # once per interval.
+            # M and gravity change slowly, unlike springs and friction: they are evaluated once per interval.
             bias = middle_bias = model.nonlinear_effects(pose, qd)
             # The bias is known only up to the start of the interval: extrapolate it to the middle.
             if previous_bias is not None:

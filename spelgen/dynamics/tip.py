@@ -27,16 +27,16 @@ class TipKinematics:
     def __init__(self, robot: Robot, joints: Sequence[str], link: str) -> None:
         self.link = link
         path = robot.path_to(link)
-        # A chain of pytorch-kinematics has one dtype, and results have the dtype of q: prepare a chain for each dtype.
+        # A chain of pytorch-kinematics has a fixed dtype. There is one per dtype, so that results have the dtype of q.
         self._chains = {
             dtype: _serial_chain(robot.root, path, dtype) for dtype in (torch.float64, torch.float32)
         }
         constraint = mimic_constraint(robot, joints)
         rows = [constraint.names.index(joint.name) for joint in path if joint.moves]
-        # Derivative of the moving joints on the path to the link with respect to the coordinates, (joints, n).
+        # The positions of the moving joints on the path to the link are _jacobian q + _offset; (joints, n), (joints,).
         self._jacobian = torch.from_numpy(constraint.jacobian[rows])
         self._offset = torch.from_numpy(constraint.offset[rows])
-        # A joint that does not move the link is probably a mistake of the caller: raise instead of a zero column.
+        # A joint that does not move the link is an error: it is probably a mistake of the caller.
         missing = [name for name, column in zip(joints, self._jacobian.T, strict=True) if not column.any()]
         if missing:
             raise ValueError(f"the joints {', '.join(missing)} do not lead to {link}")
@@ -90,9 +90,9 @@ def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> S
 def tip_kinematics(
     arm: Any, link: str | None = None, *, joints: Sequence[str] | None = None
 ) -> TipKinematics:
-    """Return the kinematics of ``link``.
+    """Return the kinematics of ``link``, by default the tip of the arm.
 
-    The default link is the tip of the arm, or else the result of `last_link`.
+    If no tip was specified, the default is the result of `last_link`.
 
     arm: result of ``load_arm``, or the path of a URDF together with the names of its ``joints``. Raises ValueError if
     the link is not moved by these joints.
@@ -108,9 +108,10 @@ def tip_kinematics(
 
 
 def last_link(robot: Robot, joints: Sequence[str]) -> str:
-    """Return the child link of the last of the given joints, or the end of a chain of links fixed to this link.
+    """Return the last link behind the given joints, for example a flange.
 
-    The chain ends at a link with no fixed joint, or with several fixed joints, to its children.
+    The search starts at the child link of the last joint. It follows fixed joints from parent to child, and ends at a
+    link with no fixed joint, or with several.
     """
     link = robot.joint[joints[-1]].child
     while True:

@@ -14,9 +14,11 @@ from spelgen.dynamics.tip import last_link
 class Tip:
     """The frame of the tip link.
 
-    carrier: index of the body that carries the link; -1: the root link. pose: pose of the link in the frame of this
-    body, (4, 4). bodies: bodies of the arm with the unrounded angles of the URDF, so that poses are equal to the ones
-    of other URDF parsers.
+    Attributes:
+        carrier: index of the body that carries the link; -1: the root link.
+        pose: pose of the link in the frame of this body, (4, 4).
+        bodies: bodies of the arm with the unrounded angles of the URDF, so that poses are equal to the results of other
+            URDF parsers.
     """
 
     link: str
@@ -35,9 +37,10 @@ def tip_frame(loaded: Arm) -> Tip:
 
 
 def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
-    """Return, by the name of each link, the body that carries the link and the pose of the link, (4, 4), in its frame.
+    """Return {name of a link: (body, pose)}: the body that carries the link, and the pose of the link, (4, 4).
 
-    The body is an index in `Chain.bodies`, or -1 for the root link. Angles of the URDF are not rounded.
+    The body is an index in `Chain.bodies`, or -1 for the root link. The pose is in the frame of this body. Angles of
+    the URDF are not rounded.
     """
     chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
     poses: dict[str, tuple[int, np.ndarray]] = {}

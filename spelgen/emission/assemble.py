@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class ArmModel(PortHamiltonian):
-    """Base class of the models of arms; a model is also an instance of a dynamics class of ``spelgen.runtime``."""
+    """Base class of the models of arms. Each model also has a base class with its dynamics from ``spelgen.runtime``."""
 
     spec: ModelSpec
 
@@ -60,7 +60,7 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
     # same operations in the same order, so that rounding errors are equal.
     names["mass_entries"] = partial(_mass_entries, entry_sums(spec))
     try:
-        # The rows are evaluated first, because calls refer to them by name.
+        # The tables are evaluated first, because the arguments of the model refer to them by name.
         for name, rows in assembly.rows.items():
             names[name] = tuple(_value(row, names) for row in rows)
         arguments = {str(name): _value(item, names) for name, item in assembly.model.arguments}
@@ -92,7 +92,9 @@ def spec_of(model: object) -> ModelSpec | None:
 
 
 def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
-    """Return M, (..., n, n), as linear combinations of terms, (...,); equal to ``mass_entries`` of a module.
+    """Return M, (..., n, n), whose entries are linear combinations of terms, (...,).
+
+    The result is equal to the result of ``mass_entries`` in a module.
 
     rows: a list of linear combinations for each row of the lower triangle of M. terms: values of the functions of q,
     then the constants.
@@ -116,7 +118,7 @@ def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
 @cache
 def _model_class(base: str) -> Callable[..., ArmModel]:
     """Return a class ``Model`` that derives from ``ArmModel`` and from ``base``, a class of ``spelgen.runtime``."""
-    # With the cache, models that derive from the same class of the runtime have the same type.
+    # The function is cached, so that all models with the same base class have the same type.
     return cast("Callable[..., ArmModel]", type("Model", (ArmModel, vars(runtime)[base]), {}))
 
 

@@ -24,8 +24,8 @@ def build(
         arm: the result of ``load_arm``, or the path of a URDF.
         preset: name of a preset, path of a YAML file with a design, or a ``Design``.
         width, depth: number of units of each hidden layer of networks, and number of hidden layers.
-        assume: ``kinematics``: the structure is valid for any inertial parameters; ``inertials``: only
-            for the URDF's.
+        assume: ``kinematics``: the structure is valid for any inertial parameters; ``inertials``: it is valid only for
+            the inertial parameters of the URDF.
         seed: seed of the random initial weights of networks.
 
     Raises the errors of ``load_arm``, and SettingsError for an inconsistent design.

@@ -19,12 +19,14 @@ FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code(
 class ModelParts:
     """The tables of an arm, and the constructor call that makes the model from the tables.
 
-    rows: the tables ``JOINTS``, ``LINKS``, ``FUNCTIONS`` and ``CONSTANTS``; a table is a tuple of rows, which are calls
-    of ``Joint``, ``Link``, ``Function`` or ``Constant``. model: the constructor call.
+    Attributes:
+        rows: {name of a table: rows}. The tables are ``JOINTS``, ``LINKS``, ``FUNCTIONS`` and ``CONSTANTS``; a row is a
+            call of ``Joint``, ``Link``, ``Function`` or ``Constant``.
+        model: the constructor call of the model.
 
-    All calls are calls of classes of ``spelgen.runtime``. An argument is a number, a text, a tuple, a call or a name.
-    Names refer to the tables, to the function ``mass_entries``, and to ``generator``, the random generator of initial
-    weights, which is used in the order of the calls.
+    An argument of a call is a number, a text, a tuple, a call or a name. A name refers to a table, to the function
+    ``mass_entries``, or to ``generator``, the random generator of the initial weights. The calls must be evaluated in
+    their order, which determines the initial weights.
     """
 
     rows: dict[str, tuple[Call, ...]]
@@ -37,7 +39,7 @@ def model_parts(spec: ModelSpec) -> ModelParts:
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
     if spec.outputs and spec.links and spec.design.net != "none":
-        # The functions of a residual of M are zero initially, so their rows have neither mean nor scale.
+        # Residual terms of M have bounds in place of mean and scale, so these rows have only the joints.
         rows["FUNCTIONS"] = tuple(call("Function", _joint_names(spec, x.joints)) for x in spec.outputs)
     elif spec.design.mass == "derived":
         functions = [
@@ -55,7 +57,7 @@ def _inputs(spec: ModelSpec) -> Call:
     n = range(len(spec.joints))
     values = {(x.joint, x.motor): x.value for x in spec.inputs}
     matrix = tuple(tuple(values.get((joint, motor), 0.0) for motor in n) for joint in n)
-    # Gains that are trained are marked by a mask; known gear ratios are constants.
+    # `mask` is True for gains that are trained; known gear ratios are constants.
     trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
     mask = tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
     return call("MotorInputs", matrix, **_unless({"trained": mask}, trained=not trained))
@@ -69,9 +71,9 @@ def base_class(spec: ModelSpec) -> str:
 
 
 def _unless(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
-    """Return the keyword arguments without the arguments at their default, so that the rows of a module are short.
+    """Return the keyword arguments that do not have their default values, so that the rows of a module are short.
 
-    fields: values by the name of the argument. is_default: whether an argument has its default value.
+    fields: {name of an argument: value}. is_default: True for the names of arguments with their default values.
     """
     return {name: value for name, value in fields.items() if not is_default.get(name)}
 
@@ -150,7 +152,7 @@ def _networks(spec: ModelSpec) -> dict[str, object]:
     n = len(spec.joints)
     ones = (1.0,) * n
     mass = _mass(spec)
-    # If V is constant, its network is one output that depends on no joint.
+    # A constant V also has a network: with one output, which depends on no joint.
     potential = _potential(spec) if spec.potential else _network(spec, ((),), (ones, ones), width=1, depth=0)
     scale = spec.potential_scale if spec.potential else 1.0
     arguments: dict[str, object] = {"mass": mass, "potential": potential, "potential_scale": scale}
@@ -176,14 +178,14 @@ def _mass(spec: ModelSpec) -> Call:
 
 
 def _mass_network(spec: ModelSpec) -> Call:
-    """Return the call that makes the network whose outputs are the functions of M."""
+    """Return the constructor call of the network whose outputs are the functions of M."""
     # Each edge into a unit of a Kolmogorov-Arnold network is a learned function, so fewer units suffice.
     min_units = TUNING.min_kan_units if spec.design.net == "kan" else TUNING.min_units
     return _network(spec, call("joints_of", FUNCTIONS), _mass_scales(spec), min_units=min_units)
 
 
 def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
-    """Return the scales of the inputs of the network of M, in two rows (n,).
+    """Return the scales of the inputs of the network of M: two rows (n,).
 
     The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q.
     """
@@ -224,7 +226,10 @@ def _network(
     depth: int | None = None,
     min_units: int = 1,
 ) -> Call:
-    """Return the call that makes a network; outputs: per output, the names of the joints that the output depends on."""
+    """Return the constructor call of a network.
+
+    outputs: names of the joints that each output depends on, as a tuple or as an expression of the module.
+    """
     options = {
         "scales": scales,
         "outputs": outputs,

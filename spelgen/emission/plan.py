@@ -102,7 +102,7 @@ def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
 
 
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
-    """Return the functions of M: joints that the function depends on, entries of M, mean and scale."""
+    """Return an ``OutputSpec`` for each learned function of M."""
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
         joints = output.joints
@@ -114,7 +114,7 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
-    """Return the constants of M: entries of M, initial value and scale."""
+    """Return a ``ConstantSpec`` for each constant of M."""
     values = zip(structure.constants, sizes.constants, sizes.constant_scales, strict=True)
     return tuple(
         ConstantSpec(_entries(constant.basis), initial, scale) for constant, initial, scale in values
@@ -122,7 +122,7 @@ def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]
 
 
 def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
-    """Return C as rows, where C qd are the motor velocities; empty if each motor moves its own joint only."""
+    """Return the rows of the matrix C, with C qd the motor velocities; () if each motor moves only its own joint."""
     speeds = actuation.drives().speeds
     # Most arms have uncoupled motors, whose module needs no matrix.
     if np.array_equal(speeds, np.eye(actuation.joints)):
@@ -133,7 +133,10 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
 def _joint(
     coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings, min_armature: float
 ) -> JointSpec:
-    """Return the joint of a coordinate; min_armature: armature if the rotor inertia is unknown [kg m^2, kg]."""
+    """Return the ``JointSpec`` of coordinate number ``index``, with the settings of its drive.
+
+    min_armature: armature if the rotor inertia is unknown [kg m^2, kg].
+    """
     # The inputs of networks are scaled with a working range, which exists even if the URDF has no limits.
     low, high = working_range(coordinate)
     lower, upper = (None if x is None else rounded(x) for x in (coordinate.lower, coordinate.upper))
@@ -214,12 +217,12 @@ def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
-    # If a second moment is less than `min_second_moment` times the largest, rounding to `inertia_digits` digits could
-    # make the body physically inconsistent.
+    # A second moment below `min_second_moment` times the largest is raised, too: rounding to `inertia_digits` digits
+    # could make the body physically inconsistent.
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten
-    # Only second moments below the bound are raised; the principal directions are unchanged.
+    # Smaller second moments are raised to twice the bound; all others and the principal directions are unchanged.
     raised = np.maximum(values, 2 * TUNING.min_second_moment * values[-1])
     pseudo[:3, :3] += (vectors * (raised - values)) @ vectors.T
     return _significant(parameters_of(pseudo))
@@ -233,8 +236,8 @@ def _about_center(
     x, y, z = hx / m, hy / m, hz / m
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
     inertia = [value - m * square for value, square in zip(tensor, steiner, strict=True)]
-    # The given parameters have rounding errors, since `_consistent` computes in floating point. Entries of the size of
-    # these errors become zero.
+    # If `_consistent` changed the parameters, they have rounding errors of floating point: entries of the size of these
+    # errors become zero.
     noise = max(map(abs, inertia)) / 10 ** (TUNING.inertia_digits + 3)
     inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]
     mass, cx, cy, cz, xx, xy, xz, yy, yz, zz = _significant([m, x, y, z, *inertia])
@@ -243,7 +246,7 @@ def _about_center(
 
 def _significant(values: Iterable[Fraction | float]) -> list[float]:
     """Return values rounded to the significant digits of inertial parameters."""
-    # The sum with 0.0 is 0.0 for -0.0.
+    # Adding 0.0 changes -0.0 to 0.0.
     return [rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values]
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 WIDTH = 110
 _STEP = 4  # blanks per level of indentation
-SKIP = "  # fmt: skip"  # the comment with which ruff does not reformat the rows of numbers
+SKIP = "  # fmt: skip"  # With this comment, ruff does not reformat rows of numbers.
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
     inner = " " * (indent + _STEP)
     opening, closing = "{}" if isinstance(value, dict) else "()"
     callee = value.callee if isinstance(value, Call) else ""
-    # Each line has as many items as fit, so that the rows of a matrix are lines of text.
+    # Lines are filled with items. An item that has several lines starts on its own line.
     lines = [f"{start}{callee}{opening}", inner]
     for key, item in _items(value):
         text = f"{filled(key, item, indent + _STEP)},"
@@ -85,7 +85,10 @@ def _escaped(text: str) -> str:
 
 
 def _items(value: object) -> list[tuple[str, object]]:
-    """Return (prefix, item) per item of a call ("key="), a dictionary ("key: ") or a tuple (""); else []."""
+    """Return (prefix, item) for each item of a call, a dictionary or a tuple; [] for other values.
+
+    The prefix is "key=" for a keyword argument of a call, "key: " for a dictionary, otherwise "".
+    """
     if isinstance(value, Call):
         return [(f"{key}=" if key else "", item) for key, item in value.arguments]
     if isinstance(value, dict):

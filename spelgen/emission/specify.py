@@ -72,7 +72,10 @@ def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> Arm:
 
 
 def find_urdf(module: Path, name: str) -> Path:
-    """Return the URDF ``name`` in the module's folder, the current one, or robots/ of either. Raises ModuleError."""
+    """Return the path of the URDF ``name``. Raises ModuleError if it is not found.
+
+    It is searched in the module's folder, in the current folder, and in the subfolders robots/ of both.
+    """
     # The folder of the module is searched first, since most projects have the URDF there.
     folders = [module.parent, Path(), Path("robots"), module.parent / "robots"]
     for folder in folders:
@@ -86,7 +89,7 @@ def find_urdf(module: Path, name: str) -> Path:
 
 
 def _path_of_urdf(module: Path, urdf: Path) -> str:
-    """Return the URDF's file name if ``find_urdf`` finds this file by name, else its path relative to the module."""
+    """Return the name of the URDF if it is in a folder that ``find_urdf`` searches, else its relative path."""
     try:
         if find_urdf(module, urdf.name).samefile(urdf):
             return urdf.name

@@ -24,9 +24,11 @@ class Definition(NamedTuple):
 class Runtime:
     """The source of the runtime.
 
-    definitions: definitions by name, in an order in which they can be executed. imports: import statements of other
-    packages. rows: names of the classes in rows.py, which must be defined before the tables of an arm. public: names
-    that a module can import from ``spelgen.runtime``.
+    Attributes:
+        definitions: definitions by name, in an order in which they can be executed.
+        imports: import statements of other packages.
+        rows: names of the classes in rows.py, which must be defined before the tables of an arm.
+        public: names that a module can import from ``spelgen.runtime``.
     """
 
     definitions: dict[str, Definition]

@@ -180,13 +180,13 @@ def _rows(spec: ModelSpec, assembly: ModelParts) -> list[str]:
 
 
 def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
-    """Return a text per term name: entries of M that the term contributes to, and the unit of the first entry."""
+    """Return {name of a term of M: entries of M that contain the term, and the unit of the first entry}."""
     descriptions = {}
     bases = [x.basis for x in spec.outputs] + [x.basis for x in spec.constants]
     for name, basis in zip(term_names(spec), bases, strict=True):
         entries = [entry_name(row, column) for row, column, _ in basis]
         row, column, _ = basis[0]
-        # An entry for two revolute joints is in kg m^2; each prismatic joint divides the unit by m.
+        # The unit of an entry is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
         slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
         suffix = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
         descriptions[name] = f"{', '.join(entries[:2])}{suffix} [{('kg m^2', 'kg m', 'kg')[slides]}]"
@@ -233,7 +233,7 @@ def _sum(sums: Sums, names: list[str]) -> str:
 
 def _number(value: float) -> str:
     """Return the shortest text that gives exactly this number."""
-    # Most numbers of a URDF have at most six digits.
+    # The form with six digits is tried first: most numbers of a URDF have no more digits.
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
 
@@ -274,7 +274,7 @@ def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
 
 
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
-    """Return the specification in a module's text. Raises ModuleError if ``module_text`` gives another text for it."""
+    """Return the specification in a module's text. Raises ModuleError if the text was changed since it was built."""
     spec = parse_spec(text, file)
     # The whole text is compared, since a model is assembled from the specification only: any other edit would
     # be ignored.

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 class ModelTuning:
     """Initial values of drives, servos and friction, and sizes of networks, of an untrained model."""
 
-    # [1] Lower bound of the eigenvalues of M, divided by the smallest nominal eigenvalue over the workspace.
+    # [1] Lower bound of the eigenvalues of M, divided by the smallest eigenvalue of the nominal M over the joint
+    # ranges.
     margin: float = 0.1
     # [1] Typical friction, divided by the effort limit of the drive: gears lose some per cent of the torque.
     friction_of_effort: float = 0.02

@@ -1,7 +1,7 @@
 """Selection of the motions that charts show.
 
-Of all predicted windows, of all torque curves and of all replayed logs, the one of median error and the one of largest
-error are selected.
+Charts show two predicted windows, two torque curves and two replayed logs: in each case the motion of median error and
+the motion of largest error.
 """
 
 import math
@@ -30,7 +30,7 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnMotion:
-    """Positions q (T, n) [rad, m] along a part of a log, at times t (T,) [s] since the first sample of the part.
+    """Positions q (T, n) [rad, m] along a segment of a log, at times t (T,) [s] since its first sample.
 
     which: "typical" for the motion of median error, "worst" for the motion of largest error. error: error of the model
     on this motion; None if not finite.
@@ -45,12 +45,17 @@ class DrawnMotion:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PredictedMotion(DrawnMotion):
-    """A measured motion and its prediction, (T, n) each.
+    """A measured motion and its prediction, (T, n) each: a predicted window of a log, or a replayed log.
 
-    error: RMS over joints of the errors of q and qd at the end of the motion, each divided by the RMS change of q or qd
-    over all windows [1]; for a replayed log, RMS position error [rad, m]. start: time of the first sample in the log
-    [s]; None for a log that is replayed as a whole. u: commands of position servos (T, n) [rad, m]; such a motion has
-    no velocities.
+    Attributes:
+        start: Time of the first sample of the window since the start of the log [s]; None for a replayed log.
+        predicted_q: Predicted positions, (T, n) [rad, m].
+        qd: Measured velocities, (T, n) [rad/s, m/s]; None for a replayed log.
+        predicted_qd: Predicted velocities, (T, n) [rad/s, m/s]; None for a replayed log.
+        u: Commands of position servos, (T, n) [rad, m]; None for a window.
+        error: For a window: relative error at its last sample [1], the RMS over the relative errors of q and qd of all
+            joints. A relative error is the error divided by the RMS change of q or qd over the horizon. For a replayed
+            log: RMS position error [rad, m].
     """
 
     start: float | None = None
@@ -62,10 +67,15 @@ class PredictedMotion(DrawnMotion):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TorqueTrace(DrawnMotion):
-    """Measured joint torques (T, n) [Nm, N] along ten seconds of a log, and the torques of the predictors.
+    """Measured joint torques along ten seconds of a log, and the torques of the predictors.
 
-    error: normalised mean squared error (nMSE) of the model. predicted: predicted torques (T, n) per predictor. parts:
-    terms of the model's torque, (T, n) each. energy: terms of the energy balance since the first sample, (T,) [J] each.
+    Attributes:
+        error: Normalised mean squared error (nMSE) of the torques of the model [1].
+        measured: Measured joint torques, (T, n) [Nm, N].
+        predicted: {name of a predictor: predicted joint torques, (T, n) [Nm, N]}.
+        parts: {name of a term: torque, (T, n) [Nm, N]}, for the inertia, Coriolis, gravity and friction term of the
+            model.
+        energy: {name of a term: energy since the first sample, (T,) [J]}, for the terms of the energy balance.
     """
 
     qd: Curve
@@ -134,8 +144,8 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
     The middle is used because logs begin and end at rest.
     """
     motions = []
-    # Logs of low sample rate have no usable accelerations: mean accelerations and torques of each sample interval are
-    # shown instead.
+    # A log of low sample rate does not show the acceleration at a sample. For such a log, the mean acceleration and the
+    # mean torque of each sample interval are shown.
     slow = [piece for piece in logs.pieces if not shows_accelerations(piece.sample_rate)]
     for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
@@ -171,11 +181,12 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
         }
     torques = {name: predicted_torques(predictor, samples) for name, predictor in dynamics.items()}
     predicted = {name: _at_joints(inputs, torque) for name, torque in torques.items()}
-    # Logs contain motor torques; they are converted to joint torques, to which the terms of the model belong.
+    # Logs contain motor torques. They are converted to joint torques, because the terms of the model are joint torques.
     measured = _at_joints(inputs, samples.tau)
-    # After the filter, samples are evenly spaced.
+    # The samples are evenly spaced, so the times are computed from the sample rate.
     t = np.arange(len(samples.q)) / samples.rate
-    # The friction term is the model's torque minus the stored terms, so it includes the constant torque offset.
+    # The inertia, Coriolis and gravity torques change the stored energy. The work of friction is computed from the
+    # rest of the model's torque, so it includes the work of the constant torque offset.
     stored = curves["inertia"] + curves["Coriolis"] + curves["gravity"]
     works = {
         "work of the drives": measured,

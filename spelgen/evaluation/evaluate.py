@@ -61,7 +61,7 @@ def evaluate(
     truth: Arm | Path | str | None = None,
     progress: Progress | None = None,
 ) -> Results:
-    """Predict the states and torques of test logs and measure the errors.
+    """Predict the states and torques of test logs, and return the errors of the model and of its baselines.
 
     Motion is predicted open loop, and again with a constant disturbance that a momentum observer estimates before each
     prediction starts (see `horizons.observe`). The result is deterministic, and no file is written.
@@ -76,15 +76,17 @@ def evaluate(
         preprocessing: filter and delay of states and torques; by default the preprocessing of the fit.
         steps: prediction horizons [samples].
         seconds: prediction horizons [s]. Horizons longer than every trajectory are omitted, with a note.
-        truth: true arm of simulated logs, or the path of its URDF, for the errors of M.
-        progress: function called with the number of finished rollouts, of all rollouts, and the name of the next one.
+        truth: true arm of simulated logs, or the path of its URDF, with which the mass matrices of the model and of
+            the baselines are compared.
+        progress: function called before each horizon, with the number of finished horizons, the number of all
+            horizons, and the name of the next horizon.
 
     Returns:
-        Errors of the model and of all baselines, and the curves behind them.
+        Errors of the model and of all baselines, and the curves from which the errors are computed.
 
     Raises LogError.
     """
-    # All checks precede the rollouts, which take minutes.
+    # The input is checked before the rollouts, because rollouts take minutes.
     tested = subject(model, arm)
     logs = [logs] if isinstance(logs, Trajectory) else list(logs)
     # Joints are matched by name: the order of the joints in a log may differ, but a missing joint is an error.
@@ -119,7 +121,8 @@ def _preprocessing(
     if chosen is None and used is not None:
         return used
     preprocessing = chosen or Preprocessing()
-    # The torque delay is a property of the logger and not of the filter, so the fitted delay is kept.
+    # A given preprocessing without a torque delay gets the delay that the fit estimated: the delay is a property of the
+    # logger and does not depend on the filter.
     if used is not None and preprocessing.torque_delay is None:
         preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
     return preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
@@ -135,19 +138,20 @@ def _evaluate_torques(
     truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
-    """Evaluate the inverse dynamics, and the motion predicted under the logged torques."""
+    """Return the errors of the inverse dynamics, and of the motion that is predicted under the logged torques."""
     samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=tested.reach)
     samples = [sample for sample in samples if len(sample.q)]
     # A rollout needs at least two samples: the initial state and one prediction.
     pieces = used.pieces(logs, shortest=2)
     tests = EvaluatedLogs(pieces, samples, used, tested.reach, tested.model.joint_types)
     lengths = horizon_lengths(tests, *ahead, notes)
-    # The windows are as long as in training: on longer ones errors of the dynamics would hide integration errors.
+    # The windows for the choice of the integrator steps are as long as the windows of the training. In longer windows
+    # the motion diverges because of errors of the dynamics, and integration errors cannot be distinguished.
     probe = tests.windows(tested.window - 1, TUNING.probed_model_windows)
     # Residual terms that the fit did not select are zero; they are removed to save time.
     model = without_idle_residuals(tested.model)
-    # The number of integrator steps is chosen per predictor: stiff friction needs more, and an integration error must
-    # not count as an error of the dynamics.
+    # The number of integrator steps is chosen per predictor, because stiff friction needs more steps than smooth
+    # dynamics. Integration errors are then negligible in the error of each predictor.
     solver = accurate_solver(model, probe)
     arm = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
     predictors = [Predictor(MODEL, solver, model), *torque_predictors(arm)]
@@ -173,8 +177,7 @@ def _evaluate_torques(
             expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
             do="omit --quick",
         )
-    # Joints with coarsely quantised torque are omitted from the assessment only, so they are determined after the
-    # errors are computed.
+    # Joints with coarsely quantised torques have torque errors in the tables, but the assessment in words omits them.
     steps = coarse_torques(logs, tested.joints, notes) if torque else {}
     masses = {}
     if truth is not None:
@@ -193,9 +196,9 @@ def _evaluate_torques(
 def _results(
     tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces
 ) -> Results:
-    """Return the results of an evaluation with the names of the arm, the joints and the logs, and without errors.
+    """Return results with the names of the arm, joints and logs, the notes and the curves.
 
-    The caller adds the errors.
+    The results have no errors yet: the caller adds them.
     """
     return Results(
         robot=tested.spec.robot if tested.spec else type(tested.model).__name__,
@@ -209,7 +212,7 @@ def _results(
 
 
 def _evaluate_commands(tested: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
-    """Evaluate the positions that are predicted under the logged position commands."""
+    """Return the errors of the positions that are predicted under the logged position commands."""
     for trajectory in logs:
         require_commands(trajectory)
     followers = command_followers(tested.linear_servos, notes)

@@ -22,12 +22,15 @@ from spelgen.logs.windows import Windows, cut_windows, joined
 
 
 def past_steps(rate: float) -> int:
-    """Return the number of steps that the observer runs before a prediction, at a sample rate [Hz]."""
+    """Return the number of sample intervals before a prediction in which the momentum observer runs.
+
+    rate: sample rate [Hz].
+    """
     return max(1, round(TUNING.observed_past * rate))
 
 
 def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor]:
-    """Estimate the disturbance torque in the first `past` steps of W windows, causally and without accelerations.
+    """Estimate a constant disturbance torque from the first `past` steps of W windows by a momentum observer.
 
         r(t) = K (p(t) - p(0) - integral from 0 to t of (G tau + C^T qd - g - friction + r)),    r(0) = 0
 
@@ -57,15 +60,16 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     cache = dynamics.prepare()
     pose = dynamics.at(q, prepared=cache)
     p = dynamics.momentum(pose, qd)
-    # The torque is constant in each interval. The trapezoidal rule needs the torque at both ends of an interval, so at
-    # a sample the torques of the following and of the preceding interval are both evaluated.
+    # The trapezoidal rule needs the right-hand side at both ends of each interval. The torque is constant in an
+    # interval and jumps at a sample, so each sample is evaluated twice: with the torque of the interval that starts
+    # there, and with the torque of the interval that ends there.
     inputs = torch.stack([torch.cat([tau, tau[:, -1:]], dim=1), torch.cat([tau[:, :1], tau], dim=1)])
     _, (at_start, at_end) = dynamics.port_hamiltonian_rhs(pose, p, inputs, cache, *known_past(dynamics, z))
-    # residual of the momentum balance in each interval, d (W, past, n)
+    # `residual` is d, the residual of the momentum balance in each interval, (W, past, n).
     residual = p.diff(dim=1) / dt - (at_start[:, :-1] + at_end[:, 1:]) / 2
     gain = 1 - torch.exp(-dt / TUNING.observer_time_constant)
     r = torch.zeros_like(residual[:, 0])
-    # step response of the observer: its output for a constant disturbance of 1
+    # `response` is the step response of the observer: the estimate for a constant disturbance of 1, (W, 1).
     response = torch.zeros_like(gain[:, 0])
     for k in range(past):
         r = r + gain[:, k] * (residual[:, k] - r)
@@ -77,7 +81,7 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 def without_past(windows: Windows, past: int) -> Windows:
     """Return the windows without their first `past` steps.
 
-    The friction state z of the result is unchanged, so that it is the state before the removed steps.
+    The friction state z is not advanced: it remains the state at the first sample of the given windows.
     """
     dt, q, qd, tau = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
     return Windows(dt, q, qd, tau, windows.z)
@@ -89,12 +93,17 @@ TipPosition = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class StateErrors:
-    """Errors at the end of a horizon: root mean square (RMS) over windows; a tuple has one value per joint.
+    """Root mean square (RMS) errors over all windows at the end of a horizon.
 
-    q, qd: errors of positions and velocities [rad, rad/s; m, m/s]; revolute positions are compared modulo a revolution.
-    q_relative_rms, qd_relative_rms: these errors divided by the RMS change of q and qd over the horizon.
-    mean_relative_rms: mean of both relative errors over all joints. tip_mm: position error of the tip [mm]. None: the
-    error is not finite, or unknown.
+    An error is None if it is not finite. A tuple has one value per joint.
+
+    Attributes:
+        q: Position errors [rad, m]; revolute positions are compared modulo a revolution.
+        qd: Velocity errors [rad/s, m/s].
+        q_relative_rms: Position errors divided by the RMS change of q over the horizon [1].
+        qd_relative_rms: Velocity errors divided by the RMS change of qd over the horizon [1].
+        mean_relative_rms: Mean of the relative errors of q and qd of all joints [1].
+        tip_mm: Position error of the tip [mm]; None also if the tip is unknown.
     """
 
     q: tuple[float | None, ...]
@@ -109,7 +118,7 @@ class StateErrors:
 class Horizon:
     """Errors of all predictors at one prediction horizon.
 
-    steps: length [samples]. seconds: mean length [s]. windows: number of predictions. errors: errors by key; the key is
+    steps: length [samples]. seconds: mean length [s]. windows: number of predictions. errors: {key: errors}. The key is
     the name of the predictor for open-loop predictions, and `observed(name)` for predictions with the disturbance that
     a momentum observer estimates.
     """
@@ -125,10 +134,13 @@ class Horizon:
 class EvaluatedLogs:
     """Test logs, cut at gaps and filtered.
 
-    pieces: segments without gaps, from which windows are cut. samples: filtered torques and accelerations of the logs
-    whose sample rate is high enough to differentiate twice (see `dynamics_samples`). used: preprocessing (filter and
-    torque delay) of these logs. reach: break-away displacements of the K friction bristles of each joint, (n, K) [rad,
-    m].
+    Attributes:
+        pieces: Segments without gaps, from which windows are cut.
+        samples: Filtered torques and accelerations of the logs whose sample rate is high enough to differentiate
+            positions twice (see `dynamics_samples`).
+        used: Preprocessing of the logs: filter and torque delay.
+        reach: Break-away displacements of the K friction bristles of each joint, (n, K) [rad, m].
+        joint_types: Types of the joints.
     """
 
     pieces: Sequence[Trajectory]
@@ -150,17 +162,17 @@ class EvaluatedLogs:
     def stride(self, span: int, window_count: int) -> int:
         """Return the number of samples between the starts of consecutive windows.
 
-        There are then about `window_count` windows of `span` steps.
+        With this stride, all pieces together contain about `window_count` windows of `span` steps.
         """
         return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // window_count)
 
     def starts(self, span: int, window_count: int) -> list[tuple[Trajectory, int]]:
-        """Return the piece and the index of the first sample of about `window_count` windows of `span` steps."""
+        """Return (piece, index of the first sample) of each of about `window_count` windows of `span` steps."""
         stride = self.stride(span, window_count)
         return [(piece, k) for piece in self.pieces for k in range(0, len(piece) - span, stride)]
 
     def windows(self, span: int, window_count: int) -> Windows:
-        """Return about `window_count` windows of `span` steps, shorter ones if all pieces are shorter."""
+        """Return about `window_count` windows of `span` steps; if no piece has `span` steps, windows are shorter."""
         span = min(span, self.longest)
         stride, measured = self.stride(span, window_count), self.used.filtered
         return cut_windows(self.pieces, span + 1, stride, measured=measured, reach=self.reach)
@@ -168,10 +180,11 @@ class EvaluatedLogs:
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Predictions of W windows of K samples.
+    """Predictions of all predictors for W windows of K samples.
 
-    starts: piece and index of the first sample of each window. states: predicted q and qd of each predictor at the
-    samples after the first, (W, K-1, n) each [rad, m, per second].
+    windows: measured motion. starts: (piece, index of the first sample) of each window. states: {key: (q, qd)},
+    predicted positions and velocities at the samples after the first, (W, K-1, n) each [rad, m; rad/s, m/s]. The keys
+    are the keys of `Horizon.errors`.
     """
 
     windows: Windows
@@ -182,7 +195,7 @@ class Predictions:
 def horizon_lengths(
     logs: EvaluatedLogs, steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
 ) -> dict[str, int]:
-    """Return the length of each horizon [samples], by the name of the horizon, such as "1 s".
+    """Return {name of a horizon, such as "1 s": length [samples]}.
 
     A horizon that is longer than every trajectory is omitted, and a note is appended to `notes`.
     """
@@ -206,9 +219,13 @@ def predict(
     tip: TipPosition | None,
     notes: list[Diagnostic],
 ) -> tuple[Horizon, Predictions]:
-    """Evaluate rollouts of `steps` samples: open loop, and with the disturbance observed before the rollout starts."""
+    """Return the errors at a horizon of `steps` samples, and the predicted states.
+
+    Each predictor is evaluated twice: open loop, and with the disturbance that a momentum observer estimates before the
+    prediction starts. name: name of the horizon.
+    """
     past = past_steps(logs.rate)
-    # If the logs are too short for the observer before a rollout, only open-loop predictions are evaluated.
+    # If no trajectory is long enough for the observer and the horizon, only open-loop predictions are evaluated.
     if past + steps > logs.longest:
         message = f"no observer over {name}: the longest trajectory has {logs.longest} steps"
         notes.append(Diagnostic("info", "no-observer", "logs", None, message))
@@ -218,14 +235,15 @@ def predict(
     windows = logs.windows(past + steps, window_count)
     ahead = without_past(windows, past)
     states = {}
-    # Both rollouts of a predictor start from the friction state at the end of the observer's steps.
+    # The open-loop rollout and the rollout with the observed disturbance start from the same friction state, the state
+    # at the end of the observer's steps.
     for predictor in predictors:
         if not past or not isinstance(predictor.solver, Solver):
             states[predictor.name] = predictor.solver(ahead)
             continue
         with torch.no_grad():
             started, disturbance = observe(integrable(predictor.solver.dynamics), windows, past)
-        # Both rollouts form one batch, which needs half as many operations.
+        # The rollouts without and with the disturbance form one batch: two batches would need twice as many operations.
         disturbances = torch.cat([torch.zeros_like(disturbance), disturbance])
         q, qd = predictor.solver(joined([started, started]), disturbances)
         count = len(started)
@@ -244,7 +262,7 @@ def end_errors(
 
     states: predicted q and qd at the samples after the first, (W, K-1, n) each.
     """
-    q, qd = (predicted[:, -1] for predicted in states)  # (W, n)
+    q, qd = (predicted[:, -1] for predicted in states)  # (W, n) each
     measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
     # Angles of revolute joints are compared modulo a revolution. The RMS is used instead of the mean absolute error,
     # since large errors decide whether a simulation is usable.

@@ -23,7 +23,8 @@ SCHEMA = 11
 class Verdict:
     """An assessment in words.
 
-    sentence: suitable uses, failures, and motions to record. because: figures that support the sentence.
+    sentence: suitable and unsuitable uses of the model, and motions to record next. because: errors and reasons that
+    support the sentence.
     """
 
     sentence: str
@@ -32,14 +33,24 @@ class Verdict:
 
 @dataclass(frozen=True, repr=False)
 class Measurements:
-    """All measurements of `evaluate`; `to_dict` is evaluation.json.
+    """All measurements of an evaluation, stored in evaluation.json.
 
-    parameters: number of trained parameters. traces: curves from which the figures are computed, with predictions over
-    the longest horizon. cutoff: cutoff frequency of the filter of the test logs [Hz]; None without a filter. substeps:
-    integrator steps of the model per sample interval. torque: torque errors per predictor; empty if the sample rate is
-    too low for accelerations. torque_steps: quantisation steps of torques, see `coarse_torques`. replays: errors of
-    replayed commands of an arm under position servos. mass_errors: relative errors of M per predictor, if the true M is
-    known. assessment: assessment of the model, which uses the coverage of the training logs; None before it is made.
+    Attributes:
+        robot: Name of the robot.
+        joints: Names of the joints.
+        joint_types: Types of the joints.
+        trajectories: Names of the test logs.
+        parameters: Number of trained parameters.
+        diagnostics: Warnings and notes about the logs and the evaluation.
+        traces: Curves from which the errors are computed; predictions are over the longest horizon.
+        cutoff: Cutoff frequency of the filter of the test logs [Hz]; None without a filter.
+        substeps: Integrator steps of the model per sample interval.
+        horizons: Errors of predicted motion, one entry per horizon.
+        torque: {predictor: torque errors}; empty if the sample rate is too low for accelerations.
+        torque_steps: {joint: quantisation step of its torque [Nm, N]}, see `coarse_torques`.
+        replays: Errors of replayed commands, for an arm under position servos.
+        mass_errors: {predictor: relative error of M [1]}; empty if the true M is unknown.
+        assessment: Assessment of the model in words; None before it is added.
     """
 
     robot: str

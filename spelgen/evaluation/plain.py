@@ -33,7 +33,7 @@ Curve = Annotated[np.ndarray, PlainValidator(array), PlainSerializer(listed)]
 
 
 def record(value: object) -> dict[str, object]:
-    """Return a dataclass that contains numbers and curves as an object for JSON."""
+    """Return a dataclass as a dict for JSON; `Curve` fields become nested lists of rounded numbers."""
     return dict(TypeAdapter(type(value)).dump_python(value))
 
 

@@ -21,8 +21,8 @@ from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split
 class ReplayErrors:
     """Root mean square position errors of one predictor [rad, m].
 
-    trajectories: error per log, over time and joints. mean: mean of the errors of all logs. joints: error per joint
-    (n,), over time and all logs.
+    trajectories: {log: error over time and joints}. mean: mean of these errors. joints: error of each joint over time
+    and all logs, (n,).
     """
 
     trajectories: dict[str, float]
@@ -32,7 +32,10 @@ class ReplayErrors:
 
 @dataclass(frozen=True)
 class Replay:
-    """Errors of each predictor on replayed commands. name: description of the segments, for example whole logs."""
+    """Position errors of all predictors on replayed commands.
+
+    name: description of the replayed segments, for example "whole log". errors: {predictor: errors}.
+    """
 
     name: str
     errors: dict[str, ReplayErrors]
@@ -56,13 +59,12 @@ class ServoModel:
         The first sample, the initial state, is not predicted. Parts are padded to one length for the rollout; the
         padding is removed from the result. q, qd: initial positions and velocities of the parts, (parts, n).
         """
-        # All parts form one batch, so they have the same number of integrator steps: the largest that a part needs.
+        # All parts form one batch, because a rollout of many parts takes about as long as a rollout of one part. A
+        # batch has one number of integrator steps per interval: the number for the part that needs most steps.
         steps = max(steps_between(log) for log, _ in parts)
         lengths = [rows.stop - rows.start - 1 for _, rows in parts]
         commands, intervals = [], []
         for (log, rows), length in zip(parts, lengths, strict=True):
-            # One batch of all parts is used, because the operations of a rollout are small: many parts take as long as
-            # one.
             padding = (0, max(lengths) - length)
             delayed = delayed_commands(log, rows, float(self._model.servo.delay), steps)
             commands.append(np.pad(delayed, (padding, (0, 0), (0, 0)), mode="edge"))
@@ -78,10 +80,10 @@ def replays(
     baselines: Mapping[str, CommandFollower],
     notes: list[Diagnostic],
 ) -> tuple[tuple[Replay, ...], list[PositionErrors]]:
-    """Replay whole logs, and consecutive windows of one second, with the model and the baselines.
+    """Replay the commands of whole logs, and of consecutive windows of one second, with the model and the baselines.
 
-    Returns the replays of logs and of windows, and the position errors of the model over whole logs. A description of
-    each baseline is appended to `notes`.
+    Return two results: the errors of all predictors on whole logs and on windows, and the position errors of the model
+    along each gap-free segment of the logs. A description of each baseline is appended to `notes`.
     """
     pieces = [piece for log in logs for piece in split_at_gaps(log, shortest=3)]
     windows: list[LogRows] = []
@@ -95,7 +97,7 @@ def replays(
         notes.append(Diagnostic("info", "baseline", "logs", None, f"{name}: {baseline.about}"))
     # The model is treated as one of the predictors, so that the same code measures all errors.
     predictors = {MODEL: ServoModel(model), **baselines}
-    # Whole logs are replayed from zero velocity, as they begin at rest; windows start with a measured velocity.
+    # Whole logs are replayed from zero velocity, as they begin at rest. Windows start with the velocity of the log.
     logs_from_rest: list[LogRows] = [(piece, slice(0, len(piece))) for piece in pieces]
     at_rest = np.zeros((len(pieces), pieces[0].q.shape[1]))
     replay, missed = _replay("whole log", predictors, logs_from_rest, at_rest)

@@ -53,24 +53,24 @@ def rollout(
 
 
 def smallest_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
-    """Return the smallest eigenvalue of M over random q in [low, high] (n,), divided by the mean eigenvalue.
+    """Return the smallest eigenvalue of M divided by the mean eigenvalue, at random q in [low, high] (n,) [rad, m].
 
-    It is positive if M is positive definite.
+    The result is positive if M is positive definite at all of these positions.
     """
     # The seed is fixed, so that the result is reproducible.
     generator = torch.Generator().manual_seed(0)
     count = TUNING.sampled_positions
     q = low + (high - low) * torch.rand(count, len(low), dtype=low.dtype, generator=generator)
-    chunks = q.chunk(10)  # one batch of all positions would need gigabytes of memory
+    chunks = q.chunk(10)  # One batch of all positions would need gigabytes of memory.
     eigenvalues = torch.cat([torch.linalg.eigvalsh(model.mass_matrix(chunk)) for chunk in chunks])
     return (eigenvalues.min() / eigenvalues.mean().abs()).item()
 
 
 def energy_rise(model: ArmModel, windows: Windows) -> float | None:
-    """Return the largest rise of H in a step of 1 ms without input, divided by the largest kinetic energy.
+    """Return the largest increase of the energy H in one step of 1 ms, divided by the largest kinetic energy.
 
-    The motion starts from the first states of the windows. The rise is not positive, except for rounding, if the model
-    is passive. None: the simulated arm did not move, so that the kinetic energy is zero, or the motion diverged.
+    The motion is simulated without input, from the first states of the windows. For a passive model the energy does
+    not increase, except for rounding. The result is None if the motion diverged or the kinetic energy is zero.
     """
     q, qd = windows.q[: TUNING.started_states, 0], windows.qd[: TUNING.started_states, 0]
     no_input = q.new_zeros(len(q), TUNING.free_steps, model.n)
@@ -108,7 +108,8 @@ def mass_error(learned: Tensor, true: Tensor) -> float:
         learned: M (T, n, n) of a model.
         true: M (T, n, n) of the arm.
     """
-    # The mean of the true M scales all errors: scaled by M at each position, errors near a singular M would dominate.
+    # All errors are scaled with the mean of the true M. With M at each position as the scale, the errors at positions
+    # at which M is nearly singular would dominate.
     factor = torch.linalg.cholesky(true.mean(dim=0))
     half = torch.linalg.solve_triangular(factor, learned - true, upper=False)
     relative = torch.linalg.solve_triangular(factor, half.mT, upper=False)
@@ -118,10 +119,10 @@ def mass_error(learned: Tensor, true: Tensor) -> float:
 def mass_errors(
     dynamics: Mapping[str, RigidDynamics], truth: Arm | Path | str, joints: Sequence[str], q: Tensor
 ) -> dict[str, float]:
-    """Return the relative error of M of each predictor, at a subset of the test positions.
+    """Return {predictor: relative error of M [1]}, see `mass_error`, at a subset of the test positions.
 
     Args:
-        dynamics: The model and the baselines, by name.
+        dynamics: {name of the model or of a baseline: dynamics}.
         truth: The true arm, or the path of its URDF.
         joints: Names of the n joints.
         q: Positions (T, n) [rad; m] of the test logs.

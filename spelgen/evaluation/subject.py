@@ -28,12 +28,18 @@ from spelgen.urdf.read import read_urdf
 
 @dataclass(frozen=True)
 class Subject:
-    """The evaluated model, with data about its fit; the defaults are for a model without a fit.
+    """The evaluated model, with data about its fit. A model without a fit has the default values.
 
-    urdf: URDF of the robot; None if unknown. preprocessing: preprocessing of the fit. window: number of samples of the
-    training windows; a typical number for a model that was not fitted to windows. trained_on: names of the training and
-    validation logs. baselines: baselines that were fitted to these logs. fitted_urdf: URDF for which the baselines were
-    fitted. linear_servos: parameters of the linear servos that were fitted to these logs.
+    Attributes:
+        model: The evaluated model.
+        urdf: URDF of the robot; None if unknown.
+        preprocessing: Filter and delay that the fit used.
+        window: Number of samples of the training windows, or `TUNING.model_window` if the model was not fitted to
+            windows.
+        trained_on: Names of the training and validation logs.
+        baselines: Content of least_squares.json: baselines that were fitted to the training logs.
+        fitted_urdf: URDF of the fit, whose kinematics the baselines use.
+        linear_servos: Parameters of the linear servos that were fitted to the training logs.
     """
 
     model: ArmModel
@@ -57,14 +63,17 @@ class Subject:
 
     @property
     def reach(self) -> BristleReach:
-        """Break-away displacements (n, K) [rad, m] of friction bristles; typical ones if the model has no bristles."""
+        """Break-away displacements of the K friction bristles of each joint, (n, K) [rad, m].
+
+        If the model has no bristles, the values are the default values for the joint types.
+        """
         reach = bristle_reach(self.model)
-        # Without bristles in the model, z is still needed for the baseline of least squares with bristles.
+        # Defaults are needed although the model has no bristles: the baseline of least squares may have bristles.
         return reach if reach.elements else reach_of(self.model.joint_types)
 
     @property
     def fitted_arm(self) -> Arm | None:
-        """Arm for which the baselines of the fit were fitted. Raises UrdfError, ArmError or SettingsError."""
+        """Arm of the fitted baselines; None if there are none. Raises UrdfError, ArmError or SettingsError."""
         if self.fitted_urdf is None or not self.baselines:
             return None
         return arm_of_model(self.model, self.fitted_urdf)
@@ -75,7 +84,7 @@ class Subject:
         if self.spec is not None:
             depends = {*self.spec.potential, *(k for entry in self.spec.entries for k in entry[3])}
             for k, joint in enumerate(self.spec.joints):
-                # A joint with only one limit has no range.
+                # A joint with only one limit is treated as a joint without limits.
                 bound = None if joint.lower is None or joint.upper is None else (joint.lower, joint.upper)
                 limits.append(bound)
                 if k not in depends:
@@ -84,7 +93,7 @@ class Subject:
 
 
 def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = None) -> Subject:
-    """Return the subject of an evaluation.
+    """Return the model to be evaluated, with data about its fit.
 
     tested: a model, a fit or the folder of a run. arm: arm, or path of its URDF; None: the arm of the fit.
     """
@@ -111,9 +120,12 @@ def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = 
 def read_test_logs(
     folder: Path | str, paths: Iterable[Path | str], mapping: GivenMapping = None
 ) -> list[Trajectory]:
-    """Return the test logs of a run's arm: the files test.* of a folder, or all files if none has this name.
+    """Return the test logs of a run's arm.
 
-    mapping: mapping of the log columns; None for the mapping of the training logs.
+    Args:
+        folder: Run folder.
+        paths: Log files, and folders with log files. If a folder contains files test.*, its other files are ignored.
+        mapping: Mapping of the log columns; None: the mapping of the training logs.
     """
     run = RunFolder(folder)
     record, spec = run.read_record(), run.read_spec()

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, URDF, observed, share, thousandths
 from spelgen.listing import Listing, number
 
-if TYPE_CHECKING:  # `spelgen --help` lists the figures; an import at run time would load torch
+# `spelgen --help` imports this module for LIMITS. An import of the measurements would also load torch.
+if TYPE_CHECKING:
     from spelgen.evaluation.measurements import Measurements
 
 OBSERVER = (
@@ -41,7 +42,7 @@ class Row:
 
     @property
     def best(self) -> list[str]:
-        """Return the columns that contain the smallest number; [] if there is only one column."""
+        """Return the names of the columns with the smallest number; [] if the row has one column or is not ranked."""
         if not self.ranked or len(self.values) < 2:
             return []
         smallest = min((value for value in self.values.values() if value is not None), default=None)
@@ -52,7 +53,7 @@ class Row:
 class Table:
     """Table with a row per quantity and a column per predictor or model.
 
-    title: explains the numbers. note: explains the rows.
+    title: title that states the quantity and unit of the numbers. note: explanation of the rows, "" if not needed.
     """
 
     title: str
@@ -132,7 +133,10 @@ def csv_text(results: Measurements) -> str:
 
 
 def summary(results: Measurements) -> Listing | None:
-    """Return the figures of URDF, least squares and model in one small table; None without torques."""
+    """Return a small table that compares the URDF, least squares and the model; None without torque errors.
+
+    Its rows are the unexplained fraction of the torque variance and, if the true M is known, the error of M.
+    """
     if MODEL not in results.torque:
         return None
     errors = {name: x.mean_nmse for name, x in results.torque.items()}
@@ -198,7 +202,7 @@ def _replay_tables(results: Measurements) -> list[Table]:
         rows: dict[str, Numbers] = {}
         for log in replay.errors[MODEL].trajectories:
             rows[log] = {name: 1000 * errors.trajectories[log] for name, errors in replay.errors.items()}
-        # The mean is the last row, as a sum is written below its terms.
+        # The mean of all logs is the last row of the table.
         rows["mean of all"] = {name: 1000 * errors.mean for name, errors in replay.errors.items()}
         joints = {name: [1000 * rms for rms in errors.joints] for name, errors in replay.errors.items()}
         title = f"Commands replayed, {replay.name}: RMS"
@@ -215,7 +219,11 @@ def _by_joint(
     errors: Mapping[str, Sequence[float | None]],
     note: str = "",
 ) -> Table:
-    """Return a table with a row for each joint; the unit is in the title if all joints have the same."""
+    """Return a table of the errors of all predictors, with one row per joint.
+
+    title: title with the placeholder {} for the unit. quantity: position, velocity or torque, for the unit. errors:
+    {predictor: errors of all joints}.
+    """
     units = [asdict(UNITS[joint_type])[quantity] for joint_type in results.joint_types]
     # If all joints have the same unit, it is in the title: a unit in each row would widen the first column.
     labels, common = results.joints, f" [{units[0]}]"
@@ -226,7 +234,7 @@ def _by_joint(
 
 
 def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | None]]) -> dict[str, Numbers]:
-    """Return a row per label with the errors of all predictors. errors: errors of all joints per predictor."""
+    """Return {label of a joint: {predictor: error}}. errors: {predictor: errors of all joints}."""
     return {label: {name: values[k] for name, values in errors.items()} for k, label in enumerate(labels)}
 
 
@@ -234,8 +242,8 @@ def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | Non
 class Figure:
     """One of the few figures that summarise an evaluation.
 
-    unit: a unit; or "variance", for a fraction of the variance of the torque; or "motion", for a fraction of the RMS
-    change of q and qd over the horizon.
+    unit: unit of the value. The value of unit "variance" is a fraction of the variance of the torque; the value of unit
+    "motion" is a fraction of the RMS change of q and qd over the horizon.
     """
 
     name: str

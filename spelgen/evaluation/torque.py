@@ -21,10 +21,15 @@ from spelgen.logs.trajectory import Trajectory, joined_column
 class TorqueErrors:
     """Errors of the inverse dynamics of one predictor on `dynamics_samples`.
 
-    The nMSE is the mean squared error divided by the variance of the torque. nmse: nMSE per trajectory, mean over
-    joints. All other errors are pooled over the samples of all trajectories, so that a short log has little weight.
-    joint_nmse: nMSE per joint, None for a joint of constant torque. rmse: RMS error per joint [Nm, N].
-    mean_nmse: mean nMSE over joints. nmse_with_pauses: mean nMSE over joints, pauses between motions included.
+    The nMSE is the mean squared error divided by the variance of the torque. All errors except `nmse` are computed from
+    the samples of all trajectories together, so that a short log has little weight.
+
+    Attributes:
+        nmse: {trajectory: mean nMSE over joints}.
+        joint_nmse: nMSE of each joint; None for a joint of constant torque.
+        rmse: RMS error of each joint [Nm, N].
+        mean_nmse: Mean nMSE over joints.
+        nmse_with_pauses: Mean nMSE over joints, with the samples of pauses between motions.
     """
 
     nmse: dict[str, float | None]
@@ -69,8 +74,8 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
     """Return the friction state (T, n, K) of K bristles and the direction of motion (T, n), in [-1, 1].
 
-    The returned values are the last arguments of the methods of `dynamics`. A value for which a model has no argument
-    is omitted (see `known_past`).
+    The methods of `dynamics` that compute friction take these values as their last arguments. A value that they do not
+    take is omitted (see `known_past`).
     """
     past = (None if x is None else torch.from_numpy(x) for x in (samples.z, samples.direction))
     return known_past(dynamics, *past)
@@ -88,9 +93,9 @@ def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """Return the nMSE of each joint, (n,), for residual and torque (T, n); NaN for a joint of constant torque."""
     deviation = torque.std(axis=0)
     largest = np.abs(torque).max(axis=0, initial=0.0)
-    # A torque whose standard deviation is at the level of rounding errors counts as constant.
+    # A torque is treated as constant if its standard deviation is at the level of rounding errors.
     varies = deviation > LEAST_SQUARES.negligible * largest
-    # A residual that is not finite becomes infinity: NaN means constant torque.
+    # A residual that is not finite gives an infinite nMSE, because NaN is reserved for joints of constant torque.
     squares = np.nan_to_num(np.square(residual).mean(axis=0), nan=np.inf, posinf=np.inf)
     nmse: np.ndarray = np.full_like(squares, np.nan)
     nmse[varies] = squares[varies] / deviation[varies] ** 2
@@ -106,13 +111,14 @@ def _mean(nmse: np.ndarray) -> float | None:
 def coarse_torques(
     logs: Sequence[Trajectory], joints: Sequence[str], notes: list[Diagnostic]
 ) -> dict[str, float]:
-    """Return the quantisation step [Nm, N] of the joints whose torque varies by only a few steps, per joint.
+    """Return {joint: quantisation step of its torque [Nm, N]} for joints whose torque varies by only a few steps.
 
     A note about each of these joints is appended to `notes`.
     """
     steps = {}
     for k, joint in enumerate(joints):
-        # A log without quantisation counts as infinite; the median is finite if most logs are quantised.
+        # The step of a joint is the median over the logs. A log without a quantisation step has the value infinity, so
+        # the median is finite only if most logs are quantised.
         step = float(np.median(np.nan_to_num([quantisation_step(log.tau[:, k]) for log in logs], nan=np.inf)))
         torque = joined_column(logs, "tau")[:, k]
         if np.isfinite(step) and has_few_levels(step, float(np.ptp(torque))):

@@ -43,10 +43,14 @@ class Quantiles:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Quantiles of the prediction error over the time of a prediction [s], per predictor.
+    """Growth of the prediction error with the time since the start of a prediction.
 
-    relative: errors of q and qd, divided by the RMS change of q and qd since the start of a window [1]. tip_mm:
-    position error of the tip [mm], empty without a URDF. windows: number of predictions.
+    Attributes:
+        seconds: Times since the start of a prediction, (T,) [s].
+        windows: Number of predictions.
+        relative: {predictor: quantiles of the relative error [1]}, the errors of q and qd divided by the RMS change of
+            q and qd since the start.
+        tip_mm: {predictor: quantiles of the position error of the tip [mm]}; empty without a URDF.
     """
 
     seconds: Curve
@@ -64,7 +68,7 @@ class MassCurves:
 
 @dataclass(frozen=True, eq=False)
 class MassTrace:
-    """M of each predictor along a trajectory."""
+    """Entries of M along a trajectory at times t (T,) [s]. by: {predictor: entries}."""
 
     trajectory: str
     t: Curve
@@ -73,7 +77,14 @@ class MassTrace:
 
 @dataclass(frozen=True, eq=False)
 class FrictionTrace:
-    """Friction torque over velocity of each predictor, (n, T); one joint moves at a time, at the mean position."""
+    """Friction torque of each joint as a function of its velocity.
+
+    Only one joint moves at a time, and the arm is at the mean position of the logs.
+
+    Attributes:
+        qd: Velocities of each joint, (n, T) [rad/s, m/s].
+        by: {predictor: friction torques of each joint, (n, T) [Nm, N]}.
+    """
 
     qd: Curve
     by: dict[str, Curve]
@@ -81,7 +92,16 @@ class FrictionTrace:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """All curves of an evaluation. coverage: ranges of motion in the test logs, see `logs.trajectory.coverage`."""
+    """All curves of an evaluation.
+
+    Attributes:
+        coverage: Ranges of motion in the test logs, see `logs.trajectory.coverage`.
+        growth: Growth of the prediction error over time.
+        trajectories: Predicted windows or replayed logs, of median and of largest error.
+        torques: Torques along logs, of median and of largest error.
+        mass: M of all predictors along a motion.
+        friction: Friction of all predictors over velocity.
+    """
 
     coverage: dict[str, object]
     growth: Growth | None = None
@@ -103,7 +123,8 @@ def motion_traces(
     """
     growth: Growth | None = None
     predicted: tuple[PredictedMotion, ...] = ()
-    # If the arm is at rest, relative errors are undefined (division by a change of zero).
+    # If the arm is at rest, relative errors would be divided by a change of zero, so the curves of predicted motion are
+    # omitted.
     if predictions is not None and predictions.windows.q.diff(dim=1).abs().max() >= AT_REST:
         errors = _relative_errors(predictions, logs.joint_types)
         growth = _growth(predictions, errors, tip)
@@ -127,10 +148,10 @@ def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
 
 
 def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> dict[str, Tensor]:
-    """Return the RMS over joints of the relative errors of position and velocity of each predictor, (W, K-1) [1].
+    """Return {predictor: relative error, (W, K-1) [1]} for W windows of K samples, without the initial sample.
 
-    An error is divided by the RMS change of the position or velocity since the start of a window (see `loss_scales`).
-    There are W windows of K samples; the first sample, the initial state, has no error.
+    The relative error is the RMS over the errors of position and velocity of all joints. Each of these errors is
+    divided by the RMS change of the position or velocity since the start of a window (see `loss_scales`).
     """
     windows = predictions.windows
     scales = loss_scales(windows, joint_types)
@@ -151,7 +172,7 @@ def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosi
     for name, (q, _) in predictions.states.items():
         if is_drawn(name):
             relative[name] = _quantiles(errors[name][:, times])
-            # The tip is known only with a URDF, which a model from Python may not have.
+            # The tip is unknown if the model was passed to `evaluate` without a URDF.
             if tip is not None:
                 distance = tip(q[:, times]) - tip(windows.q[:, 1 + times])
                 tips[name] = _quantiles(1000 * distance.norm(dim=-1))
@@ -159,7 +180,10 @@ def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosi
 
 
 def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[PredictedMotion, ...]:
-    """Return the model's predictions of median and largest error. errors: (W,) error at the end of each window."""
+    """Return two predicted windows of the model: the window of median error and the window of largest error.
+
+    errors: relative error at the end of each window, (W,) [1].
+    """
     motions = []
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
         motion = predicted_motion(piece.name, predictions.windows, predictions.states[MODEL], k)
@@ -169,7 +193,7 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
 
 
 def _quantiles(values: Tensor) -> Quantiles:
-    """Return the quantiles over windows of values (W, T); NaN counts as infinite."""
+    """Return the quantiles over the W windows of values (W, T), each (T,); NaN is treated as infinity."""
     ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values.numpy()
     last = len(ordered) - 1
     return Quantiles(*(ordered[round(quantile * last)] for quantile in (0.1, 0.5, 0.9)))
@@ -191,12 +215,14 @@ def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> M
 
 def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory]) -> FrictionTrace:
     q = joined_column(pieces, "q")
-    # The quantile excludes the fastest samples, which are often spikes of differentiated positions.
+    # The largest speed of a joint's curve is a quantile of the logged speeds and not their maximum, because velocities
+    # that were differentiated from positions often have spikes.
     fast = np.quantile(np.abs(joined_column(pieces, "qd")), 0.995, axis=0)
-    # The speeds are dense near zero, where friction reverses.
+    # The grid is finer near zero, where the sign of friction changes.
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)
-    speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n): 81 speeds per joint
-    alone = torch.diag_embed(speeds)  # (81, n, n): in row j only joint j moves
+    speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n): 81 speeds of each joint
+    # (81, n, n): entry [k, j] is a velocity vector at which only joint j moves.
+    alone = torch.diag_embed(speeds)
     positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)
     curves = {}
     for name, predictor in dynamics.items():

@@ -12,20 +12,22 @@ class EvaluationTuning:
     observed_past: float = 0.1
     # [s] 1 / K of the momentum observer; 0.02 to 0.1 s differ by 3 % on the UR10e of `benchmarks/arms.py`.
     observer_time_constant: float = 0.05
-    # [1] Largest number of windows per horizon, evenly spread.
+    # [1] Largest number of windows per horizon. The windows are evenly spread over the logs.
     most_windows: int = 1000
-    # [1] Largest number of predicted steps per predictor and horizon: long horizons have fewer windows.
+    # [1] Largest number of predicted steps per predictor and horizon. A horizon of k steps has this number / k windows,
+    # but at least `fewest_windows`.
     most_predicted_steps: int = 10_000
-    # [1] Smallest number of windows of a long horizon, if the logs are long enough.
+    # [1] Number of windows of the longest horizons; there are fewer only if the logs are too short.
     fewest_windows: int = 100
     # [1] Number of test windows from which the number of integration steps of a model is chosen.
     probed_model_windows: int = 64
-    # [1] Fraction of the torque variance that a model must explain for contact detection: a choice of this package.
+    # [1] Fraction of the torque variance that a model must explain for contact detection. No standard specifies this
+    # fraction; it is a choice of the package, like the next two.
     explained_for_contacts: float = 0.99
     # [1] Fraction of the torque variance that a model must explain for feed-forward control.
     explained_for_feed_forward: float = 0.95
     # [1] Fraction of the torque variance that a model must explain for gravity compensation. On most logs gravity and
-    # friction explain about this fraction, so a model that explains less lacks one of them.
+    # friction explain about this fraction, so a model that explains less has errors in gravity or friction.
     explained_for_gravity: float = 0.8
     # [1] Largest relative prediction error (RMS error / RMS change of q and qd over the horizon) for which the
     # assessment recommends simulation.
@@ -35,7 +37,8 @@ class EvaluationTuning:
     rough_prediction: float = 0.3
     # [1] Motion below this fraction of a joint's largest velocity is called slow.
     slow: float = 0.1
-    # [1] A ratio of the errors of slow and fast motion above this value is reported.
+    # [1] If the RMS torque residuals of slow and of fast motion differ by more than this factor, the assessment names
+    # the kind of motion with the larger residual.
     uneven: float = 1.4
     # [1] Logs that cover less than this fraction of a joint's range are reported as narrow.
     narrow_range: float = 0.5

@@ -36,7 +36,7 @@ class _Uses:
     """Uses of a model.
 
     good: uses for which the model is sufficient. bad: uses for which the model is not sufficient. proofs: texts with
-    the figures that prove both.
+    the errors from which this was decided.
     """
 
     good: list[str] = field(default_factory=list)
@@ -55,19 +55,19 @@ def verdict(
     identified: content of least_squares.json, for the coverage of the training logs. limits: position limits of the
     joints. independent: names of joints on whose position the dynamics do not depend, such as a vertical first axis.
     """
-    # Each assessment function adds uses, and the figures that prove them.
+    # Each assessment function adds uses, and the texts with the errors from which they were decided.
     uses = _Uses()
     _assess_torques(results, uses)
     _assess_motion(results, uses)
     _assess_replays(results, uses)
-    # An evaluation may have no figures, for example with --quick on logs without accelerations.
+    # Without any error there is no assessment. This happens with --quick on logs without accelerations.
     if not uses.proofs:
         return Verdict("No verdict: no horizon and no torque was evaluated.", "")
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
     elastic = next((x for x in results.diagnostics if x.code == ELASTIC), None)
     if elastic is not None:
-        # A rigid model is wrong near the resonance of an elastic joint, even if its errors on these logs are small. The
-        # sentence therefore does not begin with "Good enough".
+        # A rigid model is wrong near the resonance of an elastic joint, even if its errors on these logs are small.
+        # Therefore the sentence begins with this limit, and not with "Good enough".
         band = f"; below it, usable for {listed(uses.good)}" if uses.good else ""
         sentence = f"Not valid near the resonance of an elastic joint{band}"
     if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):
@@ -91,14 +91,14 @@ def verdict(
 
 
 def _assess_torques(results: Measurements, uses: _Uses) -> None:
-    """Assess the torques by the joint of the largest error, since a mean over joints would hide this joint."""
+    """Add the uses that the torque error of the worst joint permits, since a mean over joints would hide this joint."""
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
         return
     joint, unexplained = _worst_torque(results)
     if not joint:
         unexplained = torque.mean_nmse
-    # 1 - nMSE is the coefficient of determination
+    # 1 - nMSE is the coefficient of determination, the explained fraction of the torque variance.
     _, good, bad = next(row for row in TORQUE_USES if 1 - unexplained >= row[0])
     uses.good += good
     uses.bad += bad
@@ -121,7 +121,7 @@ def _worst_torque(results: Measurements) -> tuple[str, float]:
 
 
 def _assess_motion(results: Measurements, uses: _Uses) -> None:
-    # Predictions may diverge over a long horizon and not over a shorter one.
+    # The longest horizon with a finite error is assessed, because predictions may diverge over longer horizons.
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
     if results.horizons and not finite:
         uses.bad.append("simulation")
@@ -185,11 +185,11 @@ def _better_baselines(results: Measurements) -> list[str]:
 
 
 def _worst_joint(results: Measurements) -> tuple[str, str, str]:
-    """Return the worst joint, a speed, and a sentence about the joint.
+    """Return the name of the worst joint, words for its worst speed, and a sentence about its error.
 
-    The joint is the joint of the largest torque error, or of the largest motion error if only the motion has a large
-    error. The speed is " near standstill", " at speed" or "": the motion in which the torque error of the joint is
-    larger.
+    The worst joint has the largest torque error. If all torque errors are small, but the motion error is not, it is the
+    joint of the largest motion error. The words are " near standstill" or " at speed" if the torque error of the joint
+    is clearly larger in slow or in fast motion, else "".
     """
     joint, error = _worst_torque(results)
     moving, motion_error = _worst_motion(results)
@@ -210,16 +210,16 @@ def _worst_motion(results: Measurements) -> tuple[str, float]:
     The relative error is the RMS error divided by the RMS change over the horizon [1].
     """
     for last in results.horizons[-1:]:
-        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN
+        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN.
         if np.isfinite(errors).all():
             return results.joints[errors.argmax()], errors.max()
     return "", math.inf
 
 
 def _slow_or_fast(results: Measurements, k: int) -> str:
-    """Return the words for slow or for fast motion of joint k, whichever has the larger torque residual.
+    """Return " near standstill" or " at speed", if the torque residual of joint k is larger in slow or in fast motion.
 
-    The result is "" if the residuals are similar, or if the logs contain too few slow or fast samples.
+    The result is "" if the residuals are similar, or if the curves contain too few slow or fast samples.
     """
     if not results.traces.torques:
         return ""
@@ -248,8 +248,7 @@ def _recommendations(
 ) -> dict[str, str]:
     """Return motions to record, with reasons, the most useful first.
 
-    worst: joint of the largest error. speed: " near standstill", " at speed" or "", the motion in which the torque
-    error of this joint is larger.
+    worst, speed: name of the worst joint and words for its worst speed, see `_worst_joint`.
     """
     recommendations = {}
     trained = identified.get("coverage") or {}
@@ -267,7 +266,8 @@ def _recommendations(
     fractions = {}
     for joint, covered, bound in zip(results.joints, trained.get("q", ()), limits, strict=False):
         if bound is not None and bound[1] > bound[0] and joint not in independent:
-            # One revolution covers a continuous joint, so larger ranges count as one revolution.
+            # A motion of one revolution covers all positions of a revolute joint, so a wider range counts as one
+            # revolution.
             fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
     if fractions:
         joint = min(fractions, key=fractions.__getitem__)
@@ -281,10 +281,11 @@ def _recommendations(
 def _outside(
     trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str], independent: Collection[str]
 ) -> list[str]:
-    """Return the quantities whose range in the test logs exceeds the range in the training logs by a tenth.
+    """Return the positions and velocities, such as "positions of elbow", that exceed the range of the training logs.
 
-    trained, tested: `coverage` of the training logs and of the test logs. independent: names of joints on whose
-    position the dynamics do not depend; the positions of these joints are omitted.
+    A quantity is returned if the test logs exceed either end of the range by more than 10 % of the range. trained,
+    tested: `coverage` of the training logs and of the test logs. independent: names of joints on whose position the
+    dynamics do not depend; their positions are omitted.
     """
     exceeded = []
     for quantity, word in (("q", "positions"), ("qd", "velocities")):
@@ -292,7 +293,7 @@ def _outside(
         for name, inner, outer in ranges:
             if quantity == "q" and name in independent:
                 continue
-            # A tenth is tolerated, because models extrapolate over small distances.
+            # 10 % is tolerated, because models extrapolate over small distances.
             room = 0.1 * (inner["high"] - inner["low"])
             if outer["low"] < inner["low"] - room or outer["high"] > inner["high"] + room:
                 exceeded.append(f"{word} of {name}")

@@ -47,19 +47,26 @@ def motion_bounds(
     joints: Mapping[str, UrdfJoint] | None = None,
     ranges: Mapping[str, tuple[float, float]] | None = None,
 ) -> MotionBounds:
-    """Return bounds with the central fraction of the position ranges, and a fraction of the velocity limits.
+    """Return bounds that are fractions of the position ranges and of the velocity limits.
 
-    joints: joints of the URDF by name; with them, ranges are reduced so that <mimic> joints keep their limits. ranges:
-    position ranges by name of the joint, in place of its limits. The default range of continuous joints is -pi to pi.
-    Raises ArmError for a joint without a range, or whose limits are not increasing.
+    Args:
+        arm: The arm.
+        range_fraction: Fraction of each position range; the middle of the range is unchanged.
+        speed_fraction: Fraction of each velocity limit.
+        joints: {name: joint of the URDF}. The bounds are then reduced so that <mimic> joints keep their limits. None:
+            limits of mimic joints are ignored.
+        ranges: {name of a joint: position range}, in place of the limits in the URDF. A continuous joint without a
+            range has the range -pi to pi.
+
+    Raises ArmError for a joint without a range, or with limits that are not increasing.
     """
     limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
     for k, coordinate in enumerate(arm.coordinates):
         default = (-pi, pi) if coordinate.continuous else (nan, nan)
         limits[k] = sorted((ranges or {}).get(coordinate.name) or coordinate.limits or default)
         speeds[k] = coordinate.velocity or SPEEDS[coordinate.joint_type]
-    # A mimic joint is a linear function of its coordinate: narrow the range of the coordinate to keep the limits
-    # of both joints.
+    # The position of a mimic joint is a linear function of the position of its driving joint. The range of the driving
+    # joint is narrowed until both joints keep their limits.
     for body in arm.bodies:
         k, factor = body.coordinate, float(body.multiplier)
         mimic = (joints or {}).get(body.name)
@@ -117,6 +124,6 @@ class Surroundings(Group):
 
 
 def read_surroundings(path: Path) -> Surroundings:
-    """Read surroundings from a YAML file. Raises SettingsError, or SpelgenErrors for several errors."""
+    """Return the surroundings in a YAML file. Raises SettingsError, or SpelgenErrors for several errors."""
     document = read_document(path)
     return validated(Surroundings, document.value(), document)

@@ -30,7 +30,11 @@ FLOOR = "the floor"
 
 @dataclass(frozen=True)
 class Contact:
-    """The first time [s] at which two objects are closer than the clearance, and their distance [m] at this time."""
+    """Contact of two objects during a motion.
+
+    time: first time at which the objects are closer than the clearance [s]. distance: distance at this time [m]. first,
+    second: names of the objects.
+    """
 
     time: float
     distance: float
@@ -44,13 +48,17 @@ class Contact:
 class Collisions:
     """Distances of the links of an arm to each other, and to floor and boxes.
 
-    Links of the same body, or of two bodies connected by a joint, are not compared, because their shapes overlap. Pairs
-    that are too close at nearly all random positions are not compared either; ``ignored`` lists these pairs. unread:
-    names of the links whose shapes cannot be read. clearance: smallest allowed distance [m].
+    The objects are the collision shapes of the links, the floor and the boxes. Links of the same body, or of two bodies
+    connected by a joint, are not compared, because their shapes overlap.
+
+    Attributes:
+        clearance: Smallest allowed distance [m].
+        unread: Names of the links whose shapes cannot be read.
+        ignored: Pairs of objects that are not compared, because they are too close at nearly all random positions.
     """
 
     def __init__(self, arm: Arm, surroundings: Surroundings, bounds: MotionBounds) -> None:
-        """Raises LookupError if the URDF has no collision shape that can be read."""
+        """Initialize the shapes and pairs. Raises LookupError if the URDF has no collision shape that can be read."""
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
         shapes = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
         self.unread = shapes.unread_text
@@ -61,8 +69,8 @@ class Collisions:
         frames = lump_links(robot, choose_chain(robot, chain.joint_names, None), arm.angle_tolerance).frames
         self._model, self._constraint = kinematic_model(chain), body_constraint(chain)
         self._geometry = pin.GeometryModel()
-        self._bodies: list[int] = []  # index of the body of each object; -1: the root link
-        # largest distance of a shape from the origin of each body [m]
+        self._bodies: list[int] = []  # The index of the body that carries each object; -1 is the root link.
+        # For each body: the largest distance of a point of its shapes from the origin of its frame, (bodies,) [m].
         self._extents = np.zeros(len(chain.bodies))
         for shape in shapes.shapes:
             frame = frames[shape.link]
@@ -83,12 +91,12 @@ class Collisions:
 
     @property
     def pairs(self) -> int:
-        """Number of pairs of objects that are compared."""
+        """Number of pairs of objects whose distance is computed."""
         return len(self._geometry.collisionPairs)
 
     @property
     def statement(self) -> str:
-        """Text for users: which collisions are checked, and which are not."""
+        """Text for users that lists the pairs that are checked for collisions and the pairs that are not."""
         pairs = counted(self.pairs, "pair")
         clearance = f"approach included; all keep {1e3 * self.clearance:g} mm"
         text = f"Checked: {pairs} of links{self._surroundings}, {clearance}."
@@ -105,15 +113,17 @@ class Collisions:
         return np.array([result.min_distance for result in self._found.distanceResults])
 
     def contact(self, motion: Motion) -> Contact | None:
-        """Return the first contact of a motion; None guarantees that every distance is positive at all times.
+        """Return the first contact of a motion; None if there is none.
 
-        Distances are computed at selected positions, between which the distance of any two points changes by at most
-        1.5 times the clearance. At any other position of the motion, a distance therefore differs by at most 0.75 times
-        the clearance from its value at the nearest selected position.
+        Distances are computed at selected positions of the motion. From one selected position to the next, a distance
+        changes by at most 1.5 times the clearance. Between two selected positions it therefore differs by at most 0.75
+        times the clearance from its value at the nearer one, and is positive if all computed distances are at least
+        the clearance.
         """
         lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
         path = np.concatenate([[0.0], np.cumsum(lengths)])
-        # Steps are equal in path length, not in time: slow motion needs no more positions than fast motion.
+        # The selected positions are equidistant in path length and not in time, so that a slow motion needs no more
+        # positions than a fast motion.
         points = np.linspace(0.0, path[-1], ceil(path[-1] / (1.5 * self.clearance)) + 1)
         for point in points:
             q = np.array([np.interp(point, path, column) for column in motion.q.T])
@@ -131,10 +141,10 @@ class Collisions:
         return Contact(time, float(distances[nearest]), *self._names(nearest))
 
     def penalty(self, q: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the sum of squared violations of a margin over pairs and positions q (T, n), and its gradient (T, n).
+        """Return the penalty on distances below a margin at positions q (T, n), and its gradient (T, n).
 
-        The margin is ``TUNING.margin`` times the clearance. The violation of a pair is 1 - distance / margin, if
-        positive.
+        The penalty is the sum over positions and pairs of max(0, 1 - distance / margin)^2. The margin is
+        ``TUNING.margin`` times the clearance.
         """
         value, gradient, margin = 0.0, np.zeros_like(q), TUNING.margin * self.clearance
         for row, position in enumerate(q):
@@ -164,15 +174,15 @@ class Collisions:
             if joint:
                 frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
                 jacobian = pin.getJointJacobian(self._model, self._data, joint, frame)
-                # The derivative is the velocity of the nearest points along the normal, which points from the first to
-                # the second object.
+                # The derivative of the distance is the relative velocity of the two nearest points along the normal,
+                # which points from the first to the second object.
                 arm = np.cross(point - self._data.oMi[joint].translation, result.normal)
                 gradient += sign * (result.normal @ jacobian[:3] + arm @ jacobian[3:])
         derivative: np.ndarray = gradient @ self._constraint.jacobian
         return derivative
 
     def _add(self, name: str, body: int, pose: np.ndarray, geometry: coal.CollisionGeometry) -> None:
-        """Add an object that a body carries. pose: pose of the object in the frame of the body, (4, 4)."""
+        """Add an object that is fixed to a body. pose: pose of the object in the frame of the body, (4, 4)."""
         unique = f"{len(self._bodies)} {name}"
         placed = pin.GeometryObject(unique, body + 1, pin.SE3(pose), geometry)
         self._geometry.addGeometryObject(placed)
@@ -190,10 +200,13 @@ class Collisions:
         return first.partition(" ")[2], second.partition(" ")[2]
 
     def _pairs(self, chain: Chain, links: int) -> Iterator[tuple[int, int]]:
-        """Yield the pairs of objects to be compared; the first `links` objects are shapes of links."""
+        """Yield the indices of the two objects of each pair to be compared.
+
+        links: number of objects that are shapes of links; they are the first objects.
+        """
         neighbour: dict[int, int] = {}
         for index, body in enumerate(chain.bodies):
-            # The neighbour of a body is its nearest ancestor that has a shape.
+            # The shapes of a body and of its parent overlap. A parent without a shape is replaced by its own parent.
             parent = body.parent
             while parent >= 0 and parent not in self._bodies:
                 parent = chain.bodies[parent].parent
@@ -205,12 +218,13 @@ class Collisions:
                     yield index, k
 
     def _largest_displacements(self, chain: Chain, bounds: MotionBounds) -> np.ndarray:
-        """Return an upper bound of the displacement of any point per displacement of each coordinate, (n,) [m/rad, 1].
+        """Return upper bounds w of the displacement of a point of the arm, (n,) [m/rad, 1].
 
-        The distance from a joint to any point of the arm beyond it is at most the length of the chain beyond the joint.
+        If joint k moves by dq, no point of the arm moves by more than w[k] |dq|. For a revolute joint, w[k] is the
+        length of the chain beyond the joint.
         """
         extents, weights = self._extents.copy(), np.zeros(len(chain.coordinates))
-        # largest displacement of a coordinate from zero: a prismatic joint lengthens the chain by it
+        # A prismatic joint makes the chain longer by at most `travel`, (n,).
         travel = np.maximum(np.abs(bounds.low), np.abs(bounds.high))
         # Bodies are visited from the tip to the root, so that the extent of a body includes all bodies beyond it.
         for index, body in reversed(list(enumerate(chain.bodies))):
@@ -226,15 +240,18 @@ class Collisions:
         return weights
 
     def _remove_overlapping(self, bounds: MotionBounds, links: int) -> tuple[str, ...]:
-        """Remove the pairs that are too close at nearly all random positions within bounds; return the removed ones."""
+        """Remove pairs that are too close at nearly all random positions within the bounds; return their names.
+
+        links: number of objects that are shapes of links; they are the first objects.
+        """
         generator = np.random.default_rng(0)
         random = generator.uniform(bounds.low, bounds.high, (TUNING.positions, len(bounds.low)))
         share = np.mean([self.distances(q) < self.clearance for q in random], axis=0)
         names: dict[str, None] = {}
         for pair in reversed(range(self.pairs)):
             objects = self._geometry.collisionPairs[pair]
-            # Pairs with floor or boxes are removed only if they are too close at all positions: no joint can separate
-            # them.
+            # A pair with the floor or a box is removed only if it is too close at all positions, as for a base on the
+            # floor: otherwise the motion must avoid the contact.
             if share[pair] >= (TUNING.overlap if objects.second < links else 1.0):
                 names[" and ".join(self._names(pair))] = None
                 self._geometry.removeCollisionPair(objects)
@@ -257,5 +274,5 @@ def _geometry(shape: LinkShape) -> coal.CollisionGeometry:
     points = coal.StdVec_Vec3s()
     for vertex in shape.mesh[0]:
         points.append(vertex)
-    # Options of Qhull. Qt: triangulated facets. QJ: joggled input, so that flat meshes have a hull, too.
+    # Options of Qhull: Qt makes triangular facets. QJ perturbs the vertices slightly, so that flat meshes have a hull.
     return coal.Convex.convexHull(points, False, "Qt QJ")

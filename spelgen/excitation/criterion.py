@@ -1,9 +1,9 @@
-"""Criterion of exciting motions.
+"""Criterion that the parameters of an exciting motion minimize.
 
-It is the logarithm of the condition number of the base regressor with columns of unit length (Swevers et al., IEEE T-RA
-13:730, 1997), plus penalties on violated effort limits, on distances below a margin and on reduced amplitudes. The
-last penalty is needed because columns of unit length hide the amplitude of the motion, while the signal-to-noise ratio
-of the torque depends on it.
+The criterion is the logarithm of the condition number of the base regressor with columns of unit length (Swevers et
+al., IEEE T-RA 13:730, 1997) plus penalties. There are penalties on violated effort limits, on distances below a margin,
+and on reduced amplitudes. The penalty on amplitudes is needed because the condition number of columns of unit length
+does not depend on the amplitude of the motion, but the signal-to-noise ratio of the torque does.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Criterion:
         count = TUNING.samples_per_harmonic * trajectory.harmonics + 1
         self.times = torch.linspace(0.0, trajectory.duration, count, dtype=torch.float64)
         self.inertial = torch.from_numpy(urdf_parameters(arm))
-        # Without <inertial> elements the torque is unknown, so effort limits are ignored.
+        # If a body has no <inertial>, the torques are unknown, so effort limits are ignored.
         is_known = all(body.inertia for body in arm.bodies)
         efforts = [(is_known and coordinate.effort) or torch.inf for coordinate in arm.coordinates]
         self.limits = torch.tensor(efforts, dtype=torch.float64)
@@ -52,9 +52,9 @@ class Criterion:
         return self.trajectory.states(torch.from_numpy(parameters), self.times)
 
     def condition(self, states: Tensor) -> float:
-        """Return the condition number of the base regressor with unit columns, for states (3, T, n).
+        """Return the condition number of the base regressor with columns of unit length, for states (3, T, n).
 
-        It is infinite if a column is zero.
+        The result is infinite if a column is zero.
         """
         return float(self._log_condition(self._rows(states)).exp())
 
@@ -67,11 +67,11 @@ class Criterion:
         return np.asarray(torch.where(self.limits.isinf(), torch.nan, largest).numpy())
 
     def value(self, parameters: np.ndarray) -> float:
-        """Return the criterion for parameters (size,)."""
+        """Return the value of the criterion for parameters (size,)."""
         return float(self._value(torch.from_numpy(parameters)))
 
     def value_and_gradient(self, parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the criterion and its gradient (size,) for parameters (size,) with a finite criterion."""
+        """Return the criterion and its gradient (size,) for parameters (size,). The criterion must be finite."""
         variables = torch.from_numpy(parameters).requires_grad_()
         value = self._value(variables)
         (gradient,) = torch.autograd.grad(value, variables)
@@ -86,7 +86,8 @@ class Criterion:
         penalties = TUNING.penalty * overrun.square().sum() + reduction
         if self.collisions is not None:
             value, gradient = self.collisions.penalty(states[0].detach().numpy())
-            # Distances are not differentiable by torch: add a linear function of q with their value and gradient.
+            # Torch cannot differentiate the penalty on distances, so it is replaced by a linear function of q with the
+            # same value and gradient.
             change = torch.from_numpy(gradient) * (states[0] - states[0].detach())
             penalties = penalties + TUNING.collision_penalty * (value + change.sum())
         return self._log_condition(rows) + penalties
@@ -107,7 +108,7 @@ class Criterion:
         """Return the logarithm of the condition number, (), from the regressor (T, n, K)."""
         columns = rows[:, :, self.columns].flatten(0, 1)
         length = columns.norm(dim=0)
-        # the column of a parameter that the motion does not excite is zero
+        # The column of a parameter that the motion does not excite is zero.
         if not length.all():
             return torch.tensor(torch.inf, dtype=torch.float64)
         condition: Tensor = torch.linalg.cond(columns / length)

@@ -71,7 +71,8 @@ def excite(
     ranges = arm.robot.joint, arm.settings.simulation.positions
     limits = motion_bounds(arm.chain, 1.0, 1.0, *ranges)
     bounds = motion_bounds(arm.chain, reach, speed, *ranges)
-    # Without a limit of the acceleration, the approach reaches its largest speed in one second.
+    # `strongest` is the acceleration limit of the approach. If it is not given, the approach reaches its largest speed
+    # in one second.
     strongest = bounds.speed
     if acceleration is not None:
         strongest = _joint_values("acceleration", acceleration, arm.chain, positive=True)
@@ -83,7 +84,8 @@ def excite(
         fraction = TUNING.range_factor**attempt
         trajectory = ExcitationTrajectory(duration, harmonics, bounds.narrowed(fraction))
         criterion = Criterion(arm.chain, trajectory, collisions)
-        # The seed changes as well as the range: the same random motions would probably lead to the same contact.
+        # Each attempt has another seed in addition to a smaller range, because the same random motions would probably
+        # lead to the same contact.
         starts = np.random.default_rng(seed + attempt).standard_normal((TUNING.starts, trajectory.size))
         best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
         motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
@@ -111,7 +113,7 @@ def excite(
 
 
 def _other_designs(seed: int, attempt: int, reach: float) -> str:
-    """Return a sentence about the designs of earlier attempts, which had contacts; "" for the first attempt."""
+    """Return a sentence about earlier attempts, whose designs had contacts; "" if there was no earlier attempt."""
     if attempt == 0:
         return ""
     return (
@@ -156,11 +158,14 @@ def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, pos
 def _collisions(
     arm: Arm, surroundings: Surroundings | Path | str | None, limits: MotionBounds
 ) -> tuple[Collisions | None, str]:
-    """Return (collisions, text): the `Collisions` of an arm, None if they cannot be computed; a text for users."""
+    """Return the `Collisions` of an arm, and a text for users that states the checked collisions.
+
+    If collisions cannot be checked, the first result is None and the text states the reason.
+    """
     if not isinstance(surroundings, Surroundings):
         surroundings = Surroundings() if surroundings is None else read_surroundings(Path(surroundings))
     try:
-        # imported here, since Pinocchio is an optional dependency
+        # Pinocchio is an optional dependency, so the import is in this function.
         from spelgen.excitation.collisions import Collisions
 
         collisions = Collisions(arm, surroundings, limits)
@@ -176,7 +181,10 @@ def _collisions(
 def _start(
     start: Sequence[float] | None, arm: Chain, limits: MotionBounds, collisions: Collisions | None
 ) -> np.ndarray:
-    """Return the position from which the approach starts, (n,). Raises SettingsError, ArmError for a contact."""
+    """Return the position from which the approach starts, (n,) [rad, m].
+
+    Raises SettingsError for an invalid position, and ArmError for a position with a contact.
+    """
     if start is None:
         middle = (limits.low + limits.high) / 2
         # The default is zero if possible, since the controllers of most arms start at zero.
@@ -199,18 +207,18 @@ def _start(
 def _improved(
     criterion: Criterion, initial: np.ndarray, trials: int, progress: Callable[[int, int], None]
 ) -> np.ndarray:
-    """Minimize the criterion by L-BFGS from initial parameters (size,); return the best of `trials` evaluated ones.
+    """Minimize the criterion by L-BFGS from initial parameters (size,); return the parameters of the smallest value.
 
     The criterion is not differentiable if singular values are equal, or if two samples have the largest speed. L-BFGS
-    is efficient for such functions (Lewis and Overton, Math. Program. 141:135, 2013). Its last iterate need not be the
-    best one, so all evaluations are compared.
+    is efficient for such functions (Lewis and Overton, Math. Program. 141:135, 2013). The last parameters may not be
+    the best, so the values of all `trials` evaluations are compared.
     """
     best, lowest, done = initial, criterion.value(initial), 0
     if not isfinite(lowest):
         return initial
 
     def evaluate(parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the criterion and its gradient (size,), and store the parameters if they are the best ones so far."""
+        """Return the criterion and its gradient (size,), and store the parameters if the criterion is the smallest."""
         nonlocal best, lowest, done
         value, gradient = criterion.value_and_gradient(parameters)
         done += 1
@@ -219,8 +227,8 @@ def _improved(
         progress(min(done, trials), trials)
         return value, gradient
 
-    # No tolerance of the cost ends the search: a step with a small decrease may be followed by one with a large
-    # decrease. Only the number of trials is limited.
+    # The tolerance of the cost is zero, because a step with a small decrease may be followed by a step with a large
+    # decrease. The search ends after `trials` evaluations.
     options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.history, "ftol": 0.0}
     minimize(evaluate, initial, jac=True, method="L-BFGS-B", options=options)
     return best

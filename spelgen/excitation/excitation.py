@@ -19,11 +19,16 @@ ADVICE = "View the motion, then run it slowly: a load, cables and anything else 
 class Excitation:
     """A proposed motion and its quality.
 
-    The motion starts and ends at rest. approach: motion from the start position to the first position of the motion.
-    collisions: text about the checked collisions. parameters: number of base parameters, friction and armature
-    included. condition: condition number of the base regressor with columns of unit length. first: the same condition
-    number for the first random motion. efforts: (n,) largest torque of the URDF's bodies divided by the effort limit;
-    NaN without limit or inertials. first_efforts: the same ratios for the first random motion.
+    Attributes:
+        arm: The arm.
+        motion: The proposed motion, which starts and ends at rest.
+        approach: Motion from the start position to the first position of `motion`.
+        collisions: Text about the checked collisions.
+        parameters: Number of base parameters, friction and armature included.
+        first: Condition number for the first random motion, for comparison.
+        condition: Condition number of the base regressor with columns of unit length for `motion`.
+        efforts: Largest rigid-body torque divided by the effort limit, (n,) [1]; NaN without a limit or inertials.
+        first_efforts: Same as `efforts`, for the first random motion.
     """
 
     arm: Chain
@@ -47,7 +52,7 @@ class Excitation:
         paragraphs = [head, self.listing().text()]
         if (self.efforts > 1).any():
             paragraphs.append("warning: effort limits are overrun: no motion was found that keeps them")
-        # A default speed limit may be wrong for this robot, so the text names it: the user should set the limit.
+        # The text names the joints that have a default speed limit, because this limit may be wrong for the robot.
         lacking = [c.name for c in self.arm.coordinates if not c.velocity]
         if lacking:
             summary = f"no velocity limit, 1 rad/s or 0.25 m/s taken: {', '.join(lacking)}"
@@ -97,7 +102,7 @@ class Excitation:
         motion, file = self.motion, io.StringIO()
         csv.writer(file, lineterminator="\n").writerow(head)
         rows = np.concatenate([motion.t[:, None], motion.q, motion.qd, motion.qdd], axis=1)
-        np.savetxt(file, np.round(rows, 9) + 0.0, "%.9f", ",")  # adding zero turns -0 into 0
+        np.savetxt(file, np.round(rows, 9) + 0.0, "%.9f", ",")  # The zero that is added turns -0 into 0.
         return file.getvalue()
 
     def joint_trajectory(self) -> str:
@@ -128,5 +133,9 @@ class Excitation:
 
 
 def _numbers(values: np.ndarray) -> str:
-    """Return a list of numbers (n,) as text, with nine decimals. YAML would read numbers with an exponent as text."""
-    return f"[{', '.join(f'{x:.9f}' for x in np.round(values, 9) + 0.0)}]"  # adding zero turns -0 into 0
+    """Return numbers (n,) as the text of a list, with nine decimals.
+
+    No number has an exponent, because YAML would read it as text.
+    """
+    # The zero that is added turns -0 into 0.
+    return f"[{', '.join(f'{x:.9f}' for x in np.round(values, 9) + 0.0)}]"

@@ -15,13 +15,13 @@ from torch import Tensor
 from spelgen.excitation.bounds import MotionBounds
 from spelgen.excitation.tuning import TUNING
 
-# [1] Lower bound of the ratio between the maximum of a Fourier series on the grid and its maximum over time.
+# [1] Lower bound of a ratio: the maximum of a Fourier series at the grid points, divided by its maximum at all times.
 GRID_RATIO = cos(pi / TUNING.grid)
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion: q, qd and qdd, (T, n) [rad, m, s], at times t (T,) from 0 to the duration [s]."""
+    """A motion: q, qd and qdd, (T, n) each [rad, m, s], at times t (T,) [s], which start at 0."""
 
     t: np.ndarray
     q: np.ndarray
@@ -66,13 +66,16 @@ def approach(
 
 @dataclass(frozen=True, eq=False)
 class ExcitationTrajectory:
-    """Parametrized motions of n joints: Fourier series of H harmonics over one period that keep given bounds.
+    """Parametrized motions of n joints: one period of Fourier series of H harmonics that keep given bounds.
 
-    Any real parameters (size,) give a valid motion, so the design needs no constraints. The parameters of each joint
-    are H sine and H cosine coefficients (only their ratios matter), the offset of the motion within the position range,
-    and the reduction of the amplitude from the largest one that the bounds allow. Velocity and acceleration are zero at
-    both ends: sine coefficients are projected to be orthogonal to (1, 2, ..., H), cosine coefficients to (1, 4, ...,
-    H^2).
+    Any real parameters (size,) give a valid motion, so the design needs no constraints. The parameters of a joint are:
+
+    - H sine and H cosine coefficients. Only their ratios are used: they give the shape of the motion.
+    - The offset of the motion within the position range.
+    - The reduction of the amplitude, relative to the largest amplitude within the bounds.
+
+    Velocity and acceleration are zero at both ends. For this, the vector of sine coefficients is projected to be
+    orthogonal to (1, 2, ..., H), and the vector of cosine coefficients to be orthogonal to (1, 4, ..., H^2).
     """
 
     duration: float
@@ -97,8 +100,9 @@ class ExcitationTrajectory:
     def states(self, parameters: Tensor, t: Tensor) -> Tensor:
         """Return q, qd and qdd, (3, T, n), for parameters (size,) at times t (T,) [s].
 
-        The bounds hold at all times: the maximum of a series of H harmonics is at most 1 / cos(pi / density) times its
-        maximum on a grid with `density` points per harmonic (Ehlich and Zeller, Math. Z. 86:41, 1964).
+        The motion keeps its bounds at all times. They are enforced at grid points with a safety factor: the maximum of
+        a series of H harmonics is at most 1 / cos(pi / N) times its maximum on a grid with N points per period of the
+        highest harmonic (Ehlich and Zeller, Math. Z. 86:41, 1964).
         """
         coefficients, offsets = self._coefficients(parameters)
         points = torch.linspace(0.0, self.duration, TUNING.grid * self.harmonics + 1, dtype=torch.float64)
@@ -112,10 +116,11 @@ class ExcitationTrajectory:
         if self.bounds.acceleration is not None:
             strongest = accelerations.abs().amax(dim=0) / GRID_RATIO
             largest = torch.minimum(largest, torch.from_numpy(self.bounds.acceleration) / strongest)
-        # any parameter gives an amplitude between zero and the largest one
+        # Any value of the parameter gives an amplitude between zero and the largest amplitude within the bounds.
         amplitude = largest * (-self.amplitude_reduction(parameters)).exp()
-        free = room - 2 * amplitude * half  # width of the range in which the offset is free
-        # tanh: any parameter gives an offset within the free range
+        # `free` is the width of the range of offsets for which the motion keeps the position range, (n,). The tanh maps
+        # any value of the parameter into this range.
+        free = room - 2 * amplitude * half
         offset = low - amplitude * (middle - half) + free * (1 + offsets.tanh()) / 2
         q, qd, qdd = amplitude * self._signals(coefficients, t)
         return torch.stack([offset + q, qd, qdd])
@@ -136,10 +141,13 @@ class ExcitationTrajectory:
         return torch.stack(at_rest), rows[:, -2]
 
     def _signals(self, coefficients: Tensor, t: Tensor) -> Tensor:
-        """Return position, velocity and acceleration, (3, T, n), of coefficients (2, H, n) at times t (T,)."""
-        frequencies = self._numbers() * 2 * pi / self.duration  # angular frequencies [rad/s]
+        """Return position, velocity and acceleration, (3, T, n), of Fourier series at times t (T,) [s].
+
+        coefficients: sine and cosine coefficients, (2, H, n).
+        """
+        frequencies = self._numbers() * 2 * pi / self.duration  # (H,) [rad/s]
         angles = torch.outer(t, frequencies)
-        sine, cosine = angles.sin(), angles.cos()  # (T, H)
+        sine, cosine = angles.sin(), angles.cos()  # (T, H) each
         a, b = coefficients
         first, second = frequencies[:, None], (frequencies**2)[:, None]
         position = sine @ a + cosine @ b
@@ -148,5 +156,5 @@ class ExcitationTrajectory:
         return torch.stack([position, velocity, acceleration])
 
     def _numbers(self) -> Tensor:
-        """Return the numbers of the harmonics, 1 to H, (H,)."""
+        """Return 1, 2, ..., H, the numbers of the harmonics, (H,)."""
         return torch.arange(1, self.harmonics + 1, dtype=torch.float64)

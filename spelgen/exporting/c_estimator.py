@@ -1,7 +1,8 @@
 """Export of the estimator of payload, friction drift and external torques: a C header and a C source.
 
-They are added to the C files of the model. The noise levels, which were estimated in training, are constants of the C
-code. Functions of the model that only the estimator calls are CasADi expressions of the formulas of `live.momentum`.
+Both files are added to the C files of the model. The noise levels estimated from the training logs are constants in the
+C code. Functions that only the estimator calls are generated from CasADi expressions, with the formulas of
+`live.momentum`.
 """
 
 import math
@@ -50,7 +51,7 @@ _ENTRIES = (
 def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFunction]:
     """Return the C functions that only the estimator calls: the terms of the momentum balance, and payload torques.
 
-    levels: noise levels of the run; their point of the last body is a constant of the C code.
+    levels: noise levels; ``levels.point``, the tip in the frame of the last body, is a constant in the C code.
     """
     n, bodies = model.n, model.arm.bodies
     sizes = {"q": n, "qd": n, "qdd": n, "tau": n, "load": 10, "low": model.memory, "high": model.memory}
@@ -58,8 +59,8 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     q, qd, qdd, tau, load, low, high = inputs.values()
     residuals, still = residual_symbols(model), ca.SX(n, 1)
     arm = RigidBodies(model.arm, q, model.inertias)
-    # The payload is a second set of bodies, in which only the last body has an inertia. The momentum and
-    # torque of this set are linear in the payload's ten inertial parameters.
+    # The payload is represented by a second set of bodies, in which only the last body has inertial parameters. The
+    # momentum and the torque of this set are linear in these ten parameters.
     payload = RigidBodies(model.arm, q, [ca.SX(10, 1)] * (len(bodies) - 1) + [load])
     momentum, kinetic_gradient = arm.momentum(qd)
     momentum += joint_mass(model, residuals) @ qd
@@ -67,16 +68,18 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     gradient = kinetic_gradient + residuals["kinetic"] - gravity - residuals["gravity"] - residuals["torque"]
     applied = constant(model.inputs) @ (tau - model.torque_offset)
     torque = applied + constant(model.friction_compensation) * qd + gradient
-    # The friction state z is only known to lie in [low, high]. The estimate of friction is the mean of the
-    # friction torques at both ends, its uncertainty half their difference.
+    # The estimator only knows an interval [low, high] of the friction state z. The estimated friction is the mean of
+    # the friction torques at both ends of the interval; its uncertainty is half their difference.
     first, second = (drive_friction(model, residuals, qd, gravity, z) for z in (high, low))
-    # pose and Jacobian of the last body's frame in the root frame; linear rows first, then angular rows
+    # Pose and Jacobian of the last body's frame relative to the root frame. The Jacobian has three rows of linear
+    # velocity, then three rows of angular velocity.
     pose, jacobian = frame_kinematics(bodies, len(bodies) - 1, np.eye(4), q)
     rotation, weight = pose[:3, :3], load[0] * constant(model.arm.gravity)
     load_momentum, load_gradient = payload.momentum(qd)
     moment = ca.cross(rotation @ load[1:4], constant(model.arm.gravity))
-    # The payload's gravity torque is J^T times its weight. The Newton-Euler algorithm would have larger rounding
-    # errors: the log odds of "no payload" would differ 40 times as much from the Python estimator.
+    # The payload's gravity torque is computed as J^T (weight, moment of the weight). The Newton-Euler algorithm would
+    # have larger rounding errors: the estimator's log odds of "no payload" would differ 40 times as much from the
+    # Python estimator.
     load_gradient += jacobian.T @ ca.vertcat(weight, moment)
     at_point = jacobian[:3, :] - ca.skew(rotation @ levels.point) @ jacobian[3:, :]
     outputs = {
@@ -93,7 +96,7 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
 
 
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
-    """Return the texts of the estimator's header and source by file name."""
+    """Return {file name: text} of the estimator's header and source."""
     # C has no empty arrays, so a model without bristles gets one unused zero.
     breakaway = model.breakaway.ravel() if model.memory else [0.0]
     tables: dict[str, Iterable[float]] = {
@@ -117,8 +120,8 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, model.input_inverse)),
     }
-    # The generated code contains this checksum of all constants, so that it can refuse a state that another
-    # estimator saved.
+    # The generated code contains a checksum of all constants. With it, the code refuses a saved state of an estimator
+    # with other constants.
     identity = zlib.crc32(repr(sorted((name, str(value)) for name, value in values.items())).encode())
     files: dict[str, str] = {}
     for suffix in (".h", ".c"):

@@ -1,4 +1,4 @@
-"""--to c: a C99 header and source, compiled and compared with the model if there is a compiler."""
+"""Export with ``--to c``: a C99 header and source, compiled and compared with the model if there is a compiler."""
 
 import ctypes
 import shutil
@@ -23,7 +23,7 @@ _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 
 
 def export_c(trained: Trained) -> Exported:
-    """Return the C files of a trained model. Raises RunError if their results differ from the model's."""
+    """Return the C files of a trained model. Raises RunError if their results differ from the results of the model."""
     files, checked = c_files(trained)
     name = trained.described.name
     use = (
@@ -35,7 +35,7 @@ def export_c(trained: Trained) -> Exported:
 
 
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
-    """Return header and source by file name, and a sentence with the result of the parity check."""
+    """Return {file name: content} of the C files, and a sentence with the result of the parity check."""
     model, levels = trained.described, trained.levels
     entries, texts = dict(trained.entry_points), {}
     if levels is not None:
@@ -78,7 +78,7 @@ def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -
 def called_by_c(
     library: Path, functions: Sequence[CFunction], dtype: type[np.floating] = np.float64
 ) -> Called:
-    """Return a function that calls a compiled export for arrays of states and returns float64 arrays."""
+    """Return a function for `check_parity`, which calls an entry point of a compiled export for arrays of states."""
     loaded = ctypes.CDLL(str(library))
     by_name = {function.entry.name: function for function in functions}
     # The friction state is double even if all other arrays are float.

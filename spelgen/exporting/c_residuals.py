@@ -1,8 +1,8 @@
 """C code of the residual terms of a model, which are added to the rigid bodies.
 
-Networks are loops over tables of weights. Functions of the position of one joint are splines (tables with a polynomial
-per interval) and ripple (harmonics, computed as powers of a phasor exp(i f q)). The C code of an entry point first
-calls the functions that compute its residual terms (see `residual_expressions`).
+Networks are evaluated by loops over tables of weights. Residual terms of a single joint are splines (tables with one
+polynomial per interval) and ripple (harmonics k = 1, 2, ... of a frequency f, computed as powers of exp(i f q)). The C
+code of an entry point first calls the functions that compute its residual terms (see `residual_expressions`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ _CALLS = (
 
 
 def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the C variables of the residual terms ``names``, and the C calls that compute these variables."""
+    """Return the C declarations of the residual terms ``names``, and the C calls that compute these terms."""
     uncomputed = set(names)
     symbols = residual_symbols(model)
     variables: list[str] = []
@@ -55,7 +55,7 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
 
 
 def network_source(model: TrainedModel) -> list[str]:
-    """Return a list with one element, the C text of all networks; an empty list if the model has no networks."""
+    """Return a list with the C source of all networks; [] if the model has no networks."""
     n, residuals = model.n, model.residuals
     named = {"mass": residuals.mass, "potential": residuals.potential}
     networks = {name: network for name, network in named.items() if network is not None}
@@ -85,8 +85,8 @@ def network_source(model: TrainedModel) -> list[str]:
 def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
     """Return the C tables of a layer: biases, weights, and the first and last output that each input affects.
 
-    Masked networks have blocks of zero weights: of each input, only the weights between the first and the last nonzero
-    weight are stored.
+    For each input, only the weights from the first to the last nonzero weight are stored, since masked networks have
+    blocks of zero weights.
 
     Args:
         name: prefix of the names of the tables.
@@ -104,9 +104,9 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
 
 
 def joint_function_source(model: TrainedModel) -> list[str]:
-    """Return a list with one element, the C text of the residual terms that depend on one joint each.
+    """Return a list with the C source of the residual terms of single joints; [] if the model has none.
 
-    These terms are splines, ripple and factors on friction. The list is empty if the model has none.
+    These terms are torque splines, torque ripple, and friction factors.
     """
     residuals = model.residuals
     torque, factor = residuals.torque, residuals.friction
@@ -120,7 +120,8 @@ def joint_function_source(model: TrainedModel) -> list[str]:
             intervals = len(polynomials[0])
             tables.append(_table(f"{name}_pieces", np.concatenate(polynomials)))
     if torque:
-        # The C code integrates the torque within one interval, from the energy at the start of this interval.
+        # The table has the potential energy at the start of each interval. Within an interval, the C code integrates
+        # the torque.
         energies = [spline_energy(spline)(spline.t[3:-4]) for spline in torque.values()]
         tables.append(_table("torque_energy", np.concatenate(energies)))
     for k, ripple in enumerate(residuals.ripple, start=1):
@@ -138,25 +139,24 @@ def joint_function_source(model: TrainedModel) -> list[str]:
 
 
 def _polynomials(spline: BSpline) -> np.ndarray:
-    """Return the coefficients of 1, s, s^2 and s^3 of a cubic spline per interval of its knots, (intervals, 4).
+    """Return the polynomials of a cubic spline, (intervals, 4): coefficients of 1, s, s^2, s^3 in each interval.
 
-    s increases from 0 to 1 within an interval.
+    s increases from 0 to 1 within an interval between two knots.
     """
     curve = PPoly.from_spline((np.arange(len(spline.t)), spline.c, 3))
-    # A cubic B-spline has three additional knots at each end. The intervals between the additional knots are outside of
-    # the range of the spline and are removed.
+    # The first three and the last three intervals of a cubic B-spline's knots are outside of its range and are removed.
     return np.asarray(curve.c[::-1, 3 : len(spline.c)].T)
 
 
 def _spline_fields(splines: Mapping[int, BSpline]) -> list[str]:
-    """Return C initialisers: the joint, first knot and knot spacing of each spline."""
+    """Return one C initialiser per spline: "joint, first knot, knot spacing"."""
     spacings = [float(np.ptp(spline.t) / (len(spline.t) - 1)) for spline in splines.values()]
     firsts = [float(spline.t[3]) for spline in splines.values()]
     return [f"{joint}, {x!r}, {h!r}" for joint, x, h in zip(splines, firsts, spacings, strict=True)]
 
 
 def _table(name: str, values: np.ndarray) -> str:
-    """Return the definition of a constant C array with these values, (rows,) or (rows, columns), without rounding."""
+    """Return the definition of a constant C array with unrounded values, (rows,) or (rows, columns)."""
     scalar = "short" if values.dtype.kind == "i" else "real"
     # repr keeps all digits, so that the C compiler gets the same double.
     size = ""

@@ -16,8 +16,8 @@ from spelgen.templates import render
 _WIDTH = 118  # maximum length of a line
 FRICTION_STATES = ("z", "z_next", "z_start", "low", "high")
 """Inputs and outputs that are friction states, of type double; all others are of type ``real``."""
-# SIN and COS are macros for float or double. tanh is always the double function, because only the friction state, which
-# is double, needs it.
+# {0} and {1} are operands. SIN, COS and other macros are the functions for float or double. tanh is used only for the
+# friction state, which is always double.
 _FORMS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
@@ -41,10 +41,13 @@ _FORMS = {
 
 @dataclass(frozen=True)
 class CFunction:
-    """An entry point in C.
+    """C code of an entry point.
 
-    shapes: (rows,) or (rows, columns) per output. operations: upper bound of the number of arithmetic operations of a
-    call.
+    Attributes:
+        symbol: name of the C function.
+        shapes: {output: (rows,) or (rows, columns)}.
+        about: text of the comment above the function.
+        operations: upper bound of the number of arithmetic operations of a call, without networks.
     """
 
     entry: EntryPoint
@@ -63,7 +66,7 @@ def c_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> list[
 
 
 def write_c(model: TrainedModel, functions: Sequence[CFunction], folder: Path) -> Path:
-    """Write header and source into a folder; return the path of the source."""
+    """Write the model's header and source into a folder; return the path of the source."""
     source = folder / f"{model.name}.c"
     for suffix, text in c_texts(model, functions).items():
         source.with_suffix(suffix).write_text(text)
@@ -71,8 +74,9 @@ def write_c(model: TrainedModel, functions: Sequence[CFunction], folder: Path) -
 
 
 def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, str]:
-    """Return the texts of header and source by file name suffix: ``.h`` and ``.c``."""
-    # The header states the number of operations, an upper bound since no branch of the code depends on data.
+    """Return the header and the source of a model as {".h": text, ".c": text}."""
+    # The header states the number of operations of the longest function. It is an upper bound for all inputs, since the
+    # code has no branches that depend on data.
     longest = max(functions, key=lambda function: function.operations)
     facts = [f"At most {longest.operations} operations, in {longest.entry.name}, without networks."]
     if model.servos is not None:
@@ -100,13 +104,14 @@ def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, st
 
 def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
     """Return the C function of an entry point, which computes the outputs of a CasADi function."""
-    # The residual terms are computed first, since the statements refer to them.
+    # The C function computes the residual terms first, since its other statements depend on them.
     residuals, calls = residual_calls(model, residuals_needed(function))
     variables, lines = _statements(function, list(entry.outputs))
     # Casts to void prevent compiler warnings about unused parameters.
     body = [" ".join(f"(void){name};" for name in (*entry.inputs, *entry.outputs))]
     if residuals or variables:
-        # In single precision the sum z + dq would lose small displacements dq.
+        # The friction state is updated in double precision: in single precision, the sum z + dq would lose small
+        # displacements dq.
         scalar = "double" if entry.name == "friction_step" else "real"
         body.append(f"{scalar} {', '.join((*residuals, *variables))};")
     sizes = dict.fromkeys(entry.inputs, f"{model.name.upper()}_N") | {"load": "10"}
@@ -145,9 +150,9 @@ def _parameter(model: TrainedModel, name: str, size: str) -> str:
 def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the variables and the statements of a C function, one statement per CasADi instruction.
 
-    Arrays are row-major and have the names of the inputs of `function` and of ``outputs``. Outputs are dense, so that
-    each number is written once. A variable is a slot of CasADi's work vector; several results use the same slot in
-    turn.
+    The C arrays are row-major; their names are the names of the inputs of `function` and ``outputs``. Outputs are
+    dense, so that each number is written exactly once. Each variable is a slot of CasADi's work vector, which holds
+    several intermediate results in turn.
     """
     inputs = function.name_in()
     # CasADi numbers the entries of a matrix in column-major order, the C arrays are row-major.
@@ -160,9 +165,7 @@ def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str
         if operation == ca.OP_OUTPUT:
             output, index = writes
             rows, columns = shapes[output]
-            row_by_row = (
-                index % rows * columns + index // rows
-            )  # index in the row-major C array, from CasADi's column-major index
+            row_by_row = index % rows * columns + index // rows  # index in the row-major C array
             lines.append(f"{outputs[output]}[{row_by_row}] = a{reads[0]};")
             continue
         if operation == ca.OP_INPUT:
@@ -171,8 +174,7 @@ def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str
             value = f"R({function.instruction_constant(k)!r})"  # the C literal has all digits of the constant
         else:
             value = _FORMS[operation].format(*(f"a{slot}" for slot in reads))
-        # The keys of a dict are unique and keep the order of the first assignments; a set would lose this
-        # order.
+        # A dict is used as an ordered set: its keys are unique and in the order of the first assignments.
         variables[f"a{writes[0]}"] = None
         lines.append(f"a{writes[0]} = {value};")
     return list(variables), lines

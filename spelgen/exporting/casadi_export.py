@@ -1,4 +1,4 @@
-"""--to casadi: a file with a CasADi function for each entry point."""
+"""Export with ``--to casadi``: one file with a CasADi function for each entry point."""
 
 import tempfile
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from spelgen.exporting.tuning import TUNING
 
 
 def export_casadi(trained: Trained) -> Exported:
-    """Return a file for each entry point. Raises RunError if the results of a function differ from the model's."""
+    """Return one file per entry point. Raises RunError if results of a function and of the model differ."""
     model = trained.described
     functions = casadi_functions(model, trained.entry_points)
     parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
@@ -41,16 +41,15 @@ def export_casadi(trained: Trained) -> Exported:
 
 
 def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
-    """Return CasADi functions of the entry points, by name.
+    """Return {name of an entry point: CasADi function}.
 
-    Rigid bodies and friction are SX expressions; residual terms are MX expressions.
+    Rigid bodies and friction are SX (scalar) expressions; residual terms are MX (matrix) expressions.
     """
-    # Without residual terms all expressions are scalar, and SX is faster than MX with calls of SX
-    # functions.
+    # Without residual terms, pure SX functions suffice. They are faster than MX functions that call SX functions.
     if not model.residuals:
         return expression_functions(model, entries)
-    # The function that is differentiated includes the residual terms as functions of q. In the SX function, the
-    # residual terms are symbols, so that a derivative would omit their dependence on q.
+    # Derivatives are computed from the MX function, which includes the residual terms as functions of q. In the SX
+    # function, the residual terms are symbols, so a derivative would omit their dependence on q.
     bases = {name: ENTRY_POINTS[name.removesuffix("_derivatives")] for name in entries}
     expressions = expression_functions(model, {base.name: base for base in bases.values()})
     functions: dict[str, ca.Function] = {}
@@ -62,9 +61,10 @@ def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> 
 
 
 def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
-    """Return a function of the inputs of ``entry`` only: it computes the residual terms and passes them to `function`.
+    """Return ``function`` as a function of the inputs of ``entry`` only.
 
-    function: function whose inputs are the inputs of ``entry``, then the residual terms.
+    The result computes the residual terms and passes them to ``function``, whose inputs are the inputs of ``entry``,
+    then the residual terms.
     """
     needed = residuals_needed(function)
     if not needed:
@@ -77,9 +77,10 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
-    """Return the function of ``entry``, whose output k is the Jacobian of `function` with respect to input k.
+    """Return the function whose output k is the Jacobian of ``function`` with respect to its input k.
 
-    function: function with a single output and the inputs of ``entry``, which may be more than the outputs.
+    entry: entry point of the result; it has at most as many outputs as inputs. function: function with a single output
+    and the inputs of ``entry``.
     """
     arguments = function.mx_in()
     (output,) = function.call(arguments)
@@ -97,7 +98,7 @@ def _saved(function: ca.Function) -> bytes:
 
 
 def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
-    """Return a function that calls a CasADi function by name, once per state, and stacks the results."""
+    """Return a function for `check_parity`, which calls a CasADi function once per state and stacks the results."""
 
     def called(name: str, inputs: Values) -> Values:
         function = functions[name]
@@ -115,9 +116,9 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
 
 
 def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return the values of the residual terms, as expressions in q and qd, by the names of their symbols.
+    """Return {name of a symbol in `residual_expressions`: its value as an expression in q and qd}.
 
-    q, qd: symbols, (n, 1) each. qd: None if only quantities are needed that do not depend on velocity.
+    q, qd: symbols, (n, 1) each; qd is None if no term that depends on velocity is needed.
     """
     residuals = model.residuals
     values: dict[str, ca.MX] = {}
@@ -129,7 +130,7 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
             values["kinetic"] = ca.jtimes(mass, q, in_kinetic_energy(model, qd), True)
     if residuals.potential is not None:
         values["energy"] = _network(residuals.potential, encoded)
-        # Reverse mode takes about the time of one evaluation of the network.
+        # The gradient in reverse mode takes about as long as one evaluation of the network.
         values["gravity"] = ca.gradient(values["energy"], q)
     # The torque of splines and ripple is computed as the derivative of their potential energy, so that torque and
     # energy are consistent.
@@ -152,7 +153,7 @@ def _network(network: SigmoidNetwork, encoded: ca.MX) -> ca.MX:
 
 
 def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
-    """Return the potential energy (1, 1) [J] at q (n, 1) of torques that depend on the position of one joint each."""
+    """Return the potential energy (1, 1) [J] at q (n, 1) of all torque splines and torque ripple."""
     energy = ca.MX(0)
     for joint, spline in residuals.torque.items():
         energy += _spline(spline_energy(spline), q[joint])
@@ -165,7 +166,7 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
 
 
 def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
-    """Return the value of a spline at q, (1, 1); outside of the knots the value is constant."""
+    """Return the value (1, 1) of a spline at the position q (1, 1) of a joint; it is constant outside of the knots."""
     knots, degree = spline.t, spline.k
     # CasADi's bspline extrapolates the last polynomial, but the model's splines are constant there.
     inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])

@@ -1,4 +1,4 @@
-"""``Trained``, a trained model with its arm, the argument of every exporter; its conversion to NumPy arrays."""
+"""``Trained``, the argument of every exporter: a trained model with its arm. Its conversion to NumPy arrays."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A trained model and its arm.
+    """A trained model, its arm, and options of the export.
 
-    entries: names of the functions to export, for formats that consist of functions; empty: all except derivatives.
-    intervals: tables of the fitted parameters with 95 % intervals, for the README.
-    float32: whether ONNX and torch programs compute in float32; otherwise in float64.
-    levels: noise levels of the estimator of payload and external torques; None: no estimator is
-    exported.
+    Attributes:
+        entries: names of the functions to export, for formats that consist of functions; empty: all except derivatives.
+        intervals: tables of the fitted parameters with 95 % intervals, for the README.
+        float32: whether ONNX and torch programs compute in float32; otherwise in float64.
+        levels: noise levels of the estimator of payload and external torques; None: the estimator is not exported.
     """
 
     model: ArmModel
@@ -85,7 +85,10 @@ class Trained:
         return self.arm.tip or last_link(self.arm.robot, self.joint_names)
 
     def prepared(self) -> PreparedModel:
-        """Return a copy of the model with precomputed parameters, and the kinematics of the tip, for programs."""
+        """Return the copy of the model from which ONNX and torch programs are made.
+
+        It has precomputed parameters, the kinematics of the tip, and the number type of the programs.
+        """
         dtype = torch.float32 if self.float32 else torch.float64
         return self.model.prepared(tip_kinematics(self.arm), dtype=dtype)
 
@@ -109,8 +112,8 @@ def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
     weights = exact.prepare()
     constant_mass = array(weights.armature)
     residuals = Residuals((), None, None, {}, (), {})
-    # The part of the residual of M that is constant is added to the armature, so that exports need not
-    # evaluate it.
+    # A residual term of M may have a constant part, which is added to the armature, so that exports need not evaluate
+    # it.
     if residual_terms(exact) is not None:
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
@@ -134,7 +137,7 @@ def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
 
 
 def identifier(text: str) -> str:
-    """Return an identifier, made from a text, that is valid in all exported languages: ASCII letters, digits and _."""
+    """Return a text as an identifier that is valid in all exported languages: ASCII letters, digits and _."""
     plain = _letters_and_digits(text)
     if not plain or plain[0].isdigit() or keyword.iskeyword(plain):
         return f"arm_{plain}".rstrip("_")
@@ -142,7 +145,8 @@ def identifier(text: str) -> str:
 
 
 def _letters_and_digits(text: str) -> str:
-    # All functions and macros of an export start with this name: at most 40 characters keep lines readable.
+    # The names of all functions and macros of an export start with this text, which is therefore limited to 40
+    # characters.
     return re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:40]
 
 
@@ -163,7 +167,7 @@ def _residuals(model: ArmModel) -> Residuals:
     """Return the residual terms of a model, without the terms that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
-    # Entries of the residual of M to which no function contributes are zero and are omitted.
+    # The residual term of M is a sum of functions; entries to which no function contributes are omitted.
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
@@ -183,14 +187,14 @@ def _network(
 ) -> SigmoidNetwork | None:
     """Return a network of tanh units as a network of sigmoids; None if it has no layers or a zero last layer.
 
-    With the outputs y(q) of the given network, the outputs of the result are y(q), or tanh(y(q)) @ functions. Sigmoids
-    take less time in C: tanh(x) = 2 sigmoid(2 x) - 1. The factors and the shift of this formula are included in the
-    weights and biases of the layers before and after the unit.
+    The result computes y(q), the outputs of the given network, or tanh(y(q)) @ functions. Sigmoids take less time in C.
+    The factors and the shift in tanh(x) = 2 sigmoid(2 x) - 1 are included in the weights and biases of the adjacent
+    layers.
 
     Args:
         layers: weights and biases of the layers of tanh units, and of the last layer, which is linear.
-        encoding: the inputs of the network, (2 n,): cos q and sin q of a revolute joint, (q - center) slope and zero of
-            a prismatic joint.
+        encoding: the inputs of the given network, (2 n,). A revolute joint has the inputs cos q and sin q, a prismatic
+            joint (q - center) slope and zero.
         functions: linear map of tanh(y), (outputs of the last layer, outputs); None: the result is y.
     """
     if layers is None or not any(tensor.any() for tensor in layers[-1]):
@@ -206,21 +210,21 @@ def _network(
         weights.append(functions.T)
         biases.append(np.zeros(functions.shape[1]))
     for k in range(1, len(weights)):
-        # tanh(x) = 2 sigmoid(2 x) - 1: weights and biases before the unit are doubled. After it the weights
-        # are doubled, and their original sum is subtracted from the bias.
+        # For tanh(x) = 2 sigmoid(2 x) - 1, weights and biases of the layer before the unit are doubled. In the layer
+        # after it, the weights are doubled, and the sum of the original weights is subtracted from the bias.
         weights[k - 1], biases[k - 1] = 2 * weights[k - 1], 2 * biases[k - 1]
         weights[k], biases[k] = 2 * weights[k], biases[k] - weights[k].sum(axis=1)
     return SigmoidNetwork(tuple(weights), tuple(biases))
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
-    """Return cubic splines by the index of the joint; joints whose coefficients are all zero are omitted.
+    """Return {index of a joint: cubic spline}; joints whose coefficients are all zero are omitted.
 
     weights: coefficients of k B-splines per joint, (n, k).
     """
     splines = {}
     for joint in torch.nonzero(weights.any(dim=1)).flatten().tolist():
-        # Three zero weights at each end make the curve and its first two derivatives zero at the ends.
+        # With three zero coefficients at each end, the spline and its first two derivatives are zero at both ends.
         padded = np.pad(array(weights[joint]), 3)
         steps = np.arange(len(padded) + 4) - 5
         knots = float(terms.middles[joint, 0]) + float(terms.spacing[joint, 0]) * steps
@@ -229,25 +233,23 @@ def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
 
 
 def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
-    """Return the torque ripple of the joints.
+    """Return the torque ripple: up to two elements per joint, for harmonics of the joint and of its motor.
 
-    weights: coefficients of H cosines, then of H sines, (n, 2 H). The H frequencies are the harmonics of a revolution
-    of the joint, then of a revolution of the motor.
-
-    An export computes harmonics k = 1, 2, ... of one frequency by a rotating phasor, in sequence. Harmonics with zero
-    amplitude are therefore only removed after the last nonzero one.
+    weights: (n, 2 H), coefficients of H cosines, then of H sines. The H frequencies are harmonics of a revolution of
+    the joint, then harmonics of a revolution of the motor. An export computes the harmonics k = 1, 2, ... of one
+    frequency in sequence. Harmonics with zero amplitude are therefore removed only after the last nonzero one.
     """
     ripple: list[Harmonics] = []
     cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
-        # `regular` is the number of harmonics of the joint, with the frequencies 1, 2, ... per revolution. The other
-        # frequencies are multiples of the gear ratio.
+        # `regular` is the number of harmonics of the joint, whose frequencies are 1, 2, ... per revolution. The other
+        # frequencies are multiples of the gear ratio: harmonics of the motor.
         regular = int(np.argmin(frequencies == np.arange(1, count + 1))) or count
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]
             used = np.flatnonzero((c != 0) | (s != 0))
-            # Each further harmonic costs a rotation of the phasor, so trailing zeros are removed.
+            # Each harmonic takes time in an export, so trailing harmonics with zero amplitude are removed.
             if used.size:
                 last = used[-1] + 1
                 ripple.append(Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))

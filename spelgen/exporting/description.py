@@ -1,4 +1,4 @@
-"""``TrainedModel``, a trained model as NumPy arrays; and the entry points, the functions that an export contains."""
+"""A trained model as NumPy arrays (``TrainedModel``), and the functions that an export contains (entry points)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from spelgen.errors import RunError
 
 @dataclass(frozen=True, eq=False)
 class SigmoidNetwork:
-    """A network with inputs cos q, sin q and q of all joints: layers of sigmoids, then a linear layer.
+    """A network with layers of sigmoids, then a linear layer. Its inputs are cos q, sin q and q of all joints, (3 n,).
 
-    weights: weights per layer, (units, units of the previous layer). biases: biases per layer, (units,).
+    weights: one matrix per layer, (units, units of the previous layer). biases: one vector per layer, (units,).
     """
 
     weights: tuple[np.ndarray, ...]
@@ -25,9 +25,9 @@ class SigmoidNetwork:
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Torque ripple of a joint [Nm]: a sum over k = 1, 2, ... at the position q of the joint.
+    """Torque ripple of one joint [Nm], as a function of its position q [rad].
 
-    The terms are cosines[k - 1] cos(k frequency q) + sines[k - 1] sin(k frequency q).
+    The torque is the sum of cosines[k - 1] cos(k frequency q) + sines[k - 1] sin(k frequency q) over k = 1, 2, ...
     """
 
     joint: int
@@ -38,12 +38,15 @@ class Harmonics:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """The residual terms of a model that are not zero.
+    """The residual terms of a model that are not zero. Splines are cubic, and zero outside of their knots.
 
-    mass: network whose outputs are added to entries of M's lower triangle. entries: row and column of the entry, per
-    output. potential: network whose output is added to V. torque, ripple: contributions to dV/dq [Nm, N] per joint.
-    friction: logarithm of the factor on a drive's friction, per joint. Splines are cubic, and zero outside of their
-    knots.
+    Attributes:
+        mass: network whose outputs are added to M.
+        entries: (row, column) in the lower triangle of M to which each output is added.
+        potential: network whose output is added to V.
+        torque: {joint: spline of q that is added to dV/dq [Nm, N]}.
+        ripple: further terms of dV/dq [Nm].
+        friction: {joint: spline of q, logarithm of the factor on the friction of the joint's drive}.
     """
 
     entries: tuple[tuple[int, int], ...]
@@ -65,7 +68,7 @@ class Residuals:
 def spline_energy(spline: BSpline) -> BSpline:
     """Return the potential energy of a torque spline, its antiderivative.
 
-    The energies at both ends of the range have equal magnitudes and opposite signs, as in the runtime.
+    As in the runtime, its constant is chosen such that the energies at both ends differ only in sign.
     """
     energy = spline.antiderivative()
     count = len(energy.t) - energy.k - 1
@@ -75,9 +78,13 @@ def spline_energy(spline: BSpline) -> BSpline:
 
 @dataclass(frozen=True, eq=False)
 class Servos:
-    """Constants of position servos, (n,) each, as in ``runtime.PositionServo``, and the delay of the command [s].
+    """Constants of position servos, (n,) each, as in ``runtime.PositionServo``.
 
-    limit: largest torque [Nm, N]; infinite for a servo without a limit.
+    Attributes:
+        kp, kd: gains [Nm/rad, N/m] and [Nm s/rad, N s/m].
+        limit: largest torque [Nm, N]; infinite for a servo without a limit.
+        dead_zone: half the width of the dead zone [rad, m].
+        delay: delay of the commands [s], one number.
     """
 
     kp: np.ndarray
@@ -91,13 +98,19 @@ class Servos:
 class TrainedModel:
     """A trained model of an arm with n joints: rad and Nm for revolute joints, m and N for prismatic joints.
 
-    name: identifier of the robot in code. joint_labels: names of the joints in comments, of letters, digits and _.
-    inertias: inertial parameters in the frames of the joints, (bodies, 10). constant_mass: armature and constant
-    residual terms of M, (n, n). motors: C, (n, n), motor velocities per joint velocities. friction: the
-    ``FrictionConstants`` of the runtime, as arrays. breakaway: break-away displacements of the bristles, (n, K) [rad,
-    m]. inputs: G, (n, n), joint torque per motor torque. actuated: 0 for a passive joint, otherwise 1, (n,).
-    torque_offset: measured torque at zero torque, (n,). friction_compensation: torque per velocity that the drives
-    add but do not report, (n,).
+    Attributes:
+        name: identifier of the robot in code.
+        joint_labels: names of the joints for comments, only letters, digits and _.
+        inertias: (bodies, 10), inertial parameters in the frames of the joints.
+        constant_mass: (n, n), armature and constant residual terms of M.
+        motors: C, (n, n), motor velocities = C qd.
+        friction: the ``FrictionConstants`` of the runtime, as arrays.
+        breakaway: (n, K) [rad, m], break-away displacements of K bristles per joint.
+        inputs: G, (n, n), joint torques = G times motor torques.
+        actuated: (n,), 0 for a passive joint, otherwise 1.
+        torque_offset: (n,), measured torque at zero torque.
+        friction_compensation: (n,) [Nm s/rad, N s/m], coefficient of a torque proportional to qd that the drives add
+            without measuring it.
     """
 
     name: str
@@ -128,16 +141,19 @@ class TrainedModel:
 
     @property
     def input_inverse(self) -> np.ndarray:
-        """G^-1, (n, n): motor torque per joint torque; at a passive joint, the joint torque itself."""
+        """Matrix (n, n) from joint torques to motor torques: G^-1, with the identity at passive joints."""
         return np.linalg.inv(self.inputs + np.diag(1 - self.actuated))
 
 
 @dataclass(frozen=True)
 class EntryPoint:
-    """A function that exports contain, and the names of its arguments and results.
+    """A function that exports contain, with the names of its arguments and results.
 
-    inputs: names of arguments: q, qd, qdd, tau, u, dq (n numbers each) and z (the friction state). outputs: units by
-    name.
+    Attributes:
+        about: description.
+        inputs: names of the arguments, among q, qd, qdd, tau, u (command of servos), dq (displacement), n numbers each,
+            and z, the friction state.
+        outputs: {name of a result: unit}.
     """
 
     name: str
@@ -213,7 +229,10 @@ ENTRY_POINTS = {entry.name: entry for entry in _ENTRY_POINTS}
 
 
 def entry_points(model: TrainedModel, names: Sequence[str] = ()) -> dict[str, EntryPoint]:
-    """Return the selected entry points by name; no names: all except derivatives. Raises RunError for unknown names."""
+    """Return {name: entry point} for the given names. Raises RunError for unknown names.
+
+    names: names of entry points; empty: all that the model has, except derivatives.
+    """
     available = list(ENTRY_POINTS)
     if model.servos is None:
         available.remove("servo_torque")
@@ -224,7 +243,7 @@ def entry_points(model: TrainedModel, names: Sequence[str] = ()) -> dict[str, En
 
 
 def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
-    """Return the selected names in the order of `available`; no names: all. Raises RunError for unknown names."""
+    """Return the given names in the order of `available`; all if none are given. Raises RunError for unknown names."""
     options = list(available)
     for name in names:
         if name not in options:

@@ -31,7 +31,9 @@ def export(
     entries: Sequence[str] = (),
     float32: bool = False,
 ) -> Exported:
-    """Return a trained model in the format of another tool; results of the export are compared with the model's.
+    """Return a trained model in the format of another tool, and write it to a path, if one is given.
+
+    The results of the export are compared with the results of the model.
 
     Args:
         trained: a fit, the folder of a run, or a model.

@@ -22,10 +22,13 @@ UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 class Exporter:
     """A format of exports.
 
-    function_name: module and name of the function that makes an ``Exported`` from a ``Trained``. It is imported on use,
-    because most formats need optional packages. title: end of the README's title. suffix: file name suffix, empty for a
-    format that is a folder. choice: whether a user can select functions. float32: whether programs can compute in
-    float32.
+    Attributes:
+        function_name: "module:function" of the function that returns the ``Exported`` for a ``Trained``. It is imported
+            on use, because most formats need optional packages.
+        title: last words of the README's title.
+        suffix: file name extension; empty for a format that is a folder.
+        choice: whether a user can select functions.
+        float32: whether the exported programs can compute in float32.
     """
 
     function_name: str
@@ -58,8 +61,11 @@ else:
 class Exported:
     """A trained model in the format of another tool.
 
-    files: contents by the path of the file in the folder. For a format that is a single file, the keys are endings,
-    such as ``.urdf``, which are appended to the stem of its name. summary: sentences for the user.
+    Attributes:
+        to: name of the format.
+        files: {path in the folder: content}. For a format that is a single file, the keys are extensions such as
+            ``.urdf``, which replace the extension of the file name.
+        summary: sentences for the user.
     """
 
     to: str
@@ -68,9 +74,9 @@ class Exported:
     summary: tuple[str, ...]
 
     def write(self, path: Path | str, *, force: bool = False) -> tuple[Path, ...]:
-        """Write the files to a file name or folder, and return the paths of all files.
+        """Write the files to ``path``, the name of a file or folder; return the paths of all files.
 
-        Raises RunError for a path that contradicts the format, and for existing files without ``force``.
+        Raises RunError if the extension of the path contradicts the format, or if files exist and ``force`` is False.
         """
         path = Path(path)
         require_fitting(self.to, path)
@@ -117,19 +123,19 @@ def with_readme(
     summary: Sequence[str],
     example: Sequence[str] = (),
 ) -> Exported:
-    """Return an export with a README.
+    """Return an export whose files include a README.
 
     Args:
         trained: the model and its arm.
         to: name of the format.
         files: contents by file name.
         use: first line after the title, how the export is used.
-        about: conventions of the format; the text follows the units and the name of the tip in the same line.
-        summary: results of the checks, sentences without full stops.
+        about: conventions of the format, the end of the README's line with the units and the name of the tip.
+        summary: results of the checks, one text without a full stop each.
         example: lines of Python that run in the folder of the README.
     """
-    # The README has only the five lines that a user needs before the first call; details are in
-    # docs/deploy.md.
+    # Before examples and tables, the README has only the five lines that a user needs for the first call; details are
+    # in docs/deploy.md.
     exporter, conventions = EXPORTERS[to], f"{UNITS}; the tip is the link {trained.tip}; {about}"
     title, result = f"Dynamics of {trained.robot} {exporter.title}", f"{'; '.join(summary)}."
     name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"
@@ -142,7 +148,7 @@ def with_readme(
 
 
 def readme(title: str, use: str, joints: Sequence[str], conventions: str, checked: str) -> bytes:
-    """Return the five lines of a README: title, use, order of the joints, conventions, result of the parity check."""
+    """Return the first five lines of a README: title, use, order of the joints, conventions, result of the checks."""
     # Names come from an untrusted URDF, so characters that are not printable are replaced.
     lines = [f"# {title}", use, f"Joints, in this order: {', '.join(joints)}.", conventions, checked]
     return ("\n".join(map(printable, lines)) + "\n").encode()

@@ -1,4 +1,4 @@
-"""--to mjcf: a file for MuJoCo, with bodies in the frames of their joints, compared with the model in MuJoCo."""
+"""Export with ``--to mjcf``: a file for MuJoCo, whose dynamics in MuJoCo are compared with the model."""
 
 from __future__ import annotations
 
@@ -35,15 +35,17 @@ _CONTACTS = {
     "visual": {"group": "2", "contype": "0", "conaffinity": "0"},
     "collision": {"group": "3", "contype": "1", "conaffinity": "0"},
 }
-"""Attributes of geoms by element of the URDF. Links touch other things but not each other, since shapes of neighbours
-overlap, and the model has no contacts."""
+"""{element of the URDF: attributes of its geom}.
+
+Links have contacts with other objects but not with each other, since shapes of neighbouring links overlap.
+"""
 
 
 def export_mjcf(trained: Trained) -> Exported:
-    """Return the MJCF of a trained model.
+    """Return the MJCF file of a trained model.
 
-    If the model computes M by networks, the file has the rigid bodies nearest to it (see `rigid_body_projection`).
-    Raises RunError if MuJoCo computes another M, bias or forward dynamics for these bodies.
+    If the model computes M by networks, the file has the rigid bodies that approximate it best (see
+    `rigid_body_projection`). Raises RunError if M, bias or forward dynamics of MuJoCo differ from these rigid bodies.
     """
     # MuJoCo simulates rigid bodies only, so residual terms are omitted and networks are projected onto rigid
     # bodies.
@@ -73,9 +75,10 @@ def export_mjcf(trained: Trained) -> Exported:
 
 
 def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNING.states) -> Parity:
-    """Compare MuJoCo's M, bias and forward dynamics without friction with the rigid-body model. Raises RunError.
+    """Compare M, bias and frictionless forward dynamics of MuJoCo and of the rigid bodies; return the differences.
 
-    The controls of the actuators are torques, or commands of position servos.
+    The inputs of the actuators are torques, or commands of position servos. Raises RunError if a difference is too
+    large.
     """
     arm, servos = projection.arm.chain, projection.servos
     random = random_inputs(arm.coordinates, states)
@@ -86,7 +89,8 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
     q = torch.from_numpy(random["q"])
-    # The file has the URDF's unrounded angles, but the model has rounded angles, which would change M.
+    # The reference has the unrounded angles of the URDF, as the file has: rounded angles, as in the model, would change
+    # M.
     bodies = _with_exact_angles(projection)
     mass = bodies.mass_matrix(q)
     bias = bodies.nonlinear_effects(q, torch.from_numpy(random["qd"]))
@@ -98,7 +102,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
 
 
 def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
-    """Return the rigid-body model with the unrounded angles of the URDF, the angles of the MJCF."""
+    """Return the rigid-body model with the unrounded angles of the URDF, which the MJCF has, too."""
     arm, bodies = projection.arm, copy.deepcopy(projection.bodies)
     chain = make_arm(
         arm.robot, joints=arm.chain.joint_names, angle_tolerance=0.0, gravity=arm.settings.gravity
@@ -111,9 +115,9 @@ def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
 
 
 def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:
-    """Return M, bias and accelerations computed by MuJoCo, in the coordinates of the arm, by name.
+    """Return {entry point: M, bias or accelerations, computed by MuJoCo in the coordinates of the arm}.
 
-    For an arm with mimic joints, the result has no accelerations.
+    Accelerations are omitted for an arm with mimic joints.
 
     Args:
         text: content of the MJCF file.
@@ -122,15 +126,13 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         controls: inputs of the actuators, (states, n).
     """
     model = mujoco.MjModel.from_xml_string(text.decode())
-    # Torque limits and friction are switched off: the forces are compared without them, and MuJoCo has
-    # another friction model.
+    # Torque limits and friction are switched off, since the reference has none: MuJoCo has another friction model.
     model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
-    # This linear map gives the positions and velocities of all joints, including mimic joints, from the
-    # coordinates.
+    # The constraint is the linear map from the coordinates to the positions of all joints, including mimic joints.
     constraint = body_constraint(arm)
-    # The map's rows are sorted in MuJoCo's order of joints, which is the order of the tree of bodies.
+    # The rows of the map are sorted in MuJoCo's order of joints, the order of the tree of bodies.
     order = np.argsort([model.joint(name).dofadr[0] for name in constraint.names])
     jacobian, offset = constraint.jacobian[order], constraint.offset[order]
     driven = [arm.joint_names.index(model.actuator(k).name) for k in range(model.nu)]
@@ -147,19 +149,18 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         values["mass_matrix"].append(jacobian.T @ full @ jacobian)
         values["bias"].append(jacobian.T @ data.qfrc_bias)
         values["forward_dynamics"].append(jacobian.T @ data.qacc)
-    # MuJoCo's mimic joints are soft constraints, so its accelerations are not those with exact mimic
-    # joints.
+    # In MuJoCo, mimic joints are soft constraints, so the accelerations differ from a model with exact mimic joints.
     if model.nv > len(arm.coordinates):
         del values["forward_dynamics"]
     return {name: np.array(rows) for name, rows in values.items()}
 
 
 def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
-    """Return the content of the MJCF of a projection, and the names of links whose shapes are omitted.
+    """Return the content of the MJCF file of rigid bodies, and the names of links whose shapes are omitted.
 
-    A projection is the rigid bodies nearest to a model. Shapes that are flat or cannot be read are omitted.
-    The file has the unrounded angles of the URDF, so that the tip has the same pose as in other tools that read the
-    URDF. The actuators are one motor per nonzero column of G, or one position actuator per joint for position servos.
+    Shapes that are flat or cannot be read are omitted. The file has the unrounded angles of the URDF, so that the tip
+    has the same pose as in other tools that read the URDF. The actuators are one motor per nonzero column of G or, for
+    position servos, one position actuator per joint.
     """
     arm = projection.arm.chain
     root = etree.Element("mujoco", model=arm.name)
@@ -167,7 +168,7 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     _add(root, "compiler", angle="radian", autolimits="true")
     _add(root, "option", gravity=arm.gravity)
     world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in _SECTIONS)
-    # If a motor rotates with several joints, its inertia is the armature of a tendon and not of a joint.
+    # If the speed of a motor depends on several joints, its inertia is the armature of a tendon instead of a joint.
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
     elements, tip = [world], tip_frame(projection.arm)
     for body, inertia in zip(tip.bodies, projection.inertias, strict=True):
@@ -211,7 +212,7 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
 def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> dict[str, object]:
     """Return the MJCF attributes of the joint with the coordinate k.
 
-    is_coupled: whether several joints rotate the motor, (n,).
+    is_coupled: (n,), True for a motor whose speed depends on several joints.
     """
     friction, joint = projection.friction, projection.arm.chain.coordinates[k]
     # The torque of position servos is limited by the actuator, with the learned limit.
@@ -228,7 +229,7 @@ def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> d
 
 
 def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: RigidBodyProjection) -> None:
-    """Add a motor for each input: at a joint, or at a tendon if the motor acts on several joints."""
+    """Add a motor for each column of G: at a joint, or at a tendon if the motor acts on several joints."""
     joints = projection.arm.chain.coordinates
     for k, column in enumerate(projection.inputs.T):
         name, driven = joints[k].name, np.flatnonzero(column)
@@ -241,7 +242,7 @@ def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: 
 
 
 def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos: Servos) -> None:
-    """Add a position actuator for each joint; the file does not contain the delays of the servos."""
+    """Add a position actuator for each joint. The delay of the servos cannot be represented in the file."""
     for k, joint in enumerate(joints):
         limit = servos.limit[k]
         # MuJoCo refuses an infinite force range; without the attribute the force is unlimited.
@@ -253,7 +254,7 @@ def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos:
 def _add_tendon(
     tendons: etree._Element, name: str, joints: Sequence[Coordinate], coefficients: np.ndarray
 ) -> etree._Element:
-    """Add a tendon and return it: its length is the sum of the joint positions times coefficients (n,)."""
+    """Add a tendon, whose length is the sum of coefficients (n,) times joint positions; return its element."""
     tendon = _add(tendons, "fixed", name=name)
     for joint, coefficient in zip(joints, coefficients, strict=True):
         if coefficient:
@@ -262,14 +263,14 @@ def _add_tendon(
 
 
 def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: Arm) -> str:
-    """Add the shapes of all links to a model.
+    """Add the shapes of all links to a model; return the names of links whose shapes are omitted.
 
     Args:
         root: root element of the model, to which meshes are added.
         elements: elements of the world and of the bodies, in the order of the arm.
         arm: arm whose URDF has the shapes.
 
-    Returns the names of links whose shapes are omitted because they are flat or cannot be read, separated by commas.
+    The names are separated by commas. A shape is omitted if it is flat or cannot be read.
     """
     names = [link.name for link in arm.robot.links]
     assets = etree.SubElement(root, "asset")

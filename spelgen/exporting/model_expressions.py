@@ -1,4 +1,4 @@
-"""Entry points of a trained model as CasADi expressions of the state, the inputs and symbols for residual terms."""
+"""Entry points of a trained model as CasADi expressions of state, inputs, and symbols for the residual terms."""
 
 from collections.abc import Mapping
 
@@ -22,7 +22,11 @@ Outputs = dict[str, tuple[ca.SX, ...]]
 
 
 def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
-    """Return CasADi functions of entry points, whose inputs include the needed residual terms; outputs are dense."""
+    """Return {name of an entry point: CasADi function}.
+
+    The inputs of a function are the inputs of the entry point, then the residual terms on which it depends. The outputs
+    are dense.
+    """
     names = ("q", "qd", "qdd", "tau", "dq", "u")
     inputs = {name: ca.SX.sym(name, model.n) for name in names}
     inputs["z"] = ca.SX.sym("z", model.memory)
@@ -41,7 +45,10 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
 def named_function(
     entry: EntryPoint, expressions: tuple[ca.SX, ...], inputs: Symbols, residuals: Symbols
 ) -> ca.Function:
-    """Return the CasADi function of an entry point; its inputs include the needed residual terms, outputs are dense."""
+    """Return the CasADi function of an entry point, with dense outputs.
+
+    Its inputs are the inputs of the entry point, then the residual terms on which the expressions depend.
+    """
     outputs = list(map(ca.densify, expressions))
     arguments = {key: inputs[key] for key in entry.inputs}
     for key, symbols in residuals.items():
@@ -60,7 +67,7 @@ def residuals_needed(function: ca.Function) -> list[str]:
 def _expressions(
     model: TrainedModel, inputs: Symbols, residuals: Symbols, *, derivatives: bool = False
 ) -> Outputs:
-    """Return the expressions of all entry points except derivatives, and of ``force``.
+    """Return {name: expressions} of all entry points except derivatives, and of ``force``.
 
     The model is M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation, with the measured torque ``offset``
     at zero torque and the torque ``compensation`` that the drives add. ``force`` is M qdd + h + friction -
@@ -70,8 +77,8 @@ def _expressions(
         model: the model as NumPy arrays.
         inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1).
         residuals: symbols of the residual terms, see ``residual_symbols``.
-        derivatives: whether the derivative of the residual of M with respect to q (symbol ``first``) replaces the time
-            derivative (``rate``) and the gradient of the kinetic energy (``kinetic``).
+        derivatives: True if the expressions will be differentiated. The symbol ``first``, the derivative of M's
+            residual term with respect to q, then replaces the symbols ``rate`` and ``kinetic``.
     """
     q, qd, qdd, tau, dq, u, z = inputs.values()
     standstill = ca.SX(model.n, 1)
@@ -87,8 +94,8 @@ def _expressions(
     bias = bodies.torque(qd, standstill) + added_bias
     friction = drive_friction(model, residuals, qd, rigid_gravity, z)
     compensation = constant(model.friction_compensation) * qd
-    # Newton-Euler gives the sum M qdd + h of the rigid bodies in one pass; M qdd and h separately would take
-    # two.
+    # One pass of the Newton-Euler algorithm computes the sum M qdd + h of the rigid bodies; M qdd and h separately
+    # would take two.
     force = bodies.torque(qd, qdd) + added_mass @ qdd + added_bias + friction - compensation
     to_inputs = constant(model.input_inverse)
     applied = constant(model.inputs) @ (tau - model.torque_offset)
@@ -124,8 +131,7 @@ def joint_mass(model: TrainedModel, residuals: Symbols) -> ca.SX:
 def drive_friction(model: TrainedModel, residuals: Symbols, qd: ca.SX, gravity: ca.SX, z: ca.SX) -> ca.SX:
     """Return joint friction torques, (n, 1) [Nm, N]; gravity: gravity torques of the rigid bodies, (n, 1) [Nm, N]."""
     motors = constant(model.motors)
-    # Motors and joints transmit equal power, so gravity torques at motors and joints satisfy C^T load =
-    # gravity.
+    # Power is equal at motors and joints, so the gravity torques ``load`` of the motors satisfy C^T load = gravity.
     load = constant(np.linalg.inv(model.motors).T) @ gravity
     friction = friction_torque(model, motors @ qd, load, z)
     for k, joint in enumerate(model.residuals.friction):
@@ -147,8 +153,8 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
     deflection = ca.reshape(
         z * (constants.bristle_fractions / model.breakaway).ravel(), model.breakaway.shape[1], model.n
     )
-    # direction of dry friction, in [-1, 1]: a function of velocity at joints without bristles, else of the
-    # bristles
+    # The direction of dry friction is between -1 and 1: a function of the velocity at joints without bristles,
+    # otherwise the mean deflection of the bristles.
     direction = constants.memoryless * _smooth_sign(qd, constants.coulomb_smoothing_velocity)
     direction += ca.sum1(deflection).T
     load = ca.sqrt(gravity**2 + constants.min_load**2)
@@ -163,12 +169,12 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
 
 
 def _smooth_sign(velocity: ca.SX, width: np.ndarray) -> ca.SX:
-    """Return smooth signs of velocities, (n, 1); velocity: (n, 1), width: width of the transition, (n,)."""
+    """Return smooth signs of velocities (n, 1). width: velocity at which the sign is 1 / sqrt(2), (n,)."""
     return velocity / ca.sqrt(velocity**2 + width**2)
 
 
 def sliding_bristles(model: TrainedModel, qd: ca.SX) -> ca.SX:
-    """Return the friction state z, (n K, 1), of motors that have moved at constant qd, (n, 1), for a long time."""
+    """Return the steady friction state z, (n K, 1), of motors that move at constant velocities qd, (n, 1)."""
     direction = ca.tanh(qd / model.friction.coulomb_smoothing_velocity)
     return ca.SX(_per_element(model.breakaway, direction) * model.breakaway.ravel())
 
@@ -186,12 +192,12 @@ def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
 
 
 def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:
-    """Return values (n, 1) with each value repeated K times, once per bristle of the joint, (n K, 1)."""
+    """Return (n K, 1): each of the values (n, 1) repeated K times, once per bristle of the joint."""
     return ca.vec(ca.repmat(values.T, breakaway.shape[1], 1))
 
 
 def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
-    """Return the torque of position servos, (n, 1); u: delayed commands, (n, 1), q and qd: (n, 1)."""
+    """Return the torque of position servos, (n, 1), for q and qd, (n, 1) each; u: delayed commands, (n, 1)."""
     error = u - q
     if servos.dead_zone.any():
         error -= ca.fmin(ca.fmax(error, -servos.dead_zone), servos.dead_zone)
@@ -204,26 +210,27 @@ def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
 
 
 def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Outputs:
-    """Return Jacobians, (n, n) each, of inverse and forward dynamics.
+    """Return {entry point: Jacobians, (n, n) each} for the derivatives of inverse and forward dynamics.
 
     Inverse dynamics are differentiated with respect to q and qd, forward dynamics with respect to q, qd and tau. The
-    Jacobian of forward dynamics with respect to q or qd is -M^-1 times the Jacobian of ``force`` at the accelerations
-    of the forward dynamics (Carpentier and Mansard, RSS 2018).
+    Jacobian of forward dynamics with respect to q or qd is -M^-1 times the Jacobian of ``force``, evaluated at the
+    accelerations of the forward dynamics (Carpentier and Mansard, RSS 2018).
     """
     expressions = _expressions(model, inputs, residuals, derivatives=True)
     (force,), (mass,) = expressions["force"], expressions["mass_matrix"]
     symbols = [inputs["q"]]
     jacobians = [ca.SX.eye(model.n)]
-    # Chain rule: a residual term is a symbol, whose Jacobian with respect to q is another symbol.
+    # The chain rule is applied explicitly: a residual term is a symbol, and its Jacobian with respect to q is another
+    # symbol.
     for symbol, jacobian in symbol_jacobians(model, residuals):
         symbols.append(symbol)
         jacobians.append(jacobian)
     by_position = ca.jtimes(force, ca.vertcat(*symbols), ca.vertcat(*jacobians))
-    # Residual terms depend on q only, and `coriolis` is an explicit expression in qd: no chain rule is
-    # needed.
+    # No chain rule is needed for qd: symbols of residual terms depend on q only, and `coriolis` is an explicit
+    # expression in qd.
     by_velocity = ca.jacobian(force, inputs["qd"])
     right = ca.horzcat(-by_position, -by_velocity, constant(model.inputs))
-    # Jacobians of the force are evaluated at the accelerations that the forward dynamics give.
+    # The Jacobians of the force are evaluated at the accelerations of the forward dynamics.
     right = ca.substitute(right, inputs["qdd"], *expressions["forward_dynamics"])
     to_inputs = constant(model.input_inverse)
     return {
@@ -233,9 +240,10 @@ def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Ou
 
 
 def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:
-    """Return matrix^-1 right, (n, columns), by L D L^T; matrix: positive definite, (n, n).
+    """Return matrix^-1 right, (n, columns), by an L D L^T decomposition of a positive definite matrix (n, n).
 
-    The lower triangle is not used, so CasADi need not compute it. For n = 6 there are 6 divisions; ``ca.ldl`` needs 21.
+    The lower triangle of the matrix is not used, so CasADi does not compute it. For n = 6, this needs 6 divisions,
+    ``ca.ldl`` 21.
     """
     n = matrix.shape[0]
     # The elimination changes matrices in place, so it works on copies.

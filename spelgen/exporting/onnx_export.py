@@ -1,4 +1,4 @@
-"""--to onnx: programs of torch.export as ONNX files in float64 or float32, for any batch size."""
+"""Export with ``--to onnx``: programs of torch.export as ONNX files in float64 or float32, for any batch size."""
 
 import logging
 import warnings
@@ -54,8 +54,7 @@ def export_onnx(trained: Trained) -> Exported:
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
     """Return the serialised ONNX model of an entry point."""
-    # Functions without an ONNX operator are replaced while torch traces the program, before the translation
-    # to ONNX.
+    # Functions without an ONNX operator are replaced already while torch traces the program.
     with _silent_exporter():
         with _Decomposed():
             program = export_program(model, name, flat_state=True)
@@ -96,8 +95,11 @@ def _cross(a: Tensor, b: Tensor, *, dim: int) -> Tensor:
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
-    """Return matrix^-1 right, (..., n, columns), by Gauss-Jordan elimination without pivoting; matrix: definite."""
-    n = matrix.shape[-1]  # a Python integer, so that tracing unrolls the loop over pivots
+    """Return matrix^-1 right, (..., n, columns), by Gauss-Jordan elimination without pivoting.
+
+    matrix: (..., n, n), positive definite, or triangular with a unit diagonal. right: (..., n, columns).
+    """
+    n = matrix.shape[-1]  # a Python integer, so that tracing unrolls the loop
     identity = torch.eye(n, dtype=matrix.dtype)
     # Either of the matrix and the right-hand side may have no batch dimension.
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
@@ -111,9 +113,9 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def _solve_triangular(matrix: Tensor, right: Tensor, *, upper: bool, unitriangular: bool) -> Tensor:
-    """Return matrix^-1 right, (..., n, columns); matrix: triangular, (..., n, n), with a diagonal that counts as ones.
+    """Return matrix^-1 right, (..., n, columns), for a triangular matrix (..., n, n) with a unit diagonal.
 
-    All calls of the runtime have ``unitriangular=True``.
+    The values on the diagonal are not used: all calls of the runtime have ``unitriangular=True``.
     """
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
     return _solve(matrix - matrix * identity + identity, right)
@@ -125,9 +127,10 @@ class _Cholesky(NamedTuple):
 
 
 def _cholesky_ex(matrix: Tensor) -> _Cholesky:
-    """Return the unchanged matrix, (..., n, n), and info (...): 0 if the matrix is positive definite, otherwise 1.
+    """Return the matrix (..., n, n) and info (...): 0 if the matrix is positive definite, otherwise 1.
 
-    Networks of M use only info of torch's ``cholesky_ex``, so the Cholesky factor is not computed.
+    The matrix is returned in place of its Cholesky factor: of the results of torch's ``cholesky_ex``, models use only
+    info.
     """
     rows = matrix
     info = torch.zeros(matrix.shape[:-2], dtype=torch.int32)
@@ -140,19 +143,19 @@ def _cholesky_ex(matrix: Tensor) -> _Cholesky:
 
 
 def _scalar_tensor(s: float, dtype: int = onnx.TensorProto.DOUBLE, **options: object) -> onnxscript.ir.Value:
-    """Return an ONNX constant in double precision; torch's own translation rounds to float32, an error of 1e-8."""
+    """Return an ONNX constant in double precision; torch's own translation would round it to float32."""
     value = np.array(s, dtype=onnx.helper.tensor_dtype_to_np_dtype(dtype))
     constant = onnxscript.opset18.Constant(value=onnx.numpy_helper.from_array(value))
     return cast("onnxscript.ir.Value", constant)
 
 
 def _softplus(x: Tensor) -> Tensor:
-    """Return softplus(x) = log(1 + exp x), (...), or x for large x; ONNX Runtime has softplus in float32 only."""
+    """Return softplus(x) = log(1 + exp x), (...); the softplus of ONNX Runtime supports only float32."""
     return torch.where(x > 20.0, x, x.exp().log1p())
 
 
 class _Decomposed(TorchFunctionMode):
-    """Replace functions without ONNX operators by decompositions while a program is traced."""
+    """Context in which torch functions without ONNX operators are replaced by decompositions into other functions."""
 
     functions: ClassVar[dict[object, Callable[..., object]]] = {
         torch.nn.functional.softplus: _softplus,
@@ -174,7 +177,7 @@ class _Decomposed(TorchFunctionMode):
 
 
 def called_by_onnx(files: Mapping[str, bytes]) -> Called:
-    """Return a function that evaluates an entry point in ONNX Runtime, by name, for arrays of states."""
+    """Return a function for `check_parity`, which evaluates an entry point in ONNX Runtime for arrays of states."""
     sessions = {name: onnx_session(content) for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 Values = dict[str, np.ndarray]
 """Inputs or outputs of an entry point by name, (states, ...) each."""
 Called = Callable[[str, Values], Mapping[str, np.ndarray]]
-"""A function that calls an entry point of an export, by name, with inputs (states, n), and returns its outputs."""
+"""Function (name of an entry point, {input: (states, n)}) -> {output: (states, ...)}, computed by an export."""
 
 
 def _energy(model: ArmModel, q: Tensor, qd: Tensor) -> Tensor:
-    """Return kinetic and potential energy, (states, 2) [J], at q and qd, (states, n)."""
+    """Return the two columns kinetic energy and potential energy, (states, 2) [J], at q and qd, (states, n)."""
     kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
     return torch.stack([kinetic, model.potential_energy(q)], dim=-1)
 
@@ -54,9 +54,10 @@ _REFERENCES: dict[str, Callable[..., Tensor]] = {
 
 @dataclass(frozen=True)
 class Parity:
-    """Largest difference per entry point, relative to the largest value of the torch model.
+    """Result of a parity check.
 
-    summary: sentence for the user with the largest difference.
+    differences: {entry point: largest difference between export and torch model, divided by the largest value of the
+    torch model}. summary: sentence for the user with the largest of these differences.
     """
 
     differences: dict[str, float]
@@ -66,10 +67,10 @@ class Parity:
 def require_parity(differences: dict[str, float], tolerance: float, states: int) -> Parity:
     """Return the differences as a ``Parity``. Raises RunError if a difference is above the tolerance.
 
-    differences: largest relative difference per entry point.
+    differences: {entry point: largest relative difference}. states: number of random states, for the summary.
     """
     for name, difference in differences.items():
-        if not difference <= tolerance:  # True for NaN, too
+        if not difference <= tolerance:  # The negated comparison is True for NaN, too.
             raise RunError(
                 f"{name} differs from the model by {difference:.1e}",
                 element="parity check",
@@ -93,7 +94,7 @@ def check_parity(
     states: int = TUNING.states,
     dtype: type = np.float64,
 ) -> Parity:
-    """Compare an export with the torch model at random states. Raises RunError for a difference above the tolerance.
+    """Compare an export with the torch model at random states; return the differences.
 
     Args:
         called: function that evaluates an entry point of the export.
@@ -102,6 +103,8 @@ def check_parity(
         tolerance: largest allowed difference, relative to the largest value of an output.
         states: number of random states.
         dtype: number type of the export; the inputs of export and torch model are rounded to this type.
+
+    Raises RunError if a difference is above the tolerance.
     """
     inputs = random_inputs(trained.arm.chain.coordinates, states, trained.memory)
     inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
@@ -111,16 +114,16 @@ def check_parity(
     for name in names:
         outputs = called(name, inputs)
         expected = _expected(exact, trained, name, inputs)
-        # For an arm of one joint, the shapes of matrices and vectors differ between formats.
+        # The outputs are reshaped, since for an arm of one joint some formats return a vector in place of a matrix.
         errors = [relative(outputs[key].reshape(value.shape), value) for key, value in expected.items()]
         differences[name] = float(np.max(errors))  # np.max returns NaN if any error is NaN
     return require_parity(differences, tolerance, states)
 
 
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0) -> Values:
-    """Return random inputs of the entry points by name: joint quantities (states, n), and z (states, memory).
+    """Return {input of entry points: random values}, (states, n) each, and (states, memory) for z.
 
-    The seed is fixed, so that exports are reproducible.
+    The seed is fixed, so that exports are reproducible. memory: number of values in the friction state z.
     """
     random = np.random.default_rng(0)
     # Velocities are mostly within the limits, because friction at higher speeds is extrapolated.
@@ -146,7 +149,7 @@ def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
 
 
 def relative(values: np.ndarray, expected: np.ndarray) -> float:
-    """Return the largest difference of arrays (...,) relative to the largest expected value; NaN if any is NaN."""
+    """Return max |values - expected| / max |expected| of two arrays (...,); NaN if a value is NaN."""
     if not expected.size:
         return 0.0
     # The difference is absolute if all expected values are zero.
@@ -156,9 +159,9 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
 
 
 def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> Values:
-    """Return the outputs of one entry point, computed by the torch model, as arrays (states, ...) by output name.
+    """Return {output: array (states, ...)} of one entry point, computed by the torch model.
 
-    name: name of the entry point. inputs: arrays (states, n) by input name.
+    name: name of the entry point. inputs: {input: array (states, n)}.
     """
     entry = ENTRY_POINTS[name]
     arguments: list[Tensor] = []

@@ -2,16 +2,17 @@
 
 The scalar expressions of a model contain the residual terms as symbols, so that exported code can compute these terms
 by loops over network weights and lookup of splines. R is the part of M that a network computes, with m nonzero entries
-in the lower triangle, and k is the number of joints whose friction varies with q. The symbols are:
+in the lower triangle; k is the number of joints whose friction depends on q. The symbols are:
 
-- ``mass`` (m, 1), entries of R; ``rate`` (m, 1), time derivatives of mass; ``kinetic`` (n, 1), d/dq of 1/2 qd^T R qd;
-- ``energy`` and ``gravity`` (n, 1), the network of V and the derivative of energy with respect to q;
-- ``torque`` (n, 1) and ``torque_energy``, the torques that are functions of single joints, and their potential energy;
-- ``factor`` (k, 1), logarithms of the factors that friction is multiplied by.
+- ``mass`` (m, 1), entries of R; ``rate`` (m, 1), d mass / dt; ``kinetic`` (n, 1), d/dq of 1/2 qd^T R qd;
+- ``energy`` (1, 1), the network of V; ``gravity`` (n, 1), d energy / dq;
+- ``torque`` (n, 1), torques that depend on the position of a single joint; ``torque_energy`` (1, 1), their energy;
+- ``factor`` (k, 1), logarithms of the friction factors.
 
-Derivatives of the dynamics depend on further symbols. ``first`` (m, n) and ``second`` (m, n n) replace rate and
-kinetic: first and second derivatives of mass with respect to q, the second in n columns per joint. ``stiffness`` (n, n)
-is d gravity / dq; ``torque_slope`` and ``factor_slope`` are derivatives with respect to the joint's own position.
+Derivatives of the dynamics depend on further symbols: ``first`` (m, n) and ``second`` (m, n n), the first and second
+derivatives of mass with respect to q (second has n columns per joint), which replace rate and kinetic; ``stiffness``
+(n, n), d gravity / dq; ``torque_slope`` (n, 1) and ``factor_slope`` (k, 1), derivatives with respect to the joint's own
+position.
 """
 
 from typing import TypeVar
@@ -26,15 +27,15 @@ Scalars = TypeVar("Scalars", ca.SX, ca.MX)
 
 
 def residual_symbols(model: TrainedModel) -> Symbols:
-    """Return the symbols of the residual terms by name; terms that the model does not have are structural zeros."""
+    """Return {name: symbol} of all residual terms; terms that the model does not have are structural zeros."""
     n = model.n
     residuals = model.residuals
     entries, factors = len(residuals.entries), len(residuals.friction)
     has_potential = residuals.potential is not None
     sizes = {
         "mass": (entries, entries, 1),
-        # `rate` and `kinetic` are directional derivatives of the network, each computed in one sweep; the Jacobian
-        # `first` would take n sweeps.
+        # `rate` and `kinetic` are directional derivatives of the network. Each is computed in one pass through the
+        # network; the Jacobian `first` would take n passes.
         "rate": (entries, entries, 1),
         "kinetic": (entries, n, 1),
         # `first`, `second` and the slopes occur only in derivatives of the dynamics.
@@ -56,7 +57,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
 
 
 def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
-    """Return the symmetric matrix, (n, n), with ``values``, (m, 1), at the m nonzero entries of the residual R of M."""
+    """Return the symmetric matrix (n, n) with the given values (m, 1) at the nonzero entries of R."""
     matrix = ca.SX(model.n, model.n)
     for k, (row, column) in enumerate(model.residuals.entries):
         matrix[row, column] = matrix[column, row] = values[k]
@@ -64,9 +65,9 @@ def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
 
 
 def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: bool) -> ca.SX:
-    """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1), with the residual R of M, which a network computes.
+    """Return the Coriolis torque of R, the residual term of M: dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1).
 
-    derivatives: whether the symbol ``first`` replaces ``rate`` and ``kinetic``.
+    derivatives: True: the result depends on the symbol ``first`` instead of ``rate`` and ``kinetic``.
     """
     if not derivatives:
         return symmetric(model, symbols["rate"]) @ qd - symbols["kinetic"]
@@ -75,7 +76,7 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
 
 
 def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
-    """Return the coefficients, (m, 1), of the entries of the residual R of M in 1/2 qd^T R qd; qd: (n, 1)."""
+    """Return c, (m, 1), with 1/2 qd^T R qd = c^T mass, where mass (m, 1) are the entries of R; qd: (n, 1)."""
     products = []
     for row, column in model.residuals.entries:
         # An off-diagonal entry occurs twice in R, so the factor 1/2 cancels.
@@ -85,11 +86,11 @@ def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
 
 
 def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
-    """Return pairs (symbol, Jacobian) for the residual terms that depend on q.
+    """Return pairs (symbol, Jacobian with respect to q) for the residual terms that depend on q.
 
-    The symbol is a column, (k, 1). The Jacobian with respect to q, (k, n), consists of symbols, too.
+    A symbol is a column of k entries, (k, 1). Its Jacobian, (k, n), consists of other symbols.
     """
-    # One row per friction factor, which depends on the position of its own joint only.
+    # A friction factor depends only on the position of its own joint: each row of `joints` selects one joint.
     joints = np.eye(model.n)[list(model.residuals.friction)]
     # `second` is (m, n n): each block of n columns is the Jacobian of one column of `first`.
     by_joint = ca.horzsplit(symbols["second"], model.n)

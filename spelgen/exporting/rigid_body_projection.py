@@ -1,4 +1,4 @@
-"""Projection of a trained model onto rigid bodies with viscous and Coulomb friction."""
+"""Approximation of a trained model by rigid bodies with viscous and Coulomb friction."""
 
 from __future__ import annotations
 
@@ -28,10 +28,13 @@ if TYPE_CHECKING:
 
 
 class NearestFriction(NamedTuple):
-    """Viscous friction, and Coulomb friction per direction of motion, (n,) each; backward <= 0 <= forward.
+    """Viscous and Coulomb friction that approximate the friction of a model best, (n,) each.
 
-    error: root mean square difference between this friction and the model's friction over positions and speeds,
-    relative to the root mean square of the model's friction, (n,).
+    Attributes:
+        viscous: coefficients [Nm s/rad, N s/m].
+        forward, backward: Coulomb torques [Nm, N] in both directions of motion, backward <= 0 <= forward.
+        error: RMS difference between this friction and the model's friction over positions and speeds, divided by the
+            RMS of the model's friction [1].
     """
 
     viscous: np.ndarray
@@ -49,11 +52,16 @@ class NearestFriction(NamedTuple):
 class RigidBodyProjection:
     """Parameters of an arm of n joints in the form that a URDF and a settings file can contain.
 
-    inertias: inertial parameters in the frames of the joints, (bodies, 10), as in ``Body``. armature: rotor inertia
-    of the motors, (n,) [kg m^2, kg]. motors: C, (n, n), motor velocities per joint velocities. inputs: G at q = 0,
-    (n, n), joint torque per motor torque. exact: whether the rigid bodies are the trained model's own, not the
-    nearest ones. mass_error, gravity_error: relative root mean square difference between the rigid bodies and the
-    trained model, of M and of the gravity torque. bodies: float64 model that consists of the rigid bodies only.
+    Attributes:
+        inertias: (bodies, 10), inertial parameters in the frames of the joints.
+        armature: (n,) [kg m^2, kg], rotor inertia of the motors.
+        motors: C, (n, n), motor velocities = C qd.
+        inputs: G at q = 0, (n, n), joint torques = G times motor torques.
+        exact: True if the trained model consists of rigid bodies, which are used; False if rigid bodies were fitted to
+            it.
+        mass_error, gravity_error: RMS difference between the rigid bodies and the trained model, of M and of the
+            gravity torque, divided by the RMS of the trained model [1].
+        bodies: float64 model that consists of the rigid bodies only.
     """
 
     arm: Arm
@@ -70,7 +78,7 @@ class RigidBodyProjection:
 
     @property
     def summary(self) -> tuple[str, str]:
-        """Sentences about the differences between projection and trained model: rigid bodies and friction."""
+        """Two sentences about the differences from the trained model: one on rigid bodies, one on friction."""
         bodies = "bodies are those of the model"
         if not self.exact or self.mass_error or self.gravity_error:
             source = "the rigid bodies nearest to the model"
@@ -86,11 +94,11 @@ class RigidBodyProjection:
 
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
-    """Return the rigid bodies and the friction that are nearest to a trained model of ``arm``."""
+    """Return the rigid bodies and the friction that approximate a trained model of ``arm`` best."""
     # A copy in double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
-    # If the model has rigid bodies they are used. Residual terms are omitted, as the summary states.
+    # The rigid bodies of a model are used if it has some; its residual terms are omitted, as the summary states.
     exact = isinstance(model, RigidBodyDynamics)
     bodies: ArmModel = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
@@ -116,10 +124,10 @@ def sampled_positions(arm: Chain) -> Tensor:
 def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
     """Return the model of physically consistent rigid bodies that best fits M and gravity torque at q, (positions, n).
 
-    The cost is the mean of |W (M - M0) W^T|^2 / n + |g - g0|^2 / mean g0^2, with M and g of the rigid bodies, M0 and g0
-    of the given model. W is the inverse Cholesky factor of the mean of M0, so that joints of small inertia at the tip
-    have the same weight as joints at the base. A small ridge towards the URDF's bodies determines the parameters that M
-    and g do not depend on.
+    The cost is the mean over q of |W (M - M0) W^T|^2 / n + |g - g0|^2 / mean g0^2, with M and g of the rigid bodies, M0
+    and g0 of the given model. W is the inverse Cholesky factor of the mean of M0: with it, joints of small inertia at
+    the tip have the same weight as joints at the base. A small ridge penalty towards the URDF determines the parameters
+    on which M and g do not depend.
     """
     bodies = build(arm, "closed-form")
     whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
@@ -128,10 +136,11 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
     load = gravity.square().mean().sqrt().clamp(min=1e-9)
 
     def distance() -> Tensor:
-        """Return the sum of the cost and the ridge, ()."""
+        """Return the cost plus the ridge penalty, ()."""
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
-        # The parameters are zero for the bodies of the URDF, so the ridge is the sum of squares of the parameters.
+        # For the bodies of the URDF all parameters are zero, so the ridge penalty is a sum of squares of the
+        # parameters.
         weights = torch.cat([parameter.flatten() for parameter in bodies.parameters()])
         distance: Tensor = (mass_error.square().sum() / model.n + gravity_error.square().sum()) / len(q)
         return distance + 0.5 * TUNING.ridge * weights.square().sum()
@@ -141,18 +150,20 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
 
 
 def _relative_rms(values: Tensor, expected: Tensor) -> float:
-    """Return the root mean square of values - expected, divided by the root mean square of expected, (...,) each."""
+    """Return RMS(values - expected) / RMS(expected) for two tensors (...,)."""
     size = expected.square().mean().sqrt().clamp(min=1e-12)
     return float((values - expected).square().mean().sqrt() / size)
 
 
 def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
-    """Return the viscous and Coulomb friction that best fit the friction of a model, by non-negative least squares.
+    """Return the viscous and Coulomb friction with the least squared difference from the friction of a model.
+
+    The coefficients are non-negative. The friction torque is averaged over positions.
 
     Args:
         arm: arm with velocity limits.
         model: trained model.
-        q: positions, (positions, n) [rad, m], of which evenly spaced rows are used.
+        q: (positions, n) [rad, m]; evenly spaced rows are used.
     """
     # Speeds have logarithmic steps, because friction changes most at low speed.
     fractions = np.geomspace(0.02, 1.0, TUNING.friction_speeds)

@@ -25,12 +25,12 @@ Wrench = tuple[ca.SX, ca.SX]
 
 
 def constant(values: object) -> ca.DM:
-    """Return numbers, (rows, columns), as a CasADi matrix in which zeros are structural."""
+    """Return numbers (rows, columns) as a sparse CasADi matrix: zeros are structural and cause no operations."""
     return ca.sparsify(ca.DM(np.array(values, dtype=float)))
 
 
 def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[Frame]:
-    """Return rotation, (3, 3), and position, (3, 1) [m], of each body's frame in the parent's frame, at q (n, 1)."""
+    """Return (rotation (3, 3), position (3, 1) [m]) of each body's frame relative to its parent, at q (n, 1)."""
     frames: list[Frame] = []
     for body in bodies:
         rotation = ca.SX(constant(body.rotation))
@@ -47,8 +47,8 @@ def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[Frame]:
 class RigidBodies:
     """The rigid bodies of an arm at a position q, (n, 1).
 
-    inertias: inertial parameters as numbers, (bodies, 10), or as a CasADi vector (10, 1) per body; structural zeros in
-    a vector cause no operations.
+    inertias: inertial parameters, (bodies, 10), or one CasADi vector (10, 1) per body; structural zeros cause no
+    operations.
     """
 
     def __init__(self, arm: Chain, q: ca.SX, inertias: Sequence[ca.SX] | np.ndarray) -> None:
@@ -61,10 +61,13 @@ class RigidBodies:
             self.inertias.append((ten[0], ten[1:4], tensor))
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
-        """Return M qdd + h of the bodies without armature, (n, 1) [Nm, N]; zeros of qd cause no operations."""
-        # The list has the motion of the base and of each body, in the frame of the body: angular velocity w, angular
-        # acceleration w', acceleration of the origin, and the matrix skew(w') + w w^T - |w|^2 1 (`spin`). Gravity is
-        # replaced by an upward acceleration of the base.
+        """Return M qdd + h without armature, (n, 1) [Nm, N], with h: Coriolis, centrifugal and gravity torque.
+
+        Structural zeros of qd cause no operations.
+        """
+        # The list has the motion of the base, then of each body, in the frame of the body: angular velocity w, angular
+        # acceleration w', acceleration of the frame's origin, and the matrix skew(w') + w w^T - |w|^2 1 (`spin`).
+        # Gravity is represented by an upward acceleration of the base.
         gravity = np.array(self.arm.gravity, dtype=float)
         motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
         wrenches: list[Wrench] = []
@@ -72,8 +75,8 @@ class RigidBodies:
             w, rate, acceleration, spin = motions[body.parent + 1]
             ratio = float(body.multiplier)
             speed, added = ratio * qd[body.coordinate], ratio * qdd[body.coordinate]
-            # Quantities are rotated into the frame of the body, in which first moment and tensor are
-            # constant.
+            # The motion of the parent is transformed into the frame of the body, in which first moment and inertia
+            # tensor are constant.
             acceleration = rotation.T @ (acceleration + spin @ position)
             w, rate = rotation.T @ w, rotation.T @ rate
             turning = ca.cross(w, _Z) * speed
@@ -81,7 +84,7 @@ class RigidBodies:
                 w = w + _Z * speed
                 rate = rate + _Z * added + turning
             else:
-                # The Coriolis acceleration is 2 w x v, with the velocity v along the prismatic joint.
+                # 2 w x v is the Coriolis acceleration, with the velocity v along the prismatic joint.
                 acceleration = acceleration + _Z * added + 2 * turning
             # With this matrix, spin @ p is the acceleration of a point p of the body relative to the origin.
             spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
@@ -98,10 +101,10 @@ class RigidBodies:
         return torques
 
     def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return the momentum M qd and d/dq of the kinetic energy, both without armature, (n, 1) each.
+        """Return the momentum M qd, (n, 1), and d/dq of the kinetic energy, (n, 1), both without armature.
 
-        For M qd, the momentum of all bodies that a joint carries is projected onto the joint axis S. For the gradient,
-        the momentum is projected onto dS/dt = twist x S.
+        Both are projections of the spatial momentum of all bodies that a joint carries: M qd onto the joint axis S, the
+        gradient onto dS/dt = twist x S.
         """
         # The twist of the base and then of each body, in its own frame: angular velocity, and velocity of the
         # origin.
@@ -126,11 +129,11 @@ class RigidBodies:
         return momentum, gradient
 
     def _rows(self) -> zip[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
-        """Return tuples (body, (mass, first moment (3, 1), tensor (3, 3)), frame), parents first."""
+        """Return (body, (mass, first moment (3, 1), inertia tensor (3, 3)), frame) of each body, parents first."""
         return zip(self.bodies, self.inertias, self.frames, strict=True)
 
     def _carry(self, wrenches: list[Wrench]) -> None:
-        """Add to the wrench of each body the wrenches of all bodies that it carries, in place."""
+        """Add the wrenches of all bodies that a body carries to its own wrench, for all bodies, in place."""
         for index in reversed(range(len(wrenches))):
             parent = self.bodies[index].parent
             if parent >= 0:
@@ -150,7 +153,7 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q, (n, 1), by ``structure.recursion``."""
     positions = []
     for joint, base in enumerate(base_denominators(model.arm)):
-        # Angles of mimic joints are integer multiples of the leader's angle divided by `base`.
+        # Angles of mimic joints are integer multiples of (angle of the leader) / `base`.
         angle = q[joint] / base
         positions.append(Position(ca.cos(angle), ca.sin(angle), q[joint]))
     result = energies(model.arm, positions, model.inertias.tolist(), float)
@@ -162,12 +165,14 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return pose (4, 4) and Jacobian (6, n), linear then angular, of a frame relative to the root frame, at q (n, 1).
+    """Return pose (4, 4) and Jacobian (6, n) of a frame of a body relative to the root frame, at q (n, 1).
+
+    The rows of the Jacobian are linear, then angular velocity.
 
     carrier: index of the body that carries the frame; -1: the root link. pose: pose in the frame of this body, (4, 4).
     """
-    # The list has poses of the root link and of all bodies. CasADi drops poses that the result does not
-    # depend on.
+    # The list has the poses of the root link and of all bodies; CasADi removes poses on which the result does not
+    # depend.
     poses = [ca.SX.eye(4)]
     for body, frame in zip(bodies, body_frames(bodies, q), strict=True):
         poses.append(poses[body.parent + 1] @ ca.vertcat(ca.horzcat(*frame), constant([[0, 0, 0, 1]])))

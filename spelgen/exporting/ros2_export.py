@@ -1,4 +1,4 @@
-"""--to ros2: a colcon package with the C files, a ros2_control controller and an inverse_dynamics_solver plugin."""
+"""Export with ``--to ros2``: a colcon package of C files, a ros2_control controller and an inverse_dynamics_solver."""
 
 import json
 from collections.abc import Iterable
@@ -65,9 +65,10 @@ def export_ros2(trained: Trained) -> Exported:
 
 
 def _missing_part(trained: Trained) -> tuple[str, str] | None:
-    """Return "controller" or "estimator" and the reason why the package has no such part; None if it has both.
+    """Return (part, reason): the part that the package cannot have, and why; None if it has all parts.
 
-    The estimator is part of the controller, so a package without a controller has neither.
+    The part is "controller" or "estimator". Without "controller" there is no estimator either, since it is part of the
+    controller.
     """
     model = trained.described
     if model.servos is not None or not model.actuated.all():
@@ -98,7 +99,7 @@ def _use(package: str, name: str, *, controller: bool) -> str:
 
 
 def _controller_numbers(trained: Trained) -> dict[str, object]:
-    """Return names, limits and the pose of the tip as C++ and YAML text; a missing effort limit is 0."""
+    """Return {variable of the templates: C++ or YAML text} with names, limits and the pose of the tip."""
     model, coordinates = trained.described, trained.arm.chain.coordinates
     revolute = np.array([joint.joint_type == "revolute" for joint in coordinates])
     continuous = [str(joint.continuous).lower() for joint in coordinates]
@@ -108,13 +109,13 @@ def _controller_numbers(trained: Trained) -> dict[str, object]:
         # A JSON string is also a valid YAML string.
         "yaml_joints": ", ".join(map(json.dumps, trained.joint_names)),
         "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in trained.joint_names),
-        # An unknown effort limit is 0, and the user must set a limit.
+        # An effort limit that the URDF does not specify is 0; the user must set it.
         "efforts": _listed(joint.effort or 0.0 for joint in coordinates),
         "velocities": _listed(_velocity_limit(joint.velocity) for joint in coordinates),
-        # [rad, m] position error above which computed torque control stops
+        # [rad, m] Position error above which computed torque control stops.
         "position_errors": _listed(np.where(revolute, 0.2, 0.05)),
-        # [rad, m] If the integral of the measured velocity exceeds this at constant measured position, the
-        # sensor is faulty.
+        # [rad, m] A position sensor counts as faulty if its value is constant while the integral of the measured
+        # velocity exceeds this number.
         "frozen_travel": _listed(np.where(revolute, 1e-2, 1e-3)),
         "continuous": ", ".join(continuous),
         "tip_link": cpp_string(model.tip.link),
@@ -125,7 +126,7 @@ def _controller_numbers(trained: Trained) -> dict[str, object]:
 
 
 def _velocity_limit(velocity: float | None) -> float:
-    """Return the velocity above which a joint is damped: 20 % above the URDF's limit, since tracking overshoots."""
+    """Return the velocity above which the controller damps a joint: 20 % above the URDF's limit."""
     largest = UNLIMITED["velocity"]
     return largest if velocity is None else min(float(f"{1.2 * velocity:.4g}"), largest)
 

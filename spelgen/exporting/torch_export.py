@@ -1,4 +1,4 @@
-"""--to torch: programs of torch.export, which run with torch only, and the trained parameters as safetensors."""
+"""Export with ``--to torch``: programs of torch.export, which need only torch, and the parameters as safetensors."""
 
 import io
 import warnings
@@ -63,7 +63,10 @@ def program_names(trained: Trained) -> list[str]:
 
 
 def check_programs(called: Called, trained: Trained, names: Sequence[str], tolerance: float) -> Parity:
-    """Compare programs with the torch model, with a larger tolerance in float32. Raises RunError for differences."""
+    """Compare programs with the torch model; return the differences. Raises RunError if one is too large.
+
+    tolerance: largest allowed difference of float64 programs; for float32 it is `ExportTuning.float32_tolerance`.
+    """
     if trained.float32:
         return check_parity(called, trained, names, TUNING.float32_tolerance, dtype=np.float32)
     return check_parity(called, trained, names, tolerance)
@@ -75,12 +78,14 @@ def number_type(model: PreparedModel) -> str:
 
 
 def calls(model: PreparedModel, names: Sequence[str], zeros: str, no_state: str) -> list[str]:
-    """Return lines of Python for the README that call each program: friction_memory first, friction_step last.
+    """Return lines of Python for the README, which call each program.
+
+    friction_memory is called first and friction_step last, as in a control loop.
 
     Args:
         model: model that was exported.
         names: names of the programs.
-        zeros: Python expression for an array of zeros, (5, n), in the example a batch of five states.
+        zeros: Python expression for an array of zeros, (5, n): the example has a batch of five states.
         no_state: Python expression for z, if the program friction_memory is not exported.
     """
     lines = [f"q = qd = qdd = tau = dq = {zeros}  # a batch of 5; dq: change of q since the last step"]
@@ -98,14 +103,14 @@ def _saved(program: torch.export.ExportedProgram) -> bytes:
     """Return the content of the .pt2 file of a program."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # constants share memory, which has no effect on constants
+        warnings.simplefilter("ignore")  # torch warns of constants that share memory, which is harmless
         torch.export.save(program, buffer)
     return buffer.getvalue()
 
 
 def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
-    """Load the programs from their files; return a function that evaluates one, by name, for arrays of states."""
-    # The parity check runs the saved files, not the programs in memory.
+    """Return a function for `check_parity`, which loads and evaluates the saved programs for arrays of states."""
+    # The saved files are loaded, so that the parity check includes saving and loading.
     programs = {name: torch.export.load(io.BytesIO(content)).module() for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:
@@ -120,7 +125,7 @@ def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
 
 
 class _Program(nn.Module):
-    """A module whose forward method is one entry point, for torch.export."""
+    """A module whose forward method is one entry point, as torch.export requires."""
 
     def __init__(self, model: PreparedModel, name: str, flat_state: bool) -> None:
         super().__init__()
@@ -128,7 +133,10 @@ class _Program(nn.Module):
         self._names = program_inputs(model, name)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Return the entry point's output, (batch, ...), for inputs (batch, n) and z (batch, n, K) or (batch, n K)."""
+        """Return the entry point's output, (batch, ...).
+
+        inputs: (batch, n) each, except z: (batch, n, K) or (batch, n K) for K bristles per joint.
+        """
         states = dict(zip(self._names, inputs, strict=True))
         if "z" in states:
             states["z"] = states["z"].reshape(-1, self._model.n, self._model.elements)

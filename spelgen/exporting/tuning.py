@@ -14,25 +14,26 @@ class ExportTuning:
     angular_speed: float = 1.0
     # [m/s] Nominal speed of a prismatic joint whose URDF has no velocity limit.
     linear_speed: float = 0.3
-    # [1] Largest allowed difference between C, CasADi and torch programs and the model, relative to the
-    # largest value; `benchmarks/deploy.py` measures 4e-14.
+    # [1] Largest allowed difference between results of C, CasADi or torch programs and of the model, divided by the
+    # largest value of the result. `benchmarks/deploy.py` measures 4e-14.
     tolerance: float = 1e-12
-    # [1] Largest allowed relative difference of ONNX programs; larger than `tolerance`, because M may be
-    # ill-conditioned.
+    # [1] Largest allowed difference of ONNX programs, relative like `tolerance`. It is larger because they solve linear
+    # systems without pivoting, and M may be ill-conditioned.
     onnx_tolerance: float = 1e-10
-    # [1] Largest allowed relative difference of float32 programs; solving with an ill-conditioned M loses
-    # digits.
+    # [1] Largest allowed difference of float32 programs, relative like `tolerance`. Solving with an ill-conditioned M
+    # loses digits.
     float32_tolerance: float = 1e-3
-    # [1] Largest allowed relative difference of MuJoCo's dynamics; `benchmarks/deploy.py` measures 9e-15.
+    # [1] Largest allowed difference of MuJoCo's dynamics, relative like `tolerance`. `benchmarks/deploy.py` measures
+    # 9e-15.
     mujoco_tolerance: float = 1e-9
     # [1] Number of random positions at which the nearest rigid bodies are fitted to a model.
     positions: int = 512
     # [1] Number of optimizer steps of the fit of the nearest rigid bodies.
     steps: int = 400
-    # [1] Weight of the penalty on the distance from the URDF's parameters, which fixes parameters that M and
-    # gravity do not determine.
+    # [1] Factor of half the squared distance from the URDF's parameters in the fit of the nearest rigid bodies. It
+    # determines parameters on which M and gravity do not depend.
     ridge: float = 1e-8
-    # [1] Number of the random positions at which viscous and Coulomb friction are fitted.
+    # [1] Number of random positions at which viscous and Coulomb friction are fitted to the friction of a model.
     friction_positions: int = 32
     # [1] MuJoCo's solimpfriction: the stiffest values, since a loaded joint at rest creeps with the default.
     friction_impedance: tuple[float, ...] = (0.9999, 0.9999, 0.001, 0.5, 2.0)

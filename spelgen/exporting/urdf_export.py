@@ -1,4 +1,4 @@
-"""--to urdf: the arm's URDF and settings with the trained parameters, and a file with the friction model."""
+"""Export with ``--to urdf``: the URDF and the settings with trained parameters, and the friction model."""
 
 import numpy as np
 import numpy.typing as npt
@@ -49,10 +49,10 @@ def export_urdf(trained: Trained) -> Exported:
 
 
 def _urdf_text(projection: RigidBodyProjection) -> bytes:
-    """Return the content of the arm's URDF, with the inertials and friction of a projection.
+    """Return the content of the arm's URDF with new inertials and friction.
 
-    A body is a rigid group of links. The link that a moving joint carries gets the inertial of its whole body; the
-    <inertial> of other links of the group is removed.
+    A body may consist of several links with fixed joints. The child link of its moving joint gets the <inertial> of the
+    whole body; the <inertial> of its other links is removed.
     """
     robot = projection.arm.robot
     arm = projection.arm.chain
@@ -65,7 +65,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
         for link in body.links:
             _remove(links[link.name], "inertial")
         name = body.joint.child
-        # The z axis of a body's frame is the joint axis; this rotation maps the body frame to the link frame.
+        # This rotation maps from the body frame, whose z axis is the joint axis, to the link frame.
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
         _set_inertial(links[name], inertia, rotation)
     friction = projection.friction
@@ -79,7 +79,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
 
 
 def _settings_text(projection: RigidBodyProjection) -> str:
-    """Return the arm's settings as YAML, with the armature and friction of a projection."""
+    """Return the arm's settings as YAML with new rotor inertia and friction."""
     path = projection.arm.robot.path.with_suffix(".yaml")
     content: dict[str, dict[str, dict[str, object]]] = {}
     # All other settings in the user's file are kept.
@@ -99,13 +99,13 @@ def _settings_text(projection: RigidBodyProjection) -> str:
 
 
 def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
-    """Return YAML: viscous and Coulomb friction per joint, and constants of the friction model and the servos."""
+    """Return YAML text: per joint, viscous and Coulomb friction and the constants of friction model and servo."""
     content: dict[str, object] = {
         "units": "Nm, Nm s/rad and rad/s of revolute joints; N, N s/m and m/s of prismatic ones",
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
     coulomb = np.stack([projection.friction.forward, projection.friction.backward], axis=1)
-    # Each section has arrays by name, (n,) or (n, K).
+    # {section: {name: array (n,) or (n, K)}}, one row per joint.
     sections = {"viscous_coulomb": {"viscous": projection.friction.viscous, "coulomb": coulomb}}
     # Only rigid-body models have a friction model with constants; others have friction networks.
     if projection.exact:
@@ -126,18 +126,18 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
 
 
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
-    """Return the constants of the friction model by name, (n,) or (n, K) each, in SI units."""
+    """Return {name: constants of the friction model, (n,) or (n, K), in SI units}."""
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
-    # The factor on friction, which depends on the position, is omitted if it is one at all positions.
+    # The position-dependent friction factor is given by its minimum and maximum, and omitted if it is one everywhere.
     if (factor != 1).any():
         constants["position_factor"] = np.stack([factor.min(axis=0), factor.max(axis=0)], axis=-1)
     return constants
 
 
 def _plain(value: npt.ArrayLike) -> object:
-    """Return a number, or an array (K,) as a list, with twelve digits for YAML: more precise than any fit."""
+    """Return a number, or an array (K,) as a list, rounded to twelve digits, more than any fit determines."""
     rounded = np.vectorize(lambda x: float(_number(x)), otypes=[float])
     return rounded(value).tolist()
 

@@ -24,13 +24,18 @@ from spelgen.settings.log_mapping import LogMapping
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a fit runs.
+    """Options of the run of a fit: resources, files, messages.
 
-    device: torch device. threads: number of threads of torch. resume: continue from the checkpoint of the run folder;
-    the result is the same as without an interruption. force: replace a run in the folder. progress: show the progress
-    on stderr. mapping: names and units of the columns of the logs; the run folder gets a copy. notes: diagnostics of
-    steps before the fit, reported with the diagnostics of the fit. began: time from which the time limit of the fit
-    counts (`time.monotonic`) [s]; None: now.
+    Attributes:
+        device: torch device.
+        threads: number of threads of torch.
+        resume: continue from the checkpoint of the run folder; the result is the same as without an interruption.
+        force: replace a run in the folder.
+        progress: show the progress on stderr.
+        mapping: names and units of the columns of the logs; the run folder gets a copy.
+        notes: diagnostics of the caller, for example of reading the logs; they are reported with the diagnostics of the
+            fit.
+        began: start of the time limit, as a value of `time.monotonic` [s]; None: the call of `fit`.
     """
 
     device: str = "cpu"
@@ -45,11 +50,13 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """The arguments of a fit.
+    """The arguments of `fit` after its default values have been resolved.
 
-    validation: fraction of the logs that is set aside for validation, or the validation trajectories. urdf: URDF file
-    of the robot, None if unknown. began: time from which the time limit of the fit counts (`time.monotonic`) [s].
-    folder: run folder, None if the fit writes no files.
+    Attributes:
+        validation: fraction of the logs that is set aside for validation, or the validation trajectories.
+        urdf: URDF file of the robot, None if unknown.
+        began: start of the time limit, as a value of `time.monotonic` [s].
+        folder: run folder, None if the fit writes no files.
     """
 
     model: ArmModel
@@ -73,10 +80,14 @@ class FitRequest:
 class PreparedLogs:
     """Properties of the checked logs that are written to the run folder.
 
-    preprocessing: filter, gaps and delay, with all automatic values resolved. digest: SHA-256 of all numbers of the
-    logs; a fit resumes only on logs with the same digest. training_names, validation_names: names of the trajectories.
-    window_counts: number of training windows and of validation windows. diagnostics: messages about the logs for the
-    user. scales: units of the errors in the validation loss; None if the objective has no validation loss.
+    Attributes:
+        preprocessing: filter, gaps and delay, with all automatic values resolved.
+        digest: SHA-256 of all numbers of the logs; a fit resumes only on logs with the same digest.
+        training_names, validation_names: names of the trajectories.
+        window_counts: number of training windows and of validation windows.
+        diagnostics: messages about the logs for the user.
+        scales: divisors of the errors of q, qd and tau in the validation loss; None if the objective has no validation
+            loss.
     """
 
     preprocessing: Preprocessing
@@ -90,7 +101,11 @@ class PreparedLogs:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingData(PreparedLogs):
-    """Windows of the logs for training and validation; recordings: all trajectories, for training and validation."""
+    """Prepared logs with their windows.
+
+    training, validation: windows for the training loss and for the validation loss. recordings: all trajectories from
+    which the windows were cut.
+    """
 
     training: Windows
     validation: Windows
@@ -125,7 +140,7 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
     decimation, reach = resolved.decimation or 1, bristle_reach(model)
 
     def windows(trajectories: Sequence[Trajectory]) -> Windows:
-        """Return W windows of K samples, from the filtered segments between gaps in the sample times."""
+        """Return windows of ``window`` samples, cut from the filtered segments between gaps in the sample times."""
         pieces = resolved.pieces(trajectories, shortest=(window - 1) * decimation + 1)
         return cut_windows(pieces, window, stride, decimation, measured=resolved.filtered, reach=reach)
 
@@ -160,12 +175,12 @@ def digest(trajectories: Iterable[Trajectory]) -> str:
 
 
 class Validation:
-    """Validation loss of a model, and the number of integration steps that the model needs.
+    """Validation loss of a model, and the number of integration steps that makes the integration error small.
 
     The number of integration steps is chosen on a few training windows, `probe`.
 
-    substeps: rk4 steps per sample interval; None: chosen for the model. batch: number of windows per training batch;
-    a validation batch has four times as many windows.
+    substeps: rk4 steps per sample interval; None: `choose_substeps` chooses the number. batch: number of windows per
+    training batch; a validation batch has four times as many windows.
     """
 
     def __init__(
@@ -182,7 +197,8 @@ class Validation:
         self.solver, self.prescribed = solver, substeps
         self.size = len(data.validation)
         self.scales = data.scales.to(device)
-        # Validation needs less memory per window than training, since no derivatives are computed.
+        # Validation batches are four times as large as training batches: no derivatives are computed, which saves
+        # memory.
         self.batches = data.validation.to(device).split(4 * batch)
         # The windows are evenly spread, so that the probe contains fast and slow motion.
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)
@@ -203,8 +219,10 @@ class Validation:
     def substeps(self, present: int | None = None) -> int:
         """Return the number of integration steps per sample interval.
 
-        The solver dopri5 has one step. For rk4 the number is the constructor's argument `substeps` or, if this is None,
-        the smallest number with a small integration error (see `choose_substeps`), at least `present`.
+        For the adaptive solver dopri5 the number is 1. For rk4 it is the constructor's argument `substeps` or, if this
+        is None, the smallest number with a small integration error (see `choose_substeps`).
+
+        present: number of steps in use, a lower bound of the number that is chosen; None: 1.
         """
         if self.solver != "rk4":
             return 1

@@ -78,21 +78,22 @@ def drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[Ar
 
 
 def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
-    """Return a function that approximates the friction of a model by viscous and Coulomb friction, (2, n).
+    """Return a function: model -> its viscous and Coulomb friction coefficients, (2, n).
 
-    The approximation is a straight line, fitted by least squares to the friction torque at speeds up to the typical
-    speed. The friction torque is averaged over random positions. The gravity load and the residual terms at these
-    positions are computed once, from ``model``; the function may be called with models of other friction.
+    They are the slope and the intercept of a straight line through the friction torque at speeds up to the typical
+    speed, fitted by least squares. The friction torque is averaged over random positions. The gravity load and the
+    factor of the residual terms at these positions are computed only once, from the argument ``model``: they are also
+    used for models with other friction parameters.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
     places = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
     q = torch.from_numpy([x.center for x in joints] + places)
     with torch.no_grad():
-        # gravity torque on the drives at P random positions, (P, n)
+        # The load of each drive is the gravity torque in the drive's coordinates, at P = 32 random positions, (P, n).
         load = model.gravity(q) @ torch.linalg.inv(motors_of(model))
         factor = friction_factor(model, q)
-    # Speeds are in units of the typical speed. They are dense at low speeds, which determine the Stribeck effect and
-    # the intercept.
+    # The speeds are in units of the typical speed. They are dense at low speeds, where the Stribeck effect determines
+    # the intercept of the line.
     speeds = np.geomspace(0.02, 1.0, 25)
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 

@@ -45,11 +45,13 @@ Rates = Callable[[], Sequence[float]]
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Options of a fit whose objective need not be given: it may be chosen from the logs.
+    """Options of a fit by name, checked when the objective is known.
 
-    objective: name of the objective; None: `default_objective` chooses it. options: values of options by name; an
-    option that does not apply to the objective is an error. defaults: values by name for options that are not given;
-    defaults that do not apply to the objective are ignored.
+    Attributes:
+        objective: name of the objective; None: `default_objective` chooses it from the model and the logs.
+        options: values of options by name; an option that does not apply to the objective is an error.
+        defaults: values by name for options that are not given; defaults that do not apply to the objective are
+            ignored.
     """
 
     objective: str | None = None
@@ -69,7 +71,10 @@ def fit(
     folder: Path | str | None = None,
     options: RunOptions = QUIET,
 ) -> Fit:
-    """Fit ``model`` to ``logs``, and fit the baselines for comparison; ``model`` then has the best weights found.
+    """Fit ``model`` to ``logs``, and fit the baselines for comparison.
+
+    After the fit, ``model`` has the weights of minimum validation loss (for objectives without validation, of minimum
+    cost).
 
     Ctrl-C or SIGTERM end the fit with status "interrupted".
 
@@ -131,7 +136,7 @@ class _Fitting:
             self._resume(self.run)
         else:
             self.notes += objective.begin()
-            # The run folder is written after `begin` succeeded: logs that cannot be fitted create no run.
+            # The run folder is written after `objective.begin` succeeded: logs that cannot be fitted create no run.
             self.run.start(required_spec(request.model), request.urdf, force=request.options.force)
             self._save()
             mapping = self.record.mapping.model_dump(mode="json", exclude_defaults=True)
@@ -142,7 +147,8 @@ class _Fitting:
         status = self._run()
         model, checkpoint = request.model, Checkpoint.model_validate(objective.checkpoint())
         model.load_state_dict(checkpoint.best_weights)
-        # The objective may have disabled the gradients of some parameters.
+        # The objective may have disabled the gradients of some parameters; the caller's model has all gradients
+        # enabled.
         model.requires_grad_(True)
         return Fit(
             model=model,
@@ -262,7 +268,7 @@ def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rat
     objective, defaults = chosen.objective, chosen.defaults
     if objective is None:
         objective = default_objective(model, rates)
-        # If the objective was chosen from the logs, rigid bodies have no regularizer by default.
+        # If the user chose no objective, rigid bodies are fitted to windows without the regularizer towards the URDF.
         if rigid_bodies and objective == "rollout":
             defaults = {"urdf_weight": 0.0, **defaults}
     return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.options, defaults=defaults)

@@ -36,11 +36,16 @@ from spelgen.spec import ModelSpec
 class Fit:
     """A fitted model, the record of its fit, and the baselines that were fitted to the same logs.
 
-    history: lines of metrics.jsonl, one per epoch. diagnostics: messages about the logs and the fit. status: how the
-    fit ended; None for a run that was loaded. record: content of config.json. checkpoint: content of checkpoint.pt.
-    baselines: content of least_squares.json, {} without baselines. urdf: URDF file of the robot, None if unknown.
-    folder: run folder, None if the fit wrote no files. logs: trajectories for training and validation; () for a run
-    that was loaded.
+    Attributes:
+        history: lines of metrics.jsonl, one per epoch.
+        diagnostics: messages about the logs and the fit.
+        status: how the fit ended; None for a run that was loaded.
+        record: content of config.json.
+        checkpoint: content of checkpoint.pt.
+        baselines: content of least_squares.json, {} without baselines.
+        urdf: URDF file of the robot, None if unknown.
+        folder: run folder, None if the fit wrote no files.
+        logs: trajectories for training and validation; () for a run that was loaded.
     """
 
     model: ArmModel
@@ -56,7 +61,7 @@ class Fit:
 
     @property
     def config(self) -> FitConfig:
-        """The configuration with all defaults set: the options that apply to the model."""
+        """The options of the fit that apply to the model, with all defaults set."""
         return self.record.config
 
     @property
@@ -95,7 +100,7 @@ class Fit:
 
     @property
     def result(self) -> str:
-        """Text with the nMSE of the fitted torques; for objectives other than torque, with the validation loss."""
+        """Text with the mean and worst nMSE of the fitted torques or, without a torque fit, the validation loss."""
         nmse = self.torque_nmse
         if not nmse:
             return f"validation loss {self.best_validation:.3g}"
@@ -112,7 +117,7 @@ class Fit:
 
     @property
     def substeps(self) -> int:
-        """Number of rk4 steps per sample interval that the model needs."""
+        """Number of rk4 steps per sample interval that makes the integration error of rollouts small."""
         return self.checkpoint.substeps
 
     @property
@@ -135,14 +140,14 @@ class Fit:
     @overload
     def predict(self, trajectory: Trajectory, *, std: Literal[True]) -> Uncertain: ...
     def predict(self, trajectory: Trajectory, *, std: bool = False) -> np.ndarray | Uncertain:
-        """Return joint torques (T, n) [Nm, N] of the model's inverse dynamics at the samples of a trajectory.
+        """Return the torques (T, n) [Nm, N] of the model's inverse dynamics at the samples of a trajectory.
 
-        The velocity is filtered as in the fit, and differentiated. The torque is NaN at a single sample between two
-        gaps in the sample times, since such a sample has no acceleration.
+        The acceleration is the derivative of the velocity, which is filtered as in the fit. The torque is NaN at a
+        single sample between two gaps in the sample times, since such a sample has no acceleration.
 
         Args:
             trajectory: trajectory of the arm.
-            std: return the torques with their standard deviations (see `Posterior.torque`).
+            std: if True, return the pair `Uncertain` of torques and standard deviations (see `Posterior.torque`).
         """
         reach = bristle_reach(self.model)
         tau, deviation = np.full_like(trajectory.q, np.nan), np.full_like(trajectory.q, np.nan)
@@ -151,7 +156,7 @@ class Fit:
             if stop - start < 2:
                 continue
             piece = trajectory[start:stop]
-            # The zero-phase filter needs a few samples for its transient.
+            # The zero-phase filter extends the signal at both ends, which requires more than three samples.
             if self.preprocessing.cutoff and len(piece) > 3:
                 piece = low_pass(piece, self.preprocessing.cutoff)
             # Accelerations are not logged, so they are the derivative of the filtered velocity.
@@ -164,7 +169,7 @@ class Fit:
         return Uncertain(tau, deviation) if std else tau
 
     def score(self, logs: Trajectory | Sequence[Trajectory]) -> float:
-        """Return 1 - nMSE of the torque on the samples of ``logs`` in motion: 1 is perfect, 0 as good as a constant.
+        """Return 1 - nMSE of the torque on samples of ``logs`` in motion: 1: perfect, 0: as good as a constant torque.
 
         The score is the mean over trajectories of the mean over joints. Samples are selected and filtered by
         `dynamics_samples`. Raises LogError if no log is sampled densely enough for accelerations.
@@ -204,12 +209,13 @@ class Fit:
         return run.path
 
     def _torque(self, *motion: np.ndarray | None) -> np.ndarray:
-        """Return the joint torques (T, n) [Nm, N] of the model's inverse dynamics.
+        """Return the torques (T, n) [Nm, N] of the model's inverse dynamics for arrays of motion.
 
-        motion: q, qd, qdd (T, n), and the friction state z and direction, None if unknown (see `DynamicsSamples`).
+        motion: q, qd, qdd, (T, n) each, then the friction state z and the direction of motion (see `DynamicsSamples`),
+        None if unknown.
         """
         like = next(self.model.parameters())
-        # Arrays are copied, since filters return negative strides, which torch does not accept.
+        # Filters return views with negative strides. They are copied, since torch does not accept them.
         inputs = [torch.as_tensor(np.ascontiguousarray(x)).to(like) for x in motion if x is not None]
         with torch.no_grad():
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()
@@ -251,7 +257,7 @@ def load_run(folder: Path | str) -> Fit:
     run = RunFolder(folder)
     # The record is read first, so that a missing run is reported before its model is assembled.
     record = run.read_record()
-    # Gradients are disabled, because a loaded model is used for predictions, and derivatives would need memory.
+    # A loaded model is used for predictions only. With gradients enabled, each prediction would store its graph.
     return Fit(
         model=fitted_model(run).requires_grad_(False).eval(),
         history=run.read_metrics(),

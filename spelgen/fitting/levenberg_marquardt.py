@@ -2,8 +2,8 @@
 
 Marquardt, J. SIAM 11:431 (1963): a step s solves (H + damping diag H) s = -g, with the Gauss-Newton Hessian H and the
 gradient g of the cost. After a step that lowers the cost, the damping is divided by a factor; otherwise the damping is
-multiplied by the same factor, and the step is repeated. A problem defines the type of its parameters (a vector, or a
-dataclass) and its residual: the solver compares costs only.
+multiplied by the same factor, and the step is repeated. The parameters may be of any type, for example a vector or a
+dataclass: the solver only passes them between the functions of the problem.
 """
 
 from collections.abc import Callable, Iterable
@@ -20,7 +20,7 @@ Parameters = TypeVar("Parameters")
 
 
 class Termination(Enum):
-    """Reason for which the solver ended."""
+    """Reason why the solver ended."""
 
     SMALL_DECREASE = "the last step lowered the cost by less than the threshold"
     SMALL_PREDICTION = "the predicted decrease of the cost is below the threshold"
@@ -35,7 +35,7 @@ class NormalEquations(NamedTuple):
     descent: Tensor
 
     def step(self, damping: float | Tensor = 0.0) -> Tensor:
-        """Return the damped step (..., k); damping: one number, or (...), one per system of equations."""
+        """Return the damped steps (..., k). damping: a number for all systems of equations, or (...), one for each."""
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
         # Marquardt's scaling by diag H instead of Levenberg's identity: steps are independent of the parameters' units.
         diagonal = torch.diag_embed(self.curvature.diagonal(dim1=-2, dim2=-1))
@@ -43,7 +43,7 @@ class NormalEquations(NamedTuple):
         return result
 
     def predicted_decrease(self, step: Tensor) -> float:
-        """Return the decrease of the quadratic model of the cost after a step (k,): -g^T s - s^T H s / 2."""
+        """Return the decrease of the cost that its quadratic model predicts for a step s (k,): -g^T s - s^T H s / 2."""
         return float(step @ (self.descent - self.curvature @ step / 2))
 
 
@@ -51,8 +51,10 @@ class NormalEquations(NamedTuple):
 class SolverState(Generic[Parameters]):
     """Iterate of the solver.
 
-    residual: residual of the problem at x, from which the normal equations are computed. damping: damping of the next
-    step. steps: number of accepted steps, including earlier calls of the solver.
+    Attributes:
+        residual: residual of the problem at x, from which the normal equations are computed.
+        damping: damping of the next step.
+        steps: number of accepted steps, including earlier calls of the solver.
     """
 
     x: Parameters
@@ -66,8 +68,8 @@ class SolverState(Generic[Parameters]):
 class SolverResult(Generic[Parameters]):
     """Last iterate and reason of termination.
 
-    normal_equations: normal equations of the last linearization. They are at the last iterate, unless a threshold or
-    the maximum number of steps ended the solver right after a step; then they are at the iterate before this step.
+    normal_equations: normal equations at the last iterate if no further step was accepted; if the solver ended right
+    after a step (small decrease, maximum number of steps), at the iterate before this step.
     """
 
     state: SolverState[Parameters]
@@ -78,11 +80,12 @@ class SolverResult(Generic[Parameters]):
 class LeastSquaresProblem(Protocol[Parameters]):
     """Nonlinear least-squares problem, whose cost is computed from the residual of parameters x.
 
-    If the residual vector is too large for the memory, its sum of squares per joint is used in its place.
+    The solver passes the result of `residual` to `cost` and `normal_equations`. A problem whose residual is too large
+    for the memory returns the sums of squares per joint instead.
     """
 
     def residual(self, x: Parameters) -> Tensor:
-        """Return the residual of T samples, (T, n), or its sum of squares per joint, (n,); it is passed to `cost`."""
+        """Return the residual of T samples, (T, n), or its sum of squares per joint, (n,)."""
 
     def cost(self, x: Parameters, residual: Tensor) -> float:
         """Return the cost at x, computed from the result of `residual` at x; infinite if the residual diverged."""
@@ -91,7 +94,7 @@ class LeastSquaresProblem(Protocol[Parameters]):
         """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) with respect to k free parameters."""
 
     def candidates(self, x: Parameters, step: Tensor) -> Iterable[Parameters]:
-        """Return one or more candidates for the parameters after a step (k,).
+        """Return the candidates, one or more, for the parameters after a step (k,).
 
         The solver evaluates the next candidate only if the gain ratio of the best candidate so far (decrease of the
         cost divided by the predicted decrease) is low.
@@ -104,7 +107,7 @@ def initial_state(
     damping: float = TUNING.initial_damping,
     steps: int = 0,
 ) -> SolverState[Parameters]:
-    """Return the state of the solver at x, before a step."""
+    """Return the state of the solver at x: the residual and the cost are computed here."""
     residual = problem.residual(x)
     return SolverState(x, residual, problem.cost(x, residual), damping, steps)
 
@@ -118,7 +121,7 @@ def levenberg_marquardt(
     min_relative_decrease: float = 0.0,
     callback: Callable[[SolverState[Parameters]], None] = lambda state: None,
 ) -> SolverResult[Parameters]:
-    """Minimize the cost of a problem.
+    """Minimize the cost of a problem; return the last iterate and the reason of termination.
 
     Args:
         problem: cost, residual and normal equations.
@@ -149,17 +152,22 @@ def _accepted_step(
     normal: NormalEquations,
     min_decrease: float,
 ) -> SolverState[Parameters] | Termination:
-    """Return the state after one step that lowers the cost, or the reason why no step was accepted."""
+    """Return the state after a step that lowers the cost, or the reason of termination if there is no such step.
+
+    The damping is raised until a step lowers the cost. min_decrease: smallest predicted decrease of the cost for which
+    a step is tried.
+    """
     damping = state.damping
     for _ in range(TUNING.max_trials):
         step = normal.step(damping)
         predicted = normal.predicted_decrease(step)
-        # No further damping is tried: a larger damping has an even smaller predicted decrease.
+        # The search ends here, since a larger damping has an even smaller predicted decrease.
         if predicted < max(TUNING.min_predicted_decrease * state.cost, min_decrease):
             return Termination.SMALL_PREDICTION
         best = _best_candidate(problem, state, step, predicted)
         if best.cost < state.cost:
-            # Without the lower bound, many rejected steps might be needed to raise the damping again.
+            # The damping has a lower bound: from a much smaller value, many rejected steps would be needed to raise it
+            # again.
             return replace(best, damping=max(damping / TUNING.damping_factor, TUNING.min_damping))
         damping *= TUNING.damping_factor
     return Termination.NO_DECREASE

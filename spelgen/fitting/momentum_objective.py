@@ -1,4 +1,7 @@
-"""The objective momentum: fit the weak form of the equations of motion, also as a stage of the objective rollout."""
+"""The objective momentum: fit the weak form of the equations of motion.
+
+The objective rollout contains the same minimization as a stage before its epochs.
+"""
 
 import copy
 import math
@@ -23,11 +26,14 @@ from spelgen.settings.fits import DEFAULTS, Rollout, WindowConfig
 
 
 class MomentumObjective(Objective):
-    """Minimization of `momentum_loss`; the result is kept if it lowers the validation loss. All windows are in memory.
+    """Minimization of `momentum_loss`. The initial weights are restored if they have a lower validation loss.
 
-    best_loss, best_weights: lowest validation loss so far, and the weights of the model with this loss. substeps:
-    number of integration steps per sample interval. seconds: elapsed part of the allowed time [s]. epoch_steps: number
-    of optimizer steps per epoch.
+    Attributes:
+        best_loss, best_weights: lowest validation loss so far, and the weights of the model with this loss.
+        substeps: number of integration steps per sample interval.
+        seconds: elapsed time of the fit [s].
+        allowed: time limit of the fit [s].
+        epoch_steps: number of optimizer steps per epoch.
     """
 
     name: ClassVar[str] = "momentum"
@@ -42,7 +48,7 @@ class MomentumObjective(Objective):
         self.notes: list[Diagnostic] = []
         self.epoch = self.step = self.best_epoch = 0
         minutes = self.config.max_minutes
-        self.allowed = math.inf if minutes is None else 60 * minutes  # [s]
+        self.allowed = math.inf if minutes is None else 60 * minutes  # time limit [s]
 
     def prepare(self) -> PreparedLogs:
         """Check, split and filter the logs, cut windows, and make the regularizer. Raises LogError."""
@@ -50,13 +56,13 @@ class MomentumObjective(Objective):
         self.config = self.config.resolved(len(self.data.training))
         self.regularizer = None
         if self.config.urdf_weight:
-            # The mean M of the initial model is the unit of M in the regularizer. A resumed run has the same unit: here
-            # its model still has the initial weights.
+            # The regularizer scales M with the mean M of the initial model. A resumed run has the same scale, since its
+            # model still has the initial weights at this point.
             self.regularizer = urdf_regularizer(self.request.urdf, self.model, self.data.training, self.notes)
         return self.data
 
     def begin(self) -> list[Diagnostic]:
-        """Validate the initial model; return diagnostics."""
+        """Compute the validation loss of the initial model; return diagnostics for the user."""
         self._set_up()
         return self.notes
 
@@ -83,7 +89,7 @@ class MomentumObjective(Objective):
         return {name: vars(self)[name] for name in self.saved_attributes}
 
     def _set_up(self) -> None:
-        """Move the model and the data to the device, set the batch and epoch sizes, and validate the current model."""
+        """Move the model and the data to the device, set the batch and epoch sizes, and compute the validation loss."""
         device, config = self.request.options.device, self.config
         # the time to read and prepare the logs is part of the allowed time
         self.seconds = time.monotonic() - self.request.began
@@ -103,7 +109,7 @@ class MomentumObjective(Objective):
         self.momentum_done = not config.momentum_steps
 
     def _keep(self, substeps: int, loss: float) -> None:
-        """Record the current model as the best so far, with its integration steps and its validation loss."""
+        """Store the current weights as the best so far, with their number of integration steps and validation loss."""
         self.substeps, self.best_loss, self.best_epoch = substeps, loss, self.epoch
         self.best_weights = copy.deepcopy(self.model.state_dict())
 
@@ -115,11 +121,11 @@ class MomentumObjective(Objective):
         return time.monotonic() - self._since
 
     def fraction(self, seconds: float) -> float:
-        """Return elapsed seconds divided by the allowed time; 0 if the time is not limited."""
+        """Return ``seconds`` divided by the time limit; 0 without a limit, infinite if the limit is zero."""
         return seconds / self.allowed if self.allowed else math.inf
 
     def _new_optimizer(self, generator: torch.Generator) -> WindowOptimizer:
-        """Return an optimizer of the weights that require a gradient; generator: random order of the batches."""
+        """Return an optimizer of the weights that require a gradient. generator: for the random order of batches."""
         decay = self.config.weight_decay or 0.0
         if self.config.optimizer == "lbfgs":
             return LBFGS(self.model, decay)
@@ -140,9 +146,10 @@ class MomentumObjective(Objective):
         return (self.config.learning_rate or DEFAULTS.learning_rate) * warm_up * decay
 
     def _momentum_stage(self, progress: TrainingProgress) -> None:
-        """Minimize the momentum loss, which needs no ODE solver; keep the result if it lowers the validation loss.
+        """Minimize the momentum loss, which needs no ODE solver.
 
-        After an interruption the whole stage is repeated.
+        If this does not lower the validation loss, the previous weights are restored. A run that is interrupted in this
+        stage repeats the whole stage when it is resumed.
         """
         call, steps = TUNING.epoch_steps, self.config.momentum_steps
         optimizer = self._new_optimizer(torch.Generator().manual_seed(self.request.seed))

@@ -21,9 +21,10 @@ Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 class Objective(ABC):
     """Base class of objectives. An objective fits a model to logs: it defines the loss and how the loss is minimized.
 
-    `fit` calls `prepare`, then `begin` for a new fit or `resume` for an interrupted one, then `run`. Only `fit` writes
-    to the run folder: it writes the `checkpoint` and the attribute history (the lines of metrics.jsonl) whenever
-    ``save`` is called, and the attribute results (fields of `run_record.Record`, by name) at the end.
+    `fit` calls `prepare`, then `begin` for a new fit or `resume` for an interrupted one, then `run`. An objective does
+    not write files. `fit` writes the `checkpoint` and the attribute history (the lines of metrics.jsonl) whenever the
+    objective calls ``save``. At the end, `fit` adds the attribute results, a dict with fields of `run_record.Record`,
+    to config.json.
     """
 
     name: ClassVar[str]
@@ -42,21 +43,23 @@ class Objective(ABC):
 
     @abstractmethod
     def begin(self) -> list[Diagnostic]:
-        """Run the part of a new fit that precedes the first checkpoint; return diagnostics."""
+        """Run the part of a new fit that precedes the first checkpoint; return diagnostics for the user."""
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Restore the state of a fit from the files of a run folder. By default, only the best weights are loaded.
+        """Restore the state of a fit from checkpoint.pt and metrics.jsonl. The base class loads only the best weights.
 
         Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError for files of another model.
         """
-        # By default `begin` runs the whole fit, so the checkpoint is from a finished fit: its weights are sufficient.
+        # If a class does not override this function, its `begin` runs the whole fit: the checkpoint is from a finished
+        # fit.
         self.model.load_state_dict(checkpoint["best_weights"])
         self._checkpoint = checkpoint
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """Run the fit until a stopping criterion holds; return the status. ``save`` writes a checkpoint.
 
-        By default `run` does nothing, since `begin` runs the whole fit. KeyboardInterrupt may be raised at any time.
+        The base class does nothing here: objectives without epochs run the whole fit in `begin`. KeyboardInterrupt may
+        be raised at any time.
         """
         return "finished"
 
@@ -65,7 +68,7 @@ class Objective(ABC):
         return self._checkpoint
 
     def _make_checkpoint(self, loss: float, seconds: float, substeps: int, step: int = 0) -> None:
-        """Set the checkpoint of an objective without epochs: the current weights, their loss, and the time [s]."""
+        """Set the checkpoint of a finished fit without epochs. loss: of the current weights. seconds: duration [s]."""
         self._checkpoint = {
             "epoch": 0, "step": step, "best_epoch": 0, "best_loss": loss, "seconds": seconds, "substeps": substeps,
             "best_weights": copy.deepcopy(self.model.state_dict()),
@@ -73,7 +76,7 @@ class Objective(ABC):
 
 
 def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -> Record:
-    """Return the record of a fit before it runs.
+    """Return the record of a fit without results, which are added after the fit.
 
     The record contains only the options that apply to the model, with their defaults filled in.
     """

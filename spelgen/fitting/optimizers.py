@@ -1,7 +1,8 @@
 """Optimizers of window losses: AdamW on batches, or L-BFGS on all windows at once if there are few.
 
 The gradient of a few hundred windows takes no longer than the gradient of a batch. It has no sampling noise, so L-BFGS
-can estimate the curvature. This matters for short logs, and for simulated logs, which can be fitted to many digits.
+can estimate the curvature and converges to many digits. This matters for short logs and for simulated logs without
+noise.
 """
 
 import inspect
@@ -18,14 +19,14 @@ from spelgen.logs.windows import Windows
 
 Loss = Callable[[Windows], Tensor]
 LearningRate = Callable[[int], float]
-# Function that yields the terms of a loss, so that the graph of only one term is in memory at a time.
+# Function that yields the terms of a loss one after another: only one term's graph of derivatives is in memory.
 Summands = Callable[[], Iterable[Tensor]]
 
 
 class WindowOptimizer(ABC):
     """Optimizer of the weights of a model that require a gradient when the optimizer is created.
 
-    torch's optimizers save their parameter groups, so further state for a resumed run is stored in these groups.
+    Subclasses store their own state in torch's parameter groups, since torch's `state_dict` contains these groups.
     """
 
     _optimizer: torch.optim.Optimizer
@@ -43,7 +44,7 @@ class WindowOptimizer(ABC):
 
     @property
     def stalled(self) -> bool:
-        """Whether recent steps did not lower the loss."""
+        """Whether the last calls of `run` no longer lowered the loss; False for optimizers without this test."""
         return False
 
     def state_dict(self) -> Content:
@@ -56,7 +57,7 @@ class WindowOptimizer(ABC):
 
 
 def _trainable(model: torch.nn.Module) -> tuple[list[torch.nn.Parameter], list[torch.nn.Parameter]]:
-    """Return the parameters that require a gradient, and the matrices among them, to which weight decay applies."""
+    """Return two lists: parameters that require a gradient, and the matrices among them, which have weight decay."""
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     return parameters, [parameter for parameter in parameters if parameter.dim() > 1]
 
@@ -84,7 +85,8 @@ class MiniBatchAdamW(WindowOptimizer):
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
         """Take AdamW steps on random batches of windows; return the mean loss, NaN if a loss is not finite."""
         rows, size = steps * self._batch, len(windows)
-        # Batches are cut from passes over all windows in random order, so that windows are used about equally often.
+        # Several random permutations of all windows are concatenated and cut into batches, so that all windows are used
+        # about equally often.
         passes = [torch.randperm(size, generator=self._generator) for _ in range(-(-rows // size))]
         # The sum remains on the device of the losses, since float() in each step would wait for a GPU.
         total: Tensor | float = 0.0
@@ -110,7 +112,7 @@ class MiniBatchAdamW(WindowOptimizer):
 
 
 class _EagerLBFGS(torch.optim.LBFGS):
-    """L-BFGS of torch, without the import of torch's compiler: the import takes 5 s, and a whole fit may take 10 s."""
+    """L-BFGS of torch with undecorated methods: torch's decorator imports the compiler, which takes 5 s."""
 
     add_param_group = inspect.unwrap(torch.optim.Optimizer.add_param_group)
     zero_grad = inspect.unwrap(torch.optim.Optimizer.zero_grad)
@@ -121,8 +123,8 @@ class _EagerLBFGS(torch.optim.LBFGS):
 class LBFGS(WindowOptimizer):
     """L-BFGS (Liu and Nocedal, Math. Programming 45, 1989) with a strong-Wolfe line search on all windows.
 
-    The number of steps is the number of evaluations of the loss; the learning rate is not used. weight_decay: factor of
-    the penalty, which is half the sum of squares of all matrices and is added to the loss.
+    The argument ``steps`` is the maximum number of evaluations of the loss; the learning rate is not used.
+    weight_decay: factor of the penalty, which is half the sum of squares of all matrices and is added to the loss.
     """
 
     _optimizer: torch.optim.LBFGS
@@ -139,8 +141,8 @@ class LBFGS(WindowOptimizer):
             tolerance_grad=1e-12,
             tolerance_change=1e-15,
         )
-        # `last` is the loss at the end of the last call, without and with the penalty. `waits` is the number of
-        # successive calls without progress.
+        # `last` is (loss, loss + penalty) at the end of the previous call. `waits` is the number of successive calls
+        # that lowered neither.
         self._optimizer.param_groups[0].update(last=(math.inf, math.inf), waits=0)
 
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
@@ -148,9 +150,10 @@ class LBFGS(WindowOptimizer):
         return self.minimise(lambda: [loss(windows)], steps)
 
     def minimise(self, summands: Summands, steps: int) -> float:
-        """Minimise a sum of losses, and return the sum at the end; NaN if no evaluation was finite.
+        """Minimise a sum of losses; return the final sum without the penalty, NaN if no evaluation was finite.
 
-        Only one summand at a time is in memory with its graph of derivatives.
+        Only one summand at a time is in memory with its graph of derivatives. steps: maximum number of evaluations of
+        the sum.
         """
         group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps
@@ -165,22 +168,20 @@ class LBFGS(WindowOptimizer):
         except torch.linalg.LinAlgError:
             return math.nan
         loss, (last, last_penalised) = total.item(), group["last"]
-        # A decrease of the loss or of the penalised loss is progress: one may rise while the other falls.
+        # A decrease of the loss or of the penalised loss counts as progress: a decrease of the penalty may raise the
+        # loss.
         progress = loss <= TUNING.lbfgs_stalled * last or penalised <= TUNING.lbfgs_stalled * last_penalised
         group["last"], group["waits"] = (loss, penalised), 0 if progress else group["waits"] + 1
         return loss
 
     @property
     def stalled(self) -> bool:
-        """Whether two successive calls made no progress."""
+        """Whether the last two calls lowered neither the loss nor the penalised loss significantly."""
         waits: int = self._optimizer.param_groups[0]["waits"]
         return waits > 1
 
     def _evaluated(self, summands: Summands) -> Tensor:
-        """Compute the gradients and return the penalised loss, ().
-
-        The result is a large number if the loss or a gradient is not finite.
-        """
+        """Compute the gradients and return the penalised loss, (); a large number if any of them is not finite."""
         self._optimizer.zero_grad()
         try:
             value = torch.zeros((), dtype=torch.float64)

@@ -1,8 +1,8 @@
 """Posterior of a fitted model: 95 % intervals of its parameters, of M(q), g(q) and of predicted torques.
 
 The covariance R R^T of the fitted parameters x (`fitting.torque.covariance`, `fitting.servo.covariance`) is propagated
-to first order: the variance of a function f(x) is |df/dx R|^2. The variance of a predicted torque also includes the
-squared residual of held-out samples.
+to first order: the variance of a function f(x) is |J R|^2, with the Jacobian J = df/dx. The variance of a predicted
+torque also includes the squared residual of held-out samples.
 """
 
 import copy
@@ -34,8 +34,6 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 
 PRECISE = ("firm", "fair")
 """Classes of intervals that the logs determine to 20 % or better."""
-
-
 PER_KP = "/kp"
 """Ending of the names of base parameters that are divided by kp of the first joint."""
 
@@ -48,10 +46,10 @@ class Uncertain(NamedTuple):
 
 
 class Propagated(NamedTuple):
-    """Value of a function of the model, (...), and its derivative df/dx R, (..., k).
+    """Value of a function of the model, (...), and a square root of its covariance, (..., k).
 
-    R R^T is the covariance of the fitted parameters x, with R (K, k). The norm of ``root`` over k is the standard
-    deviation of the value.
+    root: J R, with the Jacobian J (..., K) of the value with respect to the K fitted parameters, and their covariance R
+    R^T, R (K, k). The norm of ``root`` over its last axis is the standard deviation of the value.
     """
 
     value: Tensor
@@ -62,10 +60,12 @@ class Propagated(NamedTuple):
 class Posterior:
     """Posterior of a model that was fitted to torques, or to positions under position servos.
 
-    covariance: (K, K), covariance of the rigid-body, drive and friction parameters. torque_std: (n,) [Nm, N], RMS
-    torque residual of blocks of samples that were not fitted, below the cutoff frequency of the fit's filter; None for
-    position servos, whose torques are not logged. delay: delay of the torques relative to the positions, or of the
-    commands of position servos [s]; None if there is no delay.
+    Attributes:
+        covariance: (K, K), covariance of the rigid-body, drive and friction parameters.
+        torque_std: (n,) [Nm, N], RMS of the low-pass filtered torque residual on blocks of samples that were not
+            fitted; None for position servos, whose torques are not logged.
+        delay: delay of the torques relative to the positions, or of the commands of position servos [s]; None if there
+            is no delay.
     """
 
     model: ArmModel
@@ -82,17 +82,18 @@ class Posterior:
         return Uncertain(value.numpy(), root.norm(dim=-1).numpy())
 
     def propagate(self, function: Callable[[ArmModel], Tensor]) -> Propagated:
-        """Return the value (...) of a function of the model, and its derivative df/dx R, (..., k).
+        """Return the value (...) of a function of the model, and a square root of its covariance, (..., k).
 
-        R (K, k) is a factor of the covariance R R^T of the K fitted parameters x.
+        The square root is J R, with the Jacobian J of the function with respect to the fitted parameters, computed by
+        central differences, and R from `_root`.
         """
 
         def at(x: Tensor) -> Tensor:
             """Return the value of the function at parameters x, (K,)."""
             return evaluate_with(self.model, self._vector.unflatten(x), function)
 
-        # Step of the central differences, in standard deviations: small enough that the function is linear, and large
-        # enough that rounding errors are negligible.
+        # Step of the central differences, in standard deviations of the fitted parameters: small enough that the
+        # function is linear within a step, and large enough that rounding errors are negligible.
         part = 1e-4
         with torch.no_grad():
             columns = [(at(self._x + part * x) - at(self._x - part * x)) / (2 * part) for x in self._root.mT]
@@ -115,9 +116,9 @@ class Posterior:
     def torque(self, *motion: np.ndarray) -> Uncertain:
         """Return the torques (T, n) [Nm, N] that would be logged, with standard deviations.
 
-        motion: q, qd, qdd (T, n), and the friction state z and direction, if known. The standard deviation includes
-        noise and model errors, estimated by the torque residual of blocks of samples that were not fitted. Raises
-        RunError for position servos.
+        motion: q, qd, qdd, (T, n) each and, if known, the friction state z and the direction of motion (see
+        `DynamicsSamples`). The variance is the sum of two variances: the one due to errors of the parameters, and
+        `torque_std` squared, which includes noise and model errors. Raises RunError for position servos.
         """
         if self.torque_std is None:
             raise RunError("intervals of torques", expected="a fit to logs with torques, not to commands")
@@ -142,7 +143,7 @@ class Posterior:
 
     @cached_property
     def base_parameters(self) -> tuple[Interval, ...]:
-        """Intervals of the identifiable combinations of inertial parameters and armatures.
+        """95 % intervals of the base parameters: identifiable combinations of inertial parameters and armatures.
 
         Under position servos of unknown gains, they are divided by kp of the first joint.
         """
@@ -161,14 +162,14 @@ class Posterior:
 
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
-        """Intervals of the masses [kg] and first moments [kg m] that the logs determine individually."""
+        """95 % intervals of the masses [kg] and first moments [kg m] that are base parameters by themselves."""
         _, combination = self._base
         alone = compress(self.base_parameters, (combination.count_nonzero(dim=1) == 1).tolist())
         return tuple(replace(x, positive=x.name[0] == "m") for x in alone if x.name[0] in "mh")
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
-        """Names of the masses and first moments that the logs determine only in combinations, or not at all.
+        """Names of the masses and first moments that logs determine only in combinations, or not at all.
 
         Under position servos, also pairs of quantities whose sum has a smaller error than either of them (`SUMS`), and
         a common factor if no gain is known.
@@ -190,10 +191,10 @@ class Posterior:
 
     @cached_property
     def drives(self) -> dict[str, tuple[Interval, ...]]:
-        """Intervals of the joints, by the name of the quantity.
+        """{quantity: 95 % intervals of the joints}.
 
-        The quantities are armature, viscous and Coulomb friction, torque offset, and trained gain; of position servos
-        they are kp and the ratios to kp (see `drive_quantities`).
+        The quantities are armature, viscous and Coulomb friction, torque offset, and trained motor gain; of position
+        servos they are kp and the ratios to kp (see `drive_quantities`).
         """
         model = self.model
         quantities, function = drive_quantities(model)
@@ -208,9 +209,9 @@ class Posterior:
 
     @property
     def drive_columns(self) -> dict[str, list[str]]:
-        """Columns of the table of drives, by the name of the quantity.
+        """{quantity: column of the table of drives}.
 
-        A column has n texts of value and unit; a text is empty if the joint has no value.
+        A column has one text per joint, the value with interval and unit; the text is empty if the joint has no value.
         """
         columns = {}
         for quantity, of_joints in self.drives.items():
@@ -257,7 +258,10 @@ class Posterior:
 
     @cached_property
     def _root(self) -> Tensor:
-        """Factor R (K, k) of the covariance R R^T, without directions of negligible variance."""
+        """Square root R (K, k) of the covariance R R^T of the K fitted parameters.
+
+        Its columns are the k eigenvectors of non-negligible variance, each times its standard deviation.
+        """
         values, vectors = torch.linalg.eigh(self.covariance)
         kept = values > 1e-14 * values.max()
         root: Tensor = vectors[:, kept] * values[kept].sqrt()
@@ -269,10 +273,7 @@ class Posterior:
 
     @cached_property
     def _constants(self) -> Propagated:
-        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance.
-
-        The square root is the derivative with respect to the parameters x, times R, with R R^T the covariance of x.
-        """
+        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance."""
         return self.propagate(_constants)
 
     @property
@@ -286,8 +287,8 @@ class Posterior:
     def _linear(self, value: Tensor, rows: Tensor) -> Uncertain:
         """Return a value (...) that is linear in inertial parameters and armatures, with its standard deviation.
 
-        rows: (..., 10 B + n), derivatives of the value with respect to the inertial parameters of B bodies and the
-        armatures.
+        rows: (..., 10 B + n), derivatives of the value with respect to the inertial parameters of the B bodies, then
+        with respect to the n armatures.
         """
         return Uncertain(value.numpy(), (rows @ self._constants.root).norm(dim=-1).numpy())
 
@@ -299,8 +300,8 @@ def posterior_of(
 
     Args:
         model: model with the fitted parameters.
-        content: `Checkpoint.posterior` of a file, checked here: covariance (K, K), delay_std [s], and torque_std (n,)
-            unless the model has position servos.
+        content: field ``posterior`` of a checkpoint: covariance (K, K), delay_std [s], and torque_std (n,) unless the
+            model has position servos.
         delay: delay of the torques relative to the positions [s].
         file: path of the checkpoint, for error messages.
 
@@ -335,7 +336,7 @@ def _constants(model: ArmModel) -> Tensor:
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
-    """Return the tensor ``name``; None if it is absent, has another shape, is not float64, is zero or not finite."""
+    """Return the tensor ``name``; None unless it has this shape, is float64, finite and not zero."""
     tensor = content.get(name)
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
         return tensor if tensor.any() and tensor.isfinite().all() else None

@@ -1,4 +1,4 @@
-"""Resources of a fit: threads, a device, a locked folder, an orderly end after a signal; progress on the terminal."""
+"""Resources of a fit: threads, device, locked folder, end after a signal, and progress on the terminal."""
 
 from __future__ import annotations
 
@@ -73,15 +73,16 @@ def termination_as_interrupt() -> Iterator[None]:
 
 @contextmanager
 def locked(folder: Path | None) -> Iterator[None]:
-    """Create the folder and lock it against other processes of this machine, within a context; None: no effect.
+    """Create the folder and, within a context, lock it against other processes of this machine.
 
-    Raises RunError with the process that has locked the folder. The kernel releases the lock when this process ends for
-    any reason, so a remaining lock file has no effect.
+    folder: None if there is nothing to lock. Raises RunError if another process has locked the folder; the message
+    names the process. The kernel releases the lock when this process ends for any reason, so a remaining lock file has
+    no effect.
     """
     if folder is None:
         yield
         return
-    # folders that are created here; they are removed again if the fit writes nothing into them
+    # These folders are created here, and removed again if the fit writes nothing into them.
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     file = folder / LOCK
     # An error is raised at once, without waiting for the lock: the user may not know of the other process.
@@ -109,7 +110,10 @@ def locked(folder: Path | None) -> Iterator[None]:
 
 
 class TrainingProgress:
-    """Progress on stderr within a context: a bar on a terminal, else one line per stage; nothing without ``show``."""
+    """Context that shows the progress of a fit on stderr: a bar on a terminal, otherwise one line per stage.
+
+    show: if False, nothing is printed.
+    """
 
     def __init__(self, *, show: bool) -> None:
         self._show = show
@@ -155,7 +159,7 @@ class TrainingProgress:
         self._show_stage("training", record["epoch"], epochs, state, line)
 
     def _show_stage(self, stage: str, done: int, total: int, state: str, line: str) -> None:
-        """Show ``state`` in the bar; without a terminal, print ``line`` at the end of the stage."""
+        """Show the stage with ``state`` in the bar; without a terminal, print ``line`` when the stage ends."""
         if not self._line.startswith(stage):
             self._end_stage()
             self._bar.reset(self._task, description=stage, total=total, visible=True)

@@ -1,4 +1,7 @@
-"""Prediction of windows by a model: integration from a window's first sample, with zero-order hold of the input."""
+"""Prediction of windows by a model, and the losses of predictions.
+
+The equations of motion are integrated from a window's first sample, with the input constant between samples.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +28,11 @@ AT_REST = 1e-6  # [rad, m] largest displacement of joints at rest; below the res
 def roll_out(
     model: PortHamiltonian, windows: Windows, substeps: int = 1, solver: Solver = "rk4"
 ) -> tuple[Tensor, Tensor]:
-    """Return positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
+    """Return the predicted positions and velocities, (W, K-1, n) each, of W windows with K samples.
 
-    The state is (q, p) with p = M(q) qd, so that no time derivative of M is needed. The windows form one batch, each
-    with its own sample times. Each interval between samples is solved separately: the input jumps at its ends.
+    Sample 0 of a window is the initial state; samples 1 to K-1 are predicted. The state is (q, p) with p = M(q) qd, so
+    that no time derivative of M is needed. Each interval between samples is integrated separately, since the input
+    jumps at its ends. All windows are integrated together; each has its own sample times.
 
     Args:
         model: model to integrate; its parameter cache is computed once.
@@ -55,7 +59,8 @@ def roll_out(
             if substep == 0:
                 velocities.append(qd)  # velocity at the start of the interval
         positions.append(q)
-    # The integrators return the velocity at the start of each interval: only the velocity at the end is computed here.
+    # The integrator returns the velocity at the start of each interval. The first velocity is measured and not
+    # returned; the last one is computed here.
     velocities = [*velocities[1:], model.velocity(model.at(q, prepared=prepared), p)]
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
 
@@ -68,11 +73,16 @@ def _adaptive_step(
     z: Tensor,
     step: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return q, p and z at the end of one interval, integrated with adaptive steps, and q' at its start.
+    """Return q, p, z at the end of one interval, integrated with adaptive steps, and dq/dt at its start.
 
-    Dormand and Prince, J. Comput. Appl. Math. 6 (1980), differentiated through the solver. All W windows are solved
-    together, with time in units of each window's interval. rhs: function of (q, p, z) that returns q' and p'. q, p:
-    positions and momenta, (W, n). z: friction state, (W, n, K). step: duration of the interval [s].
+    The solver is dopri5 (Dormand and Prince, J. Comput. Appl. Math. 6, 1980); gradients are propagated through its
+    steps. All W windows are integrated together, with time divided by the duration of the window's interval.
+
+    Args:
+        rhs: function of (q, p, z) that returns dq/dt and dp/dt.
+        q, p: positions and momenta, (W, n).
+        z: friction state of K bristles per joint, (W, n, K).
+        step: duration of the interval [s].
     """
     from torchdiffeq import odeint  # imported only if needed, since the import takes half a second
 
@@ -89,23 +99,25 @@ def _adaptive_step(
 def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequence[str]) -> Tensor:
     """Return predicted minus measured positions, (..., n) [rad, m]; for revolute joints wrapped to +-pi.
 
-    Let R = exp(q e) and R' = exp(q' e) be rotations by q and q' about one axis, where e is the skew-symmetric matrix of
-    the unit axis. Their geodesic distance |log(R^T R')| / sqrt(2) on SO(3) is the wrapped angle |q' - q - 2 pi
-    round((q' - q) / 2 pi)|. This is the position error in the loss (eq. 8) of the paper whose model is the preset
-    `spel`, computed without matrices.
+    For a revolute joint, the magnitude of the wrapped difference is the geodesic distance of the two rotations on
+    SO(3). The loss (eq. 8) of the paper whose model is the preset `spel` uses this distance; here it is computed
+    without matrices.
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
-    # The number of turns is detached, since the derivative of the wrapped angle with respect to q' is one.
+    # The number of turns is constant for the gradient: the derivative of the wrapped difference with respect to the
+    # predicted position is one.
     turns = torch.round(difference.detach() / (2 * math.pi))
     return difference - 2 * math.pi * torch.where(revolute, turns, 0.0)
 
 
 class LossScales(NamedTuple):
-    """Units in which losses measure errors of q, qd and tau.
+    """Divisors of the errors of q, qd and tau in the losses.
 
-    q, qd: (K-1, n) [rad, m, per second], RMS change since the first sample of a window of K samples, for each further
-    sample and each joint. tau: (n,) [Nm, N], standard deviation.
+    Attributes:
+        q: (K-1, n) [rad, m], RMS over all windows of the position change from sample 0 to each of the samples 1 to K-1.
+        qd: (K-1, n) [rad/s, m/s], the same for the velocity.
+        tau: (n,) [Nm, N], standard deviation of the torque.
     """
 
     q: Tensor
@@ -118,9 +130,10 @@ class LossScales(NamedTuple):
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
-    """Return the scales of windows; for joints that hardly move, 1 % of the largest scale.
+    """Return the scales of the losses for windows of logs.
 
-    Raises LogError if no joint moves: windows at rest do not determine a model.
+    A joint that hardly moves has 1 % of the largest scale of all joints. Raises LogError if no joint moves, since
+    windows at rest do not determine a model.
     """
     moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
     if moved.abs().max() < AT_REST:
@@ -162,19 +175,20 @@ def rollout_loss(
 ) -> Tensor:
     """Return the mean square of `rollout_errors`, () [1].
 
-    This is the loss (eq. 8) of the paper whose model is the preset `spel`, with other units. The paper sums squared
-    geodesic distances [rad^2] and velocity errors [rad^2/s^2] over joints and samples. With scaled errors, all joints
-    and samples have the same weight, and a prediction that the initial state does not change has loss 1.
+    If the predicted state remains the initial state, the loss is 1. All joints and samples have the same weight, since
+    the errors are divided by ``scales``. The loss (eq. 8) of the paper whose model is the preset `spel` sums the same
+    errors without scales, in rad^2 and rad^2/s^2.
     """
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
 
 def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tensor:
-    """Return the mean squared residual of the weak form, (): p(t) - p(0) minus the impulse of all forces until t.
+    """Return the mean squared residual of the weak form of the equations of motion, () [1].
 
-    The impulse is integrated along the measured samples by the trapezium rule: no ODE solution and no accelerations are
-    needed. The residual is divided by the time t, which gives a mean torque, and by the standard deviation of the
-    joint's torque. An alternative, the velocity error M(q)^-1 times the residual, would favour an M that is too large.
+    The residual is p(t) - p(0), with the momentum p = M(q) qd, minus the impulse of all forces from 0 to t. It is
+    divided by t, which gives a mean torque, and by the standard deviation of the joint's torque. The impulse is the
+    trapezium sum along the measured samples: neither an ODE solver nor accelerations are needed. The velocity error
+    M(q)^-1 times the residual is not used, since it would favour an M that is too large.
 
     Args:
         model: model with the momentum M(q) qd.
@@ -182,22 +196,22 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
         scales: the scale of the torque, (n,) [Nm, N], is used.
     """
     q, qd, tau, dt = windows.q, windows.qd, windows.tau, windows.dt.unsqueeze(-1)
-    # M is not constrained to be positive definite here. The velocities are measured, so that M need not be inverted;
-    # and a gradient descent with the constraint would stop at the boundary of the indefinite matrices.
+    # M is not constrained to be positive definite here: it is not inverted, since the velocities are measured. With the
+    # constraint, gradient descent would stop at the boundary of the positive definite matrices.
     with mass_as_learned(model):
         configuration = model.configuration(q, model.prepare())
     p = (configuration.mass @ qd.unsqueeze(-1)).squeeze(-1)
     past = known_past(model, memory_along(model, q, qd, windows.z))
     force = model.lagrangian_gradient(configuration, qd) - model.friction_torque(configuration, qd, *past)
-    # The input is constant in each interval and jumps at the samples: each sample has two input forces, one with the
-    # input of the interval after the sample, the other with the input of the interval before it.
+    # The input is constant in each interval and jumps at the samples. Each sample therefore has two input forces: one
+    # from the interval before the sample, one from the interval after it.
     input_after = model.input_force(configuration, qd, torch.cat((tau, tau[:, -1:]), dim=1))
     input_before = model.input_force(configuration, qd, torch.cat((tau[:, :1], tau), dim=1))
     mean = (force[:, :-1] + input_after[:, :-1] + force[:, 1:] + input_before[:, 1:]) / 2
     residual = (p[:, 1:] - p[:, :1] - (dt * mean).cumsum(dim=1)) / dt.cumsum(dim=1)
     with torch.no_grad():
         inputs = model.input_matrix(q).abs()
-    # The scales of motor torques are converted to joint torques: there may be gears between motors and joints.
+    # The scales of motor torques are converted to joint torques, since there may be gears between them.
     unit = (inputs @ scales.tau).mean(dim=(0, 1))
     result: Tensor = (residual / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
     return result
@@ -213,11 +227,13 @@ def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int)
 
 
 def integration_error(coarse: Tensor, fine: Tensor) -> float:
-    """Return the integration error of a rollout divided by the error of the model [1].
+    """Return the integration error of a rollout, divided by the prediction error of the model [1].
+
+    The integration error is the difference from a rollout with half the step size.
 
     Args:
         coarse: (W, K-1, 2n) scaled errors of the rollout.
-        fine: (W, K-1, 2n) scaled errors with twice as many steps.
+        fine: (W, K-1, 2n) scaled errors of the rollout with half the step size.
     """
     model_error = max(fine.square().mean().sqrt().item(), TUNING.min_model_error)
     error = (coarse - fine).square().mean().sqrt().item() / model_error
@@ -225,9 +241,10 @@ def integration_error(coarse: Tensor, fine: Tensor) -> float:
 
 
 def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
-    """Return the minimum number of rk4 steps per sample interval, at least `start`, that is accurate enough.
+    """Return a number of rk4 steps per sample interval that makes the integration error small.
 
-    The integration error of the rollouts is then below `TUNING.integration_fraction` of the error of the model.
+    It is the first of start, 2 start, 4 start, ... with an `integration_error` below `TUNING.integration_fraction`. The
+    search ends at `TUNING.max_substeps` even if the error is larger.
     """
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.max_substeps:

@@ -27,11 +27,10 @@ from spelgen.settings.fits import Rollout, TorqueFit
 class RolloutObjective(MomentumObjective):
     """A fit in three steps: torque fit of rigid bodies, minimization of `momentum_loss`, epochs on predicted windows.
 
-    A checkpoint contains the whole state, so that a resumed run gives the same numbers as an uninterrupted run.
-
     The epochs have two stages. In the first stage, residual terms that the torque fit did not select are fixed: on
     short windows they would absorb a part of the rigid-body motion. In the second stage all weights are fitted,
-    starting from the best weights of the first stage.
+    starting from the best weights of the first stage. A checkpoint contains the whole state, so that a resumed run
+    gives the same numbers as an uninterrupted run.
     """
 
     name: ClassVar[str] = "rollout"
@@ -41,7 +40,7 @@ class RolloutObjective(MomentumObjective):
     )  # fmt: skip
 
     def begin(self) -> list[Diagnostic]:
-        """Fit torques if the model consists of rigid bodies, then validate the model; return diagnostics."""
+        """Fit torques if the model consists of rigid bodies, and compute the validation loss; return diagnostics."""
         if self.config.torque_first and isinstance(self.model, RigidBodyDynamics):
             samples = torque_samples(self.model, self.data)
             if samples is not None:
@@ -61,7 +60,7 @@ class RolloutObjective(MomentumObjective):
         self.history = history[: self.epoch]
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Run epochs until one of the stopping criteria holds; ``save`` is called after each epoch."""
+        """Run the momentum stage, then epochs until the fit ends; ``save`` is called after the stage and each epoch."""
         self._start_clock()
         if not self.momentum_done:
             self._momentum_stage(progress)
@@ -80,7 +79,7 @@ class RolloutObjective(MomentumObjective):
         return super().checkpoint() | state | {"generator": self.generator.get_state()}
 
     def _set_up(self) -> None:
-        """Validate the current model, and set the state of the first stage with a new optimizer."""
+        """Compute the validation loss of the current model; set the state and the optimizer of the first stage."""
         super()._set_up()
         self.generator = torch.Generator().manual_seed(self.request.seed)
         self.fixed, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
@@ -89,7 +88,7 @@ class RolloutObjective(MomentumObjective):
         self._step_seconds, self._validation_seconds = 0.0, 0.0
 
     def _optimizer(self) -> WindowOptimizer:
-        """Return an optimizer of all weights that are not fixed."""
+        """Return a new optimizer of all weights that are not fixed. Gradients of fixed weights are disabled."""
         for name, parameter in self.model.named_parameters():
             parameter.requires_grad_(name not in self.fixed)
         return self._new_optimizer(self.generator)
@@ -99,7 +98,7 @@ class RolloutObjective(MomentumObjective):
         return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.penalty()
 
     def _end(self) -> Status | None:
-        """Return the status of the stopping criterion that holds; None if the stage continues."""
+        """Return the status with which the current stage ends; None if it continues."""
         if self.epoch >= self.config.epochs or self.optimizer.stalled:
             return "finished"
         patience = self.config.patience
@@ -148,17 +147,17 @@ class RolloutObjective(MomentumObjective):
         return max(1, min(self.epoch_steps, int(remaining / self._step_seconds)))
 
     def _rate(self, ahead: int = 0) -> float:
-        """Return the learning rate of the step that is ``ahead`` steps after the last completed step."""
+        """Return the learning rate of a future step; ahead: its number minus the number of the last completed step."""
         fraction = (self._done(ahead) - self.stage_from) / (self._stage_end - self.stage_from)
         return self.learning_rate_factor * self.learning_rate(fraction)
 
     def _done(self, ahead: int = 0) -> float:
-        """Return the progress of the fit, 0 to 1, after ``ahead`` more steps.
+        """Return the progress of the fit, 0 to 1: the larger one of two fractions.
 
-        The progress is the completed fraction of all steps, or the elapsed fraction of the allowed time if it is
-        larger.
+        One is the fraction of all steps that is completed after ``ahead`` more steps, the other is the elapsed fraction
+        of the time limit.
         """
-        # If the time is limited, the learning-rate schedule must end with the time, not with the last epoch.
+        # The elapsed time is included so that the learning-rate schedule ends with the time limit, too.
         steps = self.config.epochs * self.epoch_steps
         return max((self.step + ahead) / steps, self.fraction(self.seconds))
 
@@ -167,7 +166,10 @@ class RolloutObjective(MomentumObjective):
         return TUNING.first_stage if self.fixed else 1.0
 
     def _release(self, end: Status) -> bool:
-        """Start the second stage, in which all weights are fitted. Return False if it is not needed or has no time."""
+        """Start the second stage of a fit; return False if there is none: no weights are fixed, or the time is up.
+
+        end: status of the first stage.
+        """
         if not self.fixed or end == "out of time" or not self.epoch:
             return False
         self.model.load_state_dict(self.best_weights)

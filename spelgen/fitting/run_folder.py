@@ -20,11 +20,17 @@ from spelgen.urdf.document import urdf_bytes
 class RunFolder:
     """The files of one training run.
 
-    spec: specification of the model. urdf, settings: URDF and settings of the robot, if known. mapping: names and units
-    of the columns of the logs, in the format of --mapping. config: record of the fit. metrics: one line per epoch.
-    checkpoint: state from which the fit is resumed. weights: the best state_dict so far. evaluation: results of
-    `evaluate`. baseline: baselines fitted to the training logs, and the coverage of the training logs. estimator: noise
-    levels of the state estimator.
+    Attributes:
+        spec: specification of the model.
+        urdf, settings: URDF and settings of the robot, if known.
+        mapping: names and units of the columns of the logs, in the format of --mapping.
+        config: record of the fit.
+        metrics: one line per epoch.
+        checkpoint: state from which the fit is resumed.
+        weights: the best state_dict so far.
+        evaluation: results of `evaluate`.
+        baseline: least-squares baselines, and the coverage of the logs.
+        estimator: noise levels of the state estimator.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -42,7 +48,7 @@ class RunFolder:
         self.estimator = self.path / "estimator.json"
 
     def require_free(self, *, force: bool) -> None:
-        """Raise RunError if the folder contains a run, unless ``force`` is true and the run may be replaced."""
+        """Raise RunError if the folder contains a run, unless ``force`` permits to replace it."""
         if self.path.exists() and not self.path.is_dir():
             raise RunError("a file", file=self.path, expected="a folder or a new name")
         if self.config.exists() and not force:
@@ -52,8 +58,8 @@ class RunFolder:
     def start(self, spec: ModelSpec, urdf: Path | None, *, force: bool) -> None:
         """Make the folder, write the specification, and copy the URDF and the settings of the robot.
 
-        A folder contains a run if it contains config.json, which the caller writes last. Raises RunError if the folder
-        contains a run, unless ``force``.
+        Files of a previous run are removed. A folder contains a run if it contains config.json, which the caller writes
+        last. Raises RunError if the folder contains a run and ``force`` is False.
         """
         self.require_free(force=force)
         content = {self.spec: f"{spec.to_json()}\n".encode()}
@@ -62,8 +68,8 @@ class RunFolder:
             content[self.urdf] = urdf_bytes(urdf)  # a xacro file is expanded
         if urdf is not None and (settings := urdf.with_suffix(".yaml")).is_file():
             content[self.settings] = settings.read_bytes()
-        # config.json, the first of the files, is removed first. A folder without this file is not treated as a run if
-        # the removal is interrupted.
+        # config.json is the first attribute and is removed first: if the removal is interrupted, the folder is not
+        # treated as a run.
         for file in vars(self).values():
             if file != self.path:
                 remove(file)

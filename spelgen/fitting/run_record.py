@@ -35,11 +35,17 @@ MAY_CHANGE = ("epochs", "patience", "max_minutes")  # options that may differ wh
 class Record(BaseModel):
     """The record of a fit in config.json: the data, the settings with all defaults resolved, and the results.
 
-    config: the options that apply to the model; the type depends on the objective. joints: names in the order of q.
-    validation_fraction: None if validation logs were given. data_digest: SHA-256 of all numbers of the logs. training,
-    validation: names of the trajectories. scales: units of the errors in the validation loss. mapping: names and units
-    of the columns of the logs. servo: parameters of position servos with intervals; None unless a fit of servos has
-    finished. notes: messages of a fit to torques. warnings: warnings about the logs and the links of the URDF.
+    Attributes:
+        config: the options that apply to the model; the type depends on the objective.
+        joints: names in the order of q.
+        validation_fraction: None if validation logs were given.
+        data_digest: SHA-256 of all numbers of the logs.
+        training, validation: names of the trajectories.
+        scales: divisors of the errors in the validation loss.
+        mapping: names and units of the columns of the logs.
+        servo: parameters of position servos with intervals; None unless a fit of servos has finished.
+        notes: messages of the torque fit for the user.
+        warnings: warnings about the logs and the links of the URDF.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -70,7 +76,8 @@ class Record(BaseModel):
     @classmethod
     def _of_the_objective(cls, options: object, info: ValidationInfo) -> object:
         """Return the options as an object of the objective's configuration class."""
-        # Without this key the objective was invalid. pydantic reports that error, so the options are not checked.
+        # The key is absent if the objective is invalid. pydantic reports the invalid objective, so the options need no
+        # check.
         if "objective" not in info.data:
             return FitConfig()
         try:
@@ -101,7 +108,10 @@ class Record(BaseModel):
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
     def require_same_run(self, resumed: Record, folder: Path) -> None:
-        """Raise RunError if ``resumed``, the record of a resumed fit, has other data or settings than this record."""
+        """Raise RunError if ``resumed``, the record of a resumed fit, has other logs or options than this record.
+
+        The options in `MAY_CHANGE` may differ.
+        """
         if self.data_digest != resumed.data_digest:
             do = "give the same --data or start a new run"
             raise RunError("other logs than the run was started with", file=folder, do=do)
@@ -122,12 +132,17 @@ class Record(BaseModel):
 class Checkpoint(BaseModel):
     """The content of checkpoint.pt: the progress of a fit, and the state from which its objective resumes.
 
-    seconds: duration of the fit [s]. substeps: integrator steps per sample interval. torque_nmse: mean squared torque
-    error divided by the variance of the torque, per joint. posterior: covariance and torque residual (see
-    `posterior_of`); None except for rigid bodies fitted to torques or to positions under position servos. rollbacks:
-    number of repeated epochs of a fit to windows. learning_rate_factor: factor on the learning rate after these
-    repetitions. momentum_done: whether the momentum stage has ended. Further keys are states of an objective; torch
-    checks their content.
+    Attributes:
+        seconds: duration of the fit [s].
+        substeps: integrator steps per sample interval.
+        torque_nmse: mean squared torque error divided by the variance of the torque, per joint.
+        posterior: covariance of the parameters and RMS torque residual (see `posterior_of`), only for rigid bodies
+            fitted to torques, or to positions under position servos.
+        rollbacks: number of repeated epochs of a fit to windows.
+        learning_rate_factor: factor on the learning rate after these repetitions.
+        momentum_done: whether the momentum stage has ended.
+
+    Further keys are states of an objective; torch checks their content.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -154,8 +169,12 @@ class Checkpoint(BaseModel):
 class Epoch(BaseModel):
     """A line of metrics.jsonl: the state of a fit after an epoch.
 
-    step: number of optimizer steps so far. loss: mean training loss. validation: validation loss. best: lowest
-    validation loss so far. seconds: duration of the fit so far [s].
+    Attributes:
+        step: number of optimizer steps so far.
+        loss: mean training loss.
+        validation: validation loss.
+        best: lowest validation loss so far.
+        seconds: duration of the fit so far [s].
     """
 
     epoch: Count
@@ -167,7 +186,10 @@ class Epoch(BaseModel):
 
 
 def require(schema: type[Schema], content: object, file: Path, line: int | None = None) -> Schema:
-    """Return the content as an object of the schema. Raises RunError if a key is missing or has another type."""
+    """Return the content of a file as an object of the schema.
+
+    Raises RunError if a key is absent or has another type.
+    """
     try:
         return schema.model_validate(content)
     except ValidationError as error:

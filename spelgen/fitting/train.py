@@ -35,12 +35,18 @@ def train(
 ) -> Fit:
     """Fit the module to the logs and write a run folder (see `RunFolder`).
 
-    module: the built module. data: log files. urdf: URDF that the module was built from, for the regularizer and the
-    baselines; by default, the file with the URDF's original name in the module's folder. source: run folder whose model
-    is adapted; used if there is no module. config: a configuration, or options for an objective that depends on the
-    logs. of_logs: fields of `Preprocessing`, validation_fraction and seed, by name. require: function that raises an
-    error for unusable logs before the fit, or returns findings. A resumed run uses the recorded options and the
-    recorded mapping of the logs, unless the arguments replace them.
+    A resumed run uses the recorded options and the recorded mapping of the logs, unless the arguments replace them.
+
+    Args:
+        module: the built module; None: the fit continues from the model of ``source``.
+        data: log files.
+        config: a configuration, or options by name; the default objective depends on the logs.
+        urdf: URDF that the module was built from, for the regularizer and the baselines; by default, the file with the
+            URDF's original name in the module's folder.
+        source: run folder with a fitted model, by default ``folder``.
+        of_logs: dict with fields of `Preprocessing`, validation_fraction and seed.
+        require: function that checks the logs before the fit: it raises an error for unusable logs and returns
+            diagnostics.
 
     Raises ModuleError, LogError, and RunError if the folder contains a run or cannot be resumed with these arguments.
     """
@@ -83,7 +89,7 @@ def train(
 
 
 def _resumed(config: FitConfig | FitOptions | None, record: Record) -> FitConfig | FitOptions:
-    """Return the configuration of a resumed fit: recorded options, unless `config` replaces them."""
+    """Return the configuration of a resumed fit: the recorded options, replaced by the options in `config`."""
     if not isinstance(config, FitOptions):
         return config or record.config
     objective, options = config.objective or record.objective, config.options
@@ -95,7 +101,7 @@ def _resumed(config: FitConfig | FitOptions | None, record: Record) -> FitConfig
 def robot_of(
     module: Path | None, urdf: Path | str | None, spec: ModelSpec
 ) -> tuple[Path | None, list[Diagnostic]]:
-    """Return the path of the URDF to copy into the run folder, None without a URDF, and diagnostics about the URDF."""
+    """Return the path of the URDF for the run folder (None if there is none), and diagnostics about the URDF."""
     if urdf is not None:
         path = Path(urdf)
     elif module is not None:

@@ -9,14 +9,15 @@ class FittingTuning:
 
     # Damping of Gauss-Newton steps, relative to the diagonal of the curvature (`fitting.levenberg_marquardt`).
 
-    # [1] Damping of the first step (Marquardt, J. SIAM 11:431, 1963: 1e-2).
+    # [1] Damping of the first step. Marquardt (J. SIAM 11:431, 1963) uses 1e-2.
     initial_damping: float = 1e-3
     # [1] Smallest damping: steps with a smaller damping equal Gauss-Newton steps to nine digits.
     min_damping: float = 1e-9
-    # [1] Factor by which the damping is lowered after a step that decreases the cost, and raised otherwise
+    # [1] The damping is divided by this number after a step that decreases the cost, otherwise multiplied by it
     # (Marquardt: 10).
     damping_factor: float = 10.0
-    # [1] Largest number of dampings tried for one step: from the smallest damping to one with negligible steps.
+    # [1] Largest number of dampings tried for one step. From the smallest damping, this reaches 1e5, where steps are
+    # negligible.
     max_trials: int = 15
     # [1] Smallest predicted decrease of the cost for which a step is tried, as a fraction of the cost; smaller ones are
     # within rounding errors.
@@ -47,14 +48,14 @@ class FittingTuning:
 
     # Epochs of predicted windows (`fitting.rollout_objective`).
 
-    # [1] Largest fraction of all steps, or of the allowed time, in the first stage, in which residual terms of rigid
-    # bodies that the torque fit did not select are constant.
+    # [1] Largest fraction of all steps, or of the time limit, for the first stage. In the first stage, residual terms
+    # that the torque fit did not select are fixed.
     first_stage: float = 0.8
-    # [1] Number of epochs without improvement that ends the second stage: residual terms that describe the arm lower
-    # the loss within few epochs.
+    # [1] The second stage ends after this number of epochs without improvement. Residual terms that describe the arm
+    # lower the loss within few epochs.
     second_patience: int = 3
-    # [1] Number of epochs between choices of the integration step: in the meantime, the fitted friction may have become
-    # too stiff for the step.
+    # [1] Number of epochs after which the integration step is chosen again: the fitted friction may have become too
+    # stiff for the present step.
     probe_every: int = 5
     # [1] Number of diverged epochs that are repeated, each at half the learning rate, before a fit ends with an error.
     max_rollbacks: int = 8
@@ -63,17 +64,17 @@ class FittingTuning:
 
     # [1] Largest number of rk4 steps per sample interval.
     max_substeps: int = 32
-    # [1] Largest integration error, as a fraction of the model's error.
+    # [1] Largest integration error, as a fraction of the model's prediction error.
     integration_fraction: float = 0.03
-    # [1] Lower bound of the model's error in the comparison with the integration error, in units of the scales of the
-    # loss.
+    # [1] The integration error is compared with the model's prediction error or with this value, whichever is larger;
+    # both are errors divided by the scales of the loss.
     min_model_error: float = 1e-2
 
     # Rollouts by dopri5 (`fitting.rollout`).
 
     # [1] Relative tolerance of a step.
     adaptive_rtol: float = 1e-7
-    # [rad, m, and momenta] Absolute tolerance of a step.
+    # [rad, m, Nm s, N s] Absolute tolerance of a step, for positions and momenta.
     adaptive_atol: float = 1e-9
 
     # Optimizers of networks (`fitting.optimizers`).
@@ -82,7 +83,7 @@ class FittingTuning:
     number_factor: float = 5.0
     # [1] Largest norm of the gradient of the scaled loss; larger gradients are scaled down to this norm.
     gradient_norm: float = 1.0
-    # [1] Number of past steps from which L-BFGS approximates the curvature.
+    # [1] Number of past steps from which L-BFGS approximates the inverse Hessian.
     lbfgs_history: int = 50
     # [1] Number of evaluations of the loss between tests of convergence.
     lbfgs_call: int = 20

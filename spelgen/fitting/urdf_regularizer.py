@@ -19,11 +19,14 @@ from spelgen.logs.windows import Windows
 
 
 class UrdfRegularizer(NamedTuple):
-    """Variation of M and gravity torque of a URDF at S positions.
+    """Mass matrices and gravity torques of a URDF at S positions, to which a model is compared.
 
-    q: (S, n), positions [rad, m]. whitening: (n, n), inverse Cholesky factor of the model's mean M before the fit.
-    variation: (S, n, n) [1], whitened difference between M and its mean over the positions. gravity: (S, n), gravity
-    torque [Nm, N]. gravity_scale: (n,), unit of errors of the gravity torque [Nm, N].
+    Attributes:
+        q: (S, n), positions [rad, m].
+        whitening: (n, n), W = inverse Cholesky factor of the model's mean M before the fit.
+        variation: (S, n, n) [1], W (M - mean M) W^T for the M of the URDF.
+        gravity: (S, n), gravity torque [Nm, N].
+        gravity_scale: (n,), divisor of the errors of the gravity torque [Nm, N].
     """
 
     q: Tensor
@@ -35,7 +38,8 @@ class UrdfRegularizer(NamedTuple):
     def loss(self, model: ArmModel) -> Tensor:
         """Return the mean squared difference between model and URDF, () [1].
 
-        The difference has two terms: the whitened variation of M with q, and the gravity torque divided by its scale.
+        The loss is the sum of two mean squares: of the difference of W (M - mean M) W^T, and of the gravity torque's
+        difference divided by its scale.
         """
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
@@ -65,7 +69,7 @@ def urdf_regularizer(
 
 
 def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfRegularizer:
-    """Return the regularizer of a URDF at random positions, uniformly distributed in the widened range of the logs.
+    """Return the regularizer of a URDF at random positions within the logged range of positions plus a margin.
 
     Args:
         urdf: URDF file.
@@ -87,7 +91,7 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
         whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
     gravity = dynamics.gravity(q)
     scale = gravity.square().mean(dim=0).sqrt()
-    # If no joint has a gravity torque, the unit is arbitrary: it is 1.
+    # If no joint has a gravity torque, the errors are divided by 1.
     scale = scale.clamp(min=TUNING.min_gravity_scale * scale.max().item() or 1.0)
     return UrdfRegularizer(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
 

@@ -1,4 +1,4 @@
-"""External torques by a first-order momentum observer (De Luca and Mattone, ICRA 2005), with thresholds per joint."""
+"""External torques by a first-order momentum observer (De Luca and Mattone, ICRA 2005), and thresholds for contacts."""
 
 from typing import NamedTuple
 
@@ -25,8 +25,11 @@ class ContactState(NamedTuple):
 class ContactObserver:
     """Momentum observer: a first-order low-pass filter of the terms of the momentum balance, updated with each sample.
 
-    low: filter states, (15, n): torque, friction, uncertainty of friction, momenta of the arm at two bandwidths, and
-    regressor of the payload. baseline: slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
+    Attributes:
+        low: Low-pass filtered terms, (15, n). Row 0: torque; 1: friction; 2: uncertainty of friction; 3 and 4: momentum
+            of the arm, filtered at the bandwidth of the observer and at twice this bandwidth; 5 to 14: regressor of the
+            payload.
+        baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -44,8 +47,12 @@ class ContactObserver:
     ) -> ContactState:
         """Return the external torques after a sample.
 
-        t: time [s]. qd: velocities, (n,). at: terms of the momentum balance at the sample. drift: friction scale minus
-        one, and disturbance [Nm, N], (n, 2).
+        Args:
+            t: Time of the sample [s].
+            qd: Velocities, (n,) [rad/s, m/s].
+            at: Terms of the momentum balance at the sample.
+            payload: Estimated payload.
+            drift: Estimates of the drift filter, (n, 2): friction scale minus one [1], and disturbance [Nm, N].
         """
         signal, variance = self.residual(t, at, payload, drift)
         noise = np.sqrt(variance + np.square(self.levels.observer))
@@ -57,41 +64,42 @@ class ContactObserver:
     def residual(
         self, t: float, at: Balance, payload: Payload, drift: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low-pass filtered torque residual, (n,) [Nm, N], and its variance, (n,).
+        """Return the low-pass filtered torque residual, (n,) [Nm, N], and a part of its variance, (n,).
 
-        The residual is the torque without the contributions of model, payload, and drift. The variance is due to
-        changing accelerations, an unknown friction state and the uncertain payload. It does not include the noise of
-        the observer.
+        The residual is the measured torque minus the torques of the model, of the payload and of the drift. The
+        variance has three terms: for changing accelerations, for an unknown friction state and for the uncertain
+        payload. The noise of the observer must be added. For the arguments see `step`.
         """
         rate = TUNING.bandwidth
         scale, disturbance = drift.T
         load = at.load_torque + rate * at.load_momentum
         free = at.torque - at.friction + rate * at.momentum
         inputs = np.stack([free, at.friction, at.uncertainty, at.momentum, at.momentum, *load.T])
-        # A slow contact looks like a disturbance: limit the disturbance to values that occur in the training logs.
-        # The excess is treated as contact.
+        # The drift filter cannot distinguish a slow contact from a disturbance. The disturbance is limited to values
+        # that occur in the training logs, and the excess is treated as contact.
         largest = TUNING.outlier * self.levels.drift.disturbance
         disturbance = np.clip(disturbance, -largest, largest)
         if self.t is None:
-            # Start at a torque residual of zero. The steady state of the filters for constant inputs would show an
-            # external torque if the arm accelerates.
+            # The filters start in the states for which the torque residual is zero. In their steady state for constant
+            # inputs, the residual of an accelerating arm would not be zero.
             self.low = inputs.copy()
             self.low[0], self.low[1], self.low[5:] = rate * at.momentum, 0.0, rate * at.load_momentum.T
             self.baseline = disturbance
         else:
             step = t - self.t
             gains = np.full((len(inputs), 1), 1 - np.exp(-rate * step))
-            # The second filter of the momenta (row 4) has twice the bandwidth of the first (row 3). The difference
-            # between both estimates of dp/dt shows how fast dp/dt changes.
+            # Row 4 of `low` has twice the bandwidth of row 3. The difference between the two estimates of dp/dt
+            # indicates how fast dp/dt changes.
             gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
-            # The estimated disturbance of a joint in contact contains the contact torque: do not update the baseline.
+            # The baseline of a joint in contact is not updated, because its estimated disturbance contains the contact
+            # torque.
             gain = np.where(self.touched, 0.0, 1 - np.exp(-step / TUNING.baseline))
             self.baseline = self.baseline + gain * (disturbance - self.baseline)
         self.t, self.inputs = t, inputs
         torque, friction, uncertainty, slow, fast = self.low[:5]
-        # Filtered regressor of the payload, (n, 10). Its product with the inertial parameters of the payload is the
-        # contribution of the payload to the residual.
+        # `regressor` is the filtered regressor of the payload, (n, 10). Its product with the inertial parameters of the
+        # payload is the torque of the payload in the residual.
         regressor = rate * at.load_momentum - self.low[5:].T
         signal = (
             torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline

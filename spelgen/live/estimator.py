@@ -26,12 +26,16 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 @dataclass(frozen=True, eq=False)
 class EstimatorState:
-    """Estimates after a sample; vectors are (n,).
+    """Estimates after a sample.
 
-    t: time of the sample [s]. refusal: "used", or the reason for which the sample was refused or used only in part.
-    contact: external torques, their thresholds, and the force at the tip. payload: last reported payload. load_changed:
-    whether a change of the payload was detected at this sample. friction_scale: current friction divided by the
-    friction of the model [1]. disturbance: slow torque that neither model nor payload explains [Nm, N].
+    Attributes:
+        t: Time of the sample [s].
+        refusal: "used", or the reason why the sample was refused or only partly used.
+        contact: External torques, their thresholds, and the force at the tip.
+        payload: Last reported payload.
+        load_changed: Whether a change of the payload was detected at this sample.
+        friction_scale: Current friction divided by the friction of the model, (n,) [1].
+        disturbance: Slow torque that neither model nor payload explains, (n,) [Nm, N].
     """
 
     t: float
@@ -57,11 +61,11 @@ class Estimator:
         levels: NoiseLevels | None = None,
         alarms_per_minute: float = TUNING.alarms_per_minute,
     ) -> None:
-        """Prepare the estimator of a fit.
+        """Initialize the estimator for the model of a fit.
 
-        levels: noise levels, by default those stored with or computed for the fit. alarms_per_minute: rate of false
-        contact alarms. Raises RunError for a model without rigid bodies or with position servos, and for a fit without
-        noise levels.
+        levels: noise levels; by default the noise levels in the run folder, or noise levels that are estimated from the
+        logs of the fit. alarms_per_minute: rate of false contact alarms [1/min]. Raises RunError for a model without
+        rigid bodies or with position servos, and if there are no noise levels.
         """
         self.model = torque_model(fit)
         with torch.no_grad():
@@ -72,7 +76,7 @@ class Estimator:
         self.reset()
 
     def reset(self) -> None:
-        """Reset all states: payload, friction drift and friction state are then unknown."""
+        """Reset all estimates. Payload, friction drift and friction state are then unknown."""
         n = self.model.n
         self.intake = Intake(self.levels, self.reach)
         self.blocks = Blocks(self.levels.rest_speed)
@@ -86,7 +90,7 @@ class Estimator:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Number of samples that were refused or only partly used, by reason."""
+        """{reason: number of samples that were refused or only partly used for this reason}."""
         return {reason: count for reason, count in self.intake.counts.items() if count and reason != "used"}
 
     def step(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> EstimatorState:
@@ -109,7 +113,10 @@ class Estimator:
             yield EstimatorState(now, refusal, self.contact, self.payload, changed, 1 + a, d)
 
     def _advance(self, t: float, qd: np.ndarray, at: Balance, refusal: Refusal) -> bool:
-        """Update all filters with the terms of the momentum balance; return True if a changed load was detected."""
+        """Update all filters with a sample; return True if a changed load was detected.
+
+        t: time [s]. qd: velocities, (n,). at: terms of the momentum balance. refusal: result of the sample's check.
+        """
         if refusal != "used":
             self.blocks.restart()
             self.half = None
@@ -139,8 +146,8 @@ class Estimator:
             main.x[:10], main.P[:10, :10], self.levels.load_variance, self.levels.load_quantile
         )
         if (before.status == "payload") != (self.payload.status == "payload"):
-            # The drift filter assumed a wrong payload and attributed its torques to friction: restart it from the
-            # friction scale of the payload filter.
+            # The drift filter has assumed a wrong payload until now, and has attributed the torques of the error to
+            # friction. It is restarted from the friction scale of the payload filter.
             joints = slice(10, 10 + self.model.n)
             self.drift = JointFilters.of_drift(self.levels.drift)
             self.drift.x[:, 0] = main.x[joints]
@@ -148,12 +155,12 @@ class Estimator:
         return self.payload
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float = 0.0) -> np.ndarray:
-        """Return the torques for accelerations qdd with the estimated payload and friction drift, (n,) [Nm, N].
+        """Return the torques for a motion, with the estimated payload and friction drift, (n,) [Nm, N].
 
         Args:
-            q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (n,).
-            ahead: time between the last sample and the motion [s]. The disturbance decays with it, and is omitted
-                beyond 0.3 s.
+            q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (n,) each.
+            ahead: time from the last sample to the motion [s]. The estimated disturbance decays during this time; if
+                it is longer than 0.3 s, the disturbance is omitted.
         """
         at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
         z = torch.from_numpy((self.intake.low + self.intake.high) / 2)
@@ -162,8 +169,8 @@ class Estimator:
             cache = self.model.at(*at, prepared=self.prepared)
             torque = self.model.inverse_dynamics(cache, *at[1:], *past)
             friction = self.model.friction_torque(cache, at[1], *past)
-            # The payload is fixed to the last body, whose ten inertial parameters are the last columns of the
-            # regressor.
+            # The payload is fixed to the last body. Its regressor is therefore the last ten columns of the regressor,
+            # which belong to this body.
             regressor = regressor_of(self.model.chain, *at)[..., -10:]
             load = regressor @ torch.from_numpy(self.payload.parameters)
             decay = np.zeros(1)

@@ -1,9 +1,14 @@
 """Kalman filters of the momentum balance, averaged over blocks of time: y = Phi theta + f a + b + d + w per joint.
 
-y: torque residual of the model. Phi, theta (10): regressor and inertial parameters of the payload, which is constant.
-f, a (n): friction of the model, and friction scale minus one, which is a random walk. b (n): torque offset, constant.
-d (n): disturbance, an Ornstein-Uhlenbeck process. w: white noise. The rows of a block are processed one after the
-other, so that a control loop can distribute them over its samples.
+- y: measured torque residual of the model.
+- Phi, theta: regressor and constant inertial parameters of the payload, (10,) each.
+- f, a: friction torque of the model, and friction scale minus one; a is a random walk.
+- b: constant torque offset.
+- d: disturbance, an Ornstein-Uhlenbeck process.
+- w: white noise.
+
+The equations of the joints are processed one after the other, so that a control loop can distribute them over its
+samples.
 """
 
 from __future__ import annotations
@@ -23,10 +28,14 @@ from spelgen.live.tuning import TUNING
 class Block(NamedTuple):
     """Means of the terms of the momentum balance over a block of samples.
 
-    duration: length of the block [s]. y: torque residual of the model without payload, (n,) [Nm, N]. load: regressor
-    Phi of the payload, (n, 10). friction: friction torque of the model, (n,) [Nm, N]. uncertainty: half width of the
-    possible friction torques if the friction state is not known exactly, (n,) [Nm, N]. moving: whether each joint
-    moved, (n,).
+    Attributes:
+        duration: Length of the block [s].
+        y: Torque residual of the model without payload, (n,) [Nm, N].
+        load: Regressor Phi of the payload, (n, 10).
+        friction: Friction torque of the model, (n,) [Nm, N].
+        uncertainty: Half of the difference between the largest and the smallest friction torque that an unknown
+            friction state permits, (n,) [Nm, N].
+        moving: Whether each joint moved, (n,).
     """
 
     duration: float
@@ -37,9 +46,9 @@ class Block(NamedTuple):
     moving: np.ndarray
 
     def joined(self, later: Block) -> Block:
-        """Return the block that joins this block and the next one."""
+        """Return this block and the block after it, `later`, as one block."""
         duration = self.duration + later.duration
-        # The terms are means over time: weight them by the durations of the blocks.
+        # The terms are means over time, so the means over both blocks are weighted by the durations of the blocks.
         weight = later.duration / duration
         y, load, friction, uncertainty = (
             a + weight * (b - a) for a, b in zip(self[1:5], later[1:5], strict=True)
@@ -48,7 +57,7 @@ class Block(NamedTuple):
 
 
 class Blocks:
-    """Accumulator of samples that returns a `Block` of means after each period of `TUNING.block` seconds."""
+    """Accumulator of samples. Every `TUNING.block` seconds it returns the means over these samples, a `Block`."""
 
     def __init__(self, rest_speed: np.ndarray) -> None:
         self.rest_speed = rest_speed
@@ -63,9 +72,10 @@ class Blocks:
         """Add a sample at time t [s], with velocities qd (n,) and terms `at`; return the block if it is complete."""
         step = t - self.samples[-1][0] if self.samples else 0.0
         self.samples.append((t, np.abs(qd), at))
-        # The emitted C code sums the steps, too. The difference to the first time would have other rounding errors.
+        # The duration is a sum of time steps, because the emitted C code computes it in this way. The difference of the
+        # last and the first time has other rounding errors.
         self.duration += step
-        # End the block at the sample whose duration is nearest to the length of a block.
+        # The block ends at the sample at which its duration is nearest to `TUNING.block`.
         if len(self.samples) == 1 or self.duration < TUNING.block - step / 2:
             return None
         block = self._block(self.duration)
@@ -84,11 +94,14 @@ class Blocks:
 
 
 class LoadFilter:
-    """Kalman filter of the payload theta together with a, b and d.
+    """Kalman filter of the payload theta and of a, b and d of all joints; see the top of this module for the symbols.
 
-    x: state (theta, a, b, d), (10 + 3 n,). P: covariance of x. log_likelihood: log likelihood of all rows since its
-    last reset. surprise: sum of the normalised squared residuals of moving joints in the last block. disturbance:
-    stationary variance of d, (n,).
+    Attributes:
+        x: State (theta, a, b, d), (10 + 3 n,).
+        P: Covariance of x.
+        log_likelihood: Log likelihood of all measurements since it was set to zero.
+        surprise: Sum of the normalised squared residuals of moving joints in the last block.
+        disturbance: Stationary variance of d, (n,).
     """
 
     def __init__(self, noise: BlockNoise, effort: np.ndarray) -> None:
@@ -100,13 +113,13 @@ class LoadFilter:
         self.log_likelihood = self.surprise = 0.0
 
     def forget_load(self) -> None:
-        """Reset the payload theta to the prior distribution."""
+        """Reset theta to its prior distribution, for a new payload."""
         self.x[:10] = 0.0
         self.P[:10] = self.P[:, :10] = 0.0
         self.P[:10, :10] = np.diag(TUNING.load_prior**2)
 
     def predict(self, duration: float) -> None:
-        """Predict the state after a time [s]."""
+        """Replace the state and its covariance by their prediction after a time `duration` [s]."""
         decay, growth = np.ones_like(self.x), np.zeros_like(self.x)
         decay[10 + 2 * self.n :] = np.exp(-duration / self.noise.time_constant)
         growth[10 : 10 + self.n] = TUNING.friction_walk * duration
@@ -116,14 +129,14 @@ class LoadFilter:
         self.surprise = 0.0
 
     def update(self, block: Block, joint: int) -> None:
-        """Update the state with the row of a joint. A joint at rest updates only the disturbance of this joint."""
+        """Update the state with the measurement y of one joint. A joint at rest updates only its own disturbance d."""
         columns = [*range(10), *range(10 + joint, 10 + 3 * self.n, self.n)]
         row = np.array([*block.load[joint], block.friction[joint], 1.0, 1.0])
         covariance = self.P[:, columns] @ row
         noise = self.noise.white[joint] ** 2 + TUNING.uncertainty * block.uncertainty[joint] ** 2
         expected = float(row @ covariance[columns]) + noise
         residual = float(block.y[joint] - self.x[columns] @ row)
-        # Huber's weights: the variance of an outlier is increased, so that its influence is bounded.
+        # The influence of an outlier is bounded by a larger variance, which corresponds to Huber's weights.
         variance = max(expected, residual**2 / TUNING.outlier**2)
         gain = covariance / variance
         if block.moving[joint]:
@@ -131,7 +144,8 @@ class LoadFilter:
             self.x += gain * residual
             self.P -= np.outer(gain, covariance)
         else:
-            # Joseph's form of the update is valid for any gain: all gains except the one of d are zero.
+            # The gains of all states except d are set to zero. This gain is not optimal, so the covariance is updated
+            # by Joseph's form, which is valid for any gain.
             d, product = columns[-1], gain[columns[-1]] * covariance
             self.x[d] += gain[d] * residual
             self.P[d] -= product
@@ -143,21 +157,22 @@ class LoadFilter:
 class JointFilters:
     """Independent filters of the friction scale a and the disturbance d of each joint, for a known payload.
 
-    Filters of all joints, and of all hypotheses (...) about the noise, are vectorized. Each filter has K states: (a,
-    d), or (a, b, d) if there is a torque offset b. x: states, (..., n, K). P: covariances, (..., n, K, K).
+    Filters with different noise can be computed at once: their axes are the leading axes (...). Each filter has K
+    states: (a, d), or (a, b, d) if there is a torque offset b. x: states, (..., n, K). P: covariances, (..., n, K, K).
     """
 
     def __init__(
         self, deviations: np.ndarray, white: np.ndarray, time_constant: np.ndarray, *, drifts: bool = False
     ) -> None:
-        """Start with states of zero.
+        """Initialize the states to zero.
 
         Args:
-            deviations: prior standard deviations of the states, (..., n, K); the prior standard deviation of d is also
-                the stationary standard deviation of d.
+            deviations: prior standard deviations of the states, (..., n, K). The value for d is also the stationary
+                standard deviation of d.
             white: standard deviations of white noise, (..., n) [Nm, N].
             time_constant: time constant of d, (..., n) [s].
-            drifts: whether a is a random walk, and joints at rest update d, too.
+            drifts: True: a is a random walk, and joints at rest update d. False: a is constant, and joints at rest
+                update no state.
         """
         self.x, self.P = np.zeros_like(deviations), deviations[..., None] ** 2 * np.eye(deviations.shape[-1])
         self.disturbance, self.white, self.time_constant = deviations[..., -1] ** 2, white**2, time_constant
@@ -165,17 +180,19 @@ class JointFilters:
 
     @classmethod
     def of_drift(cls, noise: BlockNoise) -> JointFilters:
-        """Return the filters of a and d for the estimator, whose friction scale drifts."""
+        """Return the filters of the estimator, with the states a, a random walk, and d."""
         deviations = np.stack([np.full_like(noise.white, TUNING.friction), noise.disturbance], axis=-1)
         return cls(deviations, noise.white, noise.time_constant, drifts=True)
 
     def update(self, block: Block, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the states over a block, and update them with a torque, (n,) [Nm, N].
+        """Predict the states at a block, update them with a torque, and return the residual and its variance.
 
-        torque: torque residual of the block minus the torque of the payload.
+        Args:
+            block: Means of the terms of the momentum balance.
+            torque: Torque residual of the block minus the torque of the payload, (n,) [Nm, N].
 
         Returns:
-            Residual of the prediction, and its predicted variance, (..., n) each.
+            Difference of `torque` from its prediction, and the predicted variance of this difference, (..., n) each.
         """
         decay = np.ones_like(self.x)
         decay[..., -1] = np.exp(-block.duration / self.time_constant)
@@ -193,19 +210,22 @@ class JointFilters:
         used[:, -1] |= self.drifts
         gain = np.where(used, covariance / variance[..., None], 0.0)
         self.x = self.x + gain * residual[..., None]
-        # This is Joseph's form if the gain is the optimal one for some states and zero for the others.
+        # The gain is optimal for the states in `used` and zero for the other states. For such a gain, Joseph's form of
+        # the covariance update is equal to this expression.
         product = gain[..., None] * covariance[..., None, :]
         self.P = self.P - np.where(used[..., None], product, product.swapaxes(-1, -2))
         return residual, expected
 
 
 class PayloadEstimate:
-    """The payload filter and, after a surprising block, two copies of it that represent hypotheses.
+    """The payload filter, with detection of a changed load.
 
-    One copy is for the hypothesis that the load has changed, the other for the hypothesis of a contact. Both exist
-    until a change of the load is accepted or both hypotheses are dropped. The rows of a block (one per joint and
-    filter) are distributed over the samples of the next block, to limit the computing time per sample. moved: time in
-    motion since the start or the last change of the load [s].
+    After a block with large residuals there are two copies of the filter: one for the hypothesis that the load has
+    changed, one for the hypothesis of a contact. They exist until the change of the load is accepted or both hypotheses
+    are dropped. A block has one filter update per joint and filter. These updates are distributed over the samples of
+    the next block, to limit the computing time per sample.
+
+    moved: time in motion since the start or the last change of the load [s].
     """
 
     def __init__(self, levels: NoiseLevels) -> None:
@@ -216,10 +236,7 @@ class PayloadEstimate:
         self.samples = self.per_sample = 0
 
     def start(self, block: Block) -> None:
-        """Begin an update of the filters with the measurements of `block`, which `step` distributes over samples.
-
-        Rows of the previous block that are not processed yet are processed first.
-        """
+        """Finish the updates of the previous block, then start the updates of `block`, which `step` continues."""
         for _ in self.rows:
             pass
         if block.moving.any():
@@ -230,9 +247,10 @@ class PayloadEstimate:
         self.rows = self._rows(block)
 
     def step(self) -> None:
-        """Process the next few rows of the current block.
+        """Process the next updates of the current block.
 
-        The number per sample is such that all rows are processed before the next block is complete.
+        It is called at each sample. The number of updates per call is chosen so that all updates are finished before
+        the next block is complete.
         """
         self.samples += 1
         for _ in range(self.per_sample):
@@ -249,7 +267,10 @@ class PayloadEstimate:
             yield
 
     def _compare(self, moving: int) -> None:
-        """Start, accept or drop the hypotheses of a changed load and a contact; moving: number of moving joints."""
+        """Accept or drop existing hypotheses, or start new hypotheses if the residuals of the block are large.
+
+        moving: number of moving joints.
+        """
         main = self.filters[0]
         if len(self.filters) > 1:
             _, candidate, contact = self.filters
@@ -261,7 +282,8 @@ class PayloadEstimate:
             if self.hypotheses_moved >= least:
                 self.filters = [main]
         is_surprise = moving and main.surprise > moving + TUNING.surprise * math.sqrt(2 * moving)
-        # In the first second of motion, residuals are large because the payload is unknown: test no hypotheses.
+        # There are no hypotheses in the first second of motion, in which residuals are large because the payload is
+        # unknown.
         if len(self.filters) == 1 and is_surprise and self.moved >= TUNING.changed_after:
             main.log_likelihood = self.hypotheses_moved = 0.0
             candidate, contact = copy.deepcopy(main), copy.deepcopy(main)

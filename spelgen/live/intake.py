@@ -20,9 +20,13 @@ IGNORED: tuple[Refusal, ...] = ("not finite", "repeated", "reversed", "jump")
 class Intake:
     """Checks of samples one after the other, and bounds of the friction state.
 
-    counts: number of samples for each result of the check. low, high: bounds of the friction state, (n, K) [rad, m].
-    The initial bounds are minus and plus the break-away displacements. Motion of a joint makes both bounds equal: the
-    friction state of the joint is then known.
+    The initial bounds of the friction state are minus and plus the break-away displacements. After a sufficient motion
+    of a joint both bounds are equal, and its friction state is known.
+
+    Attributes:
+        counts: {result of the check: number of samples}.
+        low: Lower bound of the friction state of each of K bristles, (n, K) [rad, m].
+        high: Upper bound, (n, K) [rad, m].
     """
 
     def __init__(self, levels: NoiseLevels, bristles: BristleReach) -> None:
@@ -34,9 +38,13 @@ class Intake:
         self.low, self.high = -self.limit, self.limit
 
     def accept(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
-        """Check a sample and update the bounds of the friction state; return "used" or the reason of a refusal."""
+        """Check a sample and update the bounds of the friction state.
+
+        Return "used", or the reason why the sample is refused or only partly used. t: time [s]. q, qd, tau: (n,) each.
+        """
         refusal = self._check(t, q, qd, tau)
-        # Several refused samples in a row show that the clock or the positions have changed permanently: restart.
+        # After `TUNING.restart` consecutive samples with such a refusal, a permanent change of the clock or of the
+        # positions is assumed, and the checks restart with the current sample.
         self.ignored += refusal in ("reversed", "jump")
         restarts = self.ignored >= TUNING.restart
         if refusal == "gap" or restarts or self.t == -np.inf:
@@ -67,7 +75,8 @@ class Intake:
             return "jump"
         if t - self.t > TUNING.gap:
             return "used" if self.t == -np.inf else "gap"
-        # The limit includes one encoder step, and motion for `TUNING.block` seconds, since time stamps may be delayed.
+        # The largest possible motion since the last sample. Time stamps may be delayed, so the limit includes a motion
+        # of `TUNING.block` seconds at the largest speed of the training logs, and one encoder step.
         furthest = speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
         if (np.abs(q - self.q) > furthest).any():
             return "jump"
@@ -102,7 +111,8 @@ def balance_along(
     used = [k for k, refusal in enumerate(refusals) if refusal not in IGNORED]
     terms: list[Balance | None] = [None] * len(t)
     if used:
-        # All samples are computed in one call, since a call of torch takes longer than the arithmetic of one sample.
+        # The terms of all samples are computed in one call, because the overhead of a call of torch is larger than the
+        # computation for one sample.
         low, high = np.array([bounds[k] for k in used]).swapaxes(0, 1)
         columns = balance(model, levels.point, [x[used] for x in samples], (low, high), prepared)
         for k, *row in zip(used, *columns, strict=True):

@@ -65,7 +65,11 @@ def stored_levels(fit: Fit) -> NoiseLevels | None:
 
 
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
-    """Return the noise levels by cross-validation: each fold of the logs is held out of a fit."""
+    """Return the noise levels of a fit, estimated by cross-validation.
+
+    For each fold of the logs a model is fitted to the other folds, and the noise is estimated from its residual on this
+    fold.
+    """
     logs, count = list(fit.logs), TUNING.folds
     if len(logs) == 1:
         # A single log is divided into parts, so that a part can be held out.
@@ -76,7 +80,8 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
     if fit.urdf is not None and fit.urdf.exists():
         arm = arm_of_model(fit.model, fit.urdf)
         effort, tip = np.array([joint.effort or np.inf for joint in arm.chain.coordinates]), tip_frame(arm)
-        # The contact force is estimated at the tip, or at the origin of the last body if another body carries the tip.
+        # The contact force is estimated at a point of the last body: at the tip or, if the tip is fixed to another
+        # body, at the origin of the last body.
         if tip.carrier == len(arm.chain.bodies) - 1:
             point = tip.pose[:3, 3]
     tested = []
@@ -84,17 +89,17 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
         tested.append((fitted_to(fit, others), fold))
     levels = find_levels(tested, effort, point)
-    # Serialization rounds the numbers. The rounded numbers are returned, so that a later read of the run folder gives
-    # the same ones.
+    # Serialization rounds the numbers. The rounded numbers are returned, so that they are equal to the numbers that are
+    # later read from the run folder.
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
 
 def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
-    """Return a new model of the same kind as the model of a fit, fitted to other logs from the initial parameters.
+    """Return a new model with the specification of the model of a fit, fitted to other logs.
 
-    The new model is used to estimate the error on held-out logs. For that purpose a subset of the samples suffices, at
-    most ``max_samples``. Residual terms are selected only if the model of the fit has some. Raises LogError for too
-    little motion.
+    The new model is used to estimate the error on held-out logs. For this, at most ``TUNING.max_samples`` samples of
+    the other logs suffice. Residual terms are selected only if the model of the fit has some. Raises LogError if the
+    logs have too little motion.
     """
     model = assemble(required_spec(fit.model)).double()
     if residual_terms(without_idle_residuals(fit.model)) is None:
@@ -113,10 +118,10 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
 
 
 class HeldOutSample(NamedTuple):
-    """A sample of a log, with the terms of a model that was not fitted to the log; vectors are (n,).
+    """A sample of a log, with the terms of a model that was not fitted to the log.
 
-    t: time [s]. at: terms of the momentum balance. is_resumed: whether the sample is the first one after a gap. block:
-    the block that ends at this sample, or None.
+    t: time [s]. qd: velocities, (n,) [rad/s, m/s]. at: terms of the momentum balance. is_resumed: whether the sample is
+    the first one after a gap. block: the block that ends at this sample, or None.
     """
 
     t: float
@@ -146,18 +151,18 @@ def find_levels(
     """Return the noise levels of an arm from held-out logs.
 
     Args:
-        folds: models, each with the held-out logs, to which the model was not fitted.
+        folds: pairs of a model and the logs to which it was not fitted.
         effort: torque limits, (n,) [Nm, N]; infinite if unknown.
         point: position of the tip in the frame of the last body, (3,) [m].
     """
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    # These `NoiseLevels` have limits and no noise values: the samples from which the noise is estimated depend on the
-    # limits.
+    # `levels` has no noise values yet. It has the limits by which samples are accepted or refused, and the noise is
+    # estimated from the accepted samples.
     levels = NoiseLevels.model_construct(
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
-        # A limit below the largest logged torque would be wrong.
+        # The torque limit in the URDF is replaced if logged torques exceed it.
         effort=np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest),
         minutes=sum(log.duration for log in logs) / 60,
         point=point,
@@ -172,13 +177,14 @@ def find_levels(
 
 
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
-    """Return the factor on the covariance of estimated payloads, and its degrees of freedom.
+    """Return the factor by which the covariance of an estimated payload is multiplied, and its degrees of freedom.
 
-    The logs are without payload, so each estimated payload is an error. Each window of consecutive blocks is one trial,
-    with two normalised squared errors: of the mass, and of mass and first moments. The mean of an error over the trials
-    includes the prior value with the weight of `prior_trials` trials. The factor is the largest of the means for both
-    errors and for all lengths of windows. A longer window may have a larger normalised error, because the errors of
-    the model are correlated over time.
+    The factor is the mean normalised squared error of estimated payloads. The logs are without payload, so each
+    estimated payload is an error. Each window of consecutive blocks gives one estimate (a trial), with two errors: the
+    error of the mass, and the error of mass and first moments. A prior value is included in the mean, with the weight
+    of `prior_trials` trials. Means are computed for the two errors and for each length of windows, and the factor is
+    the largest mean: in longer windows the normalised error may be larger, because the errors of the model are
+    correlated over time.
     """
     factors = []
     for window in TUNING.trial_blocks:
@@ -198,10 +204,11 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
 
 
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
-    """Return the maximum-likelihood noise of each joint, over a grid; segments: consecutive blocks of each log.
+    """Return the maximum-likelihood noise of each joint.
 
-    The model is y = f a + b + d + w per joint (see `live.filters`). The grid has the time constant of d, and the ratio
-    of the standard deviations of d and w. The scale of w is estimated for each point of the grid.
+    The model is y = f a + b + d + w per joint (see `live.filters`). The likelihood is maximized over a grid of time
+    constants of d, and of ratios between the standard deviations of d and w. The standard deviation of w is estimated
+    for each grid point. segments: consecutive blocks of each log.
     """
     grid = np.array(list(itertools.product(TUNING.time_constants, TUNING.disturbance_ratios)))
     typical = np.median(np.abs([x.y for blocks in segments for x in blocks]), axis=0) + 1e-9
@@ -217,19 +224,20 @@ def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
 def _likelihood(
     segments: Sequence[Sequence[Block]], grid: np.ndarray, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the negative log likelihood and the mean normalised squared residual, (G, n) each.
+    """Return the negative log likelihood, and the mean normalised squared residual, (G, n) each, at G grid points.
 
     Args:
         segments: consecutive blocks of each log.
-        grid: time constant of d [s], and ratio of the standard deviations of d and w, at each of G points, (G, 2).
-        scale: standard deviations of white noise, (G, n) [Nm, N].
+        grid: time constant of d [s], and ratio of the standard deviations of d and w [1], (G, 2).
+        scale: standard deviations of the white noise w, (G, n) [Nm, N].
     """
     constant, ratio = grid.T[:, :, None]
     cost, squares, count = np.zeros((3, *scale.shape))
-    # prior standard deviations of a, b and d; the offset b is within a few standard deviations of white noise
+    # Prior standard deviations of a, b and d, (G, n, 3). It is assumed that the offset b is not larger than a few
+    # standard deviations of the white noise.
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
-        # Without drift, joints at rest do not update the filters: the noise in motion is estimated.
+        # With `drifts` false, joints at rest update no state, so the noise of joints in motion is estimated.
         filters = JointFilters(prior, scale, constant)
         for block in blocks:
             residual, expected = filters.update(block, block.y)
@@ -241,9 +249,9 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
-    """Return a copy of the levels with two more estimates, from held-out samples of each tested log.
+    """Return the levels with the noise of the momentum observer, and with the exponential tail of its peaks.
 
-    The estimates are the noise of the momentum observer, and the exponential tail of the observer's peaks.
+    tested: held-out samples of each log.
     """
     residuals = [_observer_residuals(levels, samples) for samples in tested]
     signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))
@@ -252,7 +260,7 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
     for samples, (signal, variance, qd) in zip(tested, residuals, strict=True):
         beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
         ratio = beyond / np.sqrt(variance + np.square(levels.observer))
-        # Large values at neighbouring samples are one event, so only the largest value of each time window counts.
+        # Large values at neighbouring samples are one event, so a peak is the largest value in a time window.
         times = np.array([sample.t for sample in samples])
         starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
         peaks.append(np.maximum.reduceat(ratio, starts, axis=0))
@@ -260,11 +268,14 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
 
 
 def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
-    """Return the exponential tail of the peaks of logs, (W, n) each, increased for the differences between logs.
+    """Return the exponential tail of the peaks of all logs, as fields of `NoiseLevels`.
 
-    Thresholds of the other logs, multiplied by one factor, give at most as many alarms in each log as the default rate
-    allows for all logs together. All joints have the same factor: the joint that needs the largest one differs between
-    logs.
+    The peaks are multiplied by a factor for the differences between logs, determined by cross-validation: for each log,
+    thresholds are computed from all other logs. With the factor on these thresholds, all held-out logs together have no
+    more alarms than the default rate of false alarms allows. The factor is the same for all joints, because the joint
+    that needs the largest factor differs between logs.
+
+    peaks: peaks of each log in W time windows, (W, n) [1].
     """
     excess: list[float] = []
     for k, peaks_of_log in enumerate(peaks):
@@ -292,26 +303,30 @@ def _observer_residuals(
 
 
 def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, object]:
-    """Return the exponential tail of the peaks of logs, (W, n) each, after multiplication by a factor."""
+    """Return the parameters of an exponential distribution of the largest peaks, as fields of `NoiseLevels`.
+
+    peaks: peaks of each log, (W, n) [1]; they are multiplied by `factor`.
+    """
     together = factor * np.concatenate(peaks)
     start = np.quantile(together, 1 - TUNING.tail, axis=0)
-    # A joint without residuals has no peaks above the start.
+    # The number of peaks above `start` is the same for all joints except joints without residuals, which have none.
     count = max(int((together > start).sum(axis=0).max()), 1)
     scale = np.maximum(together - start, 0).sum(axis=0) / count
     return {"peak_start": start, "peak_scale": scale, "peak_count": count}
 
 
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:
-    """Return the maximum-likelihood noise of the observer in motion and at rest, over a grid.
+    """Return the noise of the momentum observer in motion and at rest, as fields of `NoiseLevels`.
 
-    signal: torque residual of the observer, (T, n) [Nm, N]. qd: velocities, (T, n).
+    The likelihood is maximized over a grid. signal: torque residual of the observer, (T, n) [Nm, N]. qd: velocities,
+    (T, n) [rad/s, m/s].
     """
     grid = np.array(list(itertools.product(TUNING.resting_speeds, TUNING.resting_ratios)))
     noise, costs = np.zeros((2, len(grid), len(levels.speed)))
     for k, (speed, ratio) in enumerate(grid):
         shape = 1 + np.square(ratio * np.exp(-np.abs(qd) / (speed * levels.speed)))
-        # The median is used because peaks are modelled separately; 0.455 is the median of a squared standard normal
-        # variable.
+        # The variance is estimated by the median of the squares, on which peaks have no influence: they are modelled
+        # separately. 0.455 is the median of the square of a standard normal variable.
         level = np.sqrt(np.median(signal**2 / shape, axis=0) / 0.455)
         noise[k] = np.maximum(level, TUNING.min_observer_noise * levels.effort)
         normalised = np.abs(signal) / (noise[k] * np.sqrt(shape))

@@ -19,16 +19,20 @@ from spelgen.dynamics.protocol import is_stateful
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidParameters
 
-_BLOCK = 2048  # samples computed at a time, to limit the memory
+_BLOCK = 2048  # Number of samples that are computed at once. The number is limited to save memory.
 
 
 class Balance(NamedTuple):
-    """Terms of the momentum balance at T samples, (T, n) except for the payload and the Jacobian, in SI units.
+    """Terms of the momentum balance at T samples, in SI units.
 
-    momentum: p. torque: G (tau - offset) + friction compensation + dL/dq. friction: mean of the friction torques at
-    both bounds of the friction state. uncertainty: half the difference of the friction torques at both bounds.
-    load_momentum, load_torque: P and N, momentum and torque per inertial parameter of the payload, (T, n, 10).
-    jacobian: Jacobian of a point of the last body, (T, 3, n), in root axes.
+    Attributes:
+        momentum: Momentum p of the arm, (T, n).
+        torque: G (tau - offset) + friction compensation + dL/dq, (T, n).
+        friction: Mean of the friction torques at the two bounds of the friction state, (T, n).
+        uncertainty: Half the difference of the friction torques at the two bounds, (T, n).
+        load_momentum: P, momentum per inertial parameter of the payload, (T, n, 10).
+        load_torque: N, torque per inertial parameter of the payload, (T, n, 10).
+        jacobian: Jacobian of a point of the last body, in root axes, (T, 3, n).
     """
 
     momentum: np.ndarray
@@ -41,9 +45,9 @@ class Balance(NamedTuple):
 
 
 def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the terms P and N of a payload, and the Jacobian of a point of the last body, (T, 3, n), in root axes.
+    """Return P and N, (T, n, 10) each, and the Jacobian of a point of the last body, (T, 3, n), in root axes.
 
-    P and N, (T, n, 10), are the momentum and the torque per inertial parameter of the payload in the momentum balance.
+    P is the generalised momentum and N the torque in the momentum balance, per inertial parameter of a payload.
 
     Args:
         chain: kinematics of the bodies.
@@ -54,19 +58,20 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
     # contains the whole homogeneous transform of each body.
     pose = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
     velocities, _, turning = chain.motion(pose, qd)
-    frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(-2, -3)  # (T, 1, 4, 4)
-    velocity = velocities[..., -1, :]  # velocity of the frame of the last body, (T, 3, 4)
+    # `frame` is the homogeneous transform of the last body, (T, 1, 4, 4).
+    frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(-2, -3)
+    velocity = velocities[..., -1, :]  # Time derivative of the frame of the last body, (T, 3, 4).
     axes, turned = (torch.unflatten(x.mT @ chain.motions, -1, (3, 4)) for x in (pose.axes, turning))
-    # Derivatives of the frame of the last body with respect to q, and the rates of these derivatives, (T, n, 3, 4).
-    # Only joints that carry the last body contribute.
+    # `jacobian` is the derivative of the frame of the last body with respect to q, and `rate` its time derivative,
+    # (T, n, 3, 4) each. Only joints between the root and the last body contribute.
     ratios = chain.carriers[:, -1:] * chain.ratios
     changes = axes @ frame, turned @ frame + axes[..., :3] @ velocity.unsqueeze(-3)
     jacobian, rate = (torch.einsum("bn,tbxa->tnxa", ratios, change) for change in changes)
     weight = torch.zeros_like(velocity)
     weight[..., 3] = -chain.base.flatten()
     directions, vectors = torch.stack([jacobian, rate, jacobian]), torch.stack([velocity, velocity, weight])
-    # The entries of P and N are tr(A J B^T), with the pseudo-inertia J of the payload, A in `directions` and B in
-    # `vectors`. The entries of A^T B are therefore the coefficients of the entries of J.
+    # Momentum and torque of the payload have the form tr(A J B^T), with its pseudo-inertia J (4, 4), A in `directions`
+    # and B in `vectors`. They are linear in J, with the coefficients A^T B (4, 4).
     products = torch.einsum("ktnxa,ktxb->ktnab", directions, vectors)
     units = pseudo_inertia(torch.eye(10).to(q))
     momentum, centrifugal, weighed = torch.tensordot(products, units, dims=([-2, -1], [1, 2]))

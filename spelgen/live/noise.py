@@ -38,17 +38,28 @@ class BlockNoise(BaseModel):
 
 
 class NoiseLevels(BaseModel):
-    """Noise levels and limits of an arm that the estimator uses in addition to its model; vectors are (n,).
+    """Noise levels and limits of an arm that the estimator uses in addition to its model.
 
-    drift, load: noise of the blocks of the drift filter and of the payload filter. observer: standard deviation of the
-    momentum observer for a moving joint [Nm, N]. resting: additional threshold for a joint at rest, which is three
-    standard deviations of the additional noise [Nm, N] and decreases with exp(-|qd| / resting_speed). resting_speed:
-    [rad/s, m/s]. peak_start, peak_scale: start and scale of the exponential tail of the peaks of the external torque
-    divided by its standard deviation; the tail is the largest fifth of the peaks, of which there are peak_count per
-    joint. load_variance: factor on the covariance of estimated payloads, an estimate with load_freedom degrees of
-    freedom. speed: largest speed of the training logs [rad/s, m/s]. encoder: encoder step of positions [rad, m].
-    effort: torque limit [Nm, N]. minutes: duration of the training logs [min]. point: position of the tip in the frame
-    of the last body, (3,) [m].
+    Peaks are the largest values, in time windows, of the external torque divided by its standard deviation. The largest
+    fifth of the peaks is modelled by an exponential distribution.
+
+    Attributes:
+        drift: Noise of the blocks of the drift filter.
+        load: Noise of the blocks of the payload filter.
+        observer: Standard deviation of the momentum observer for a moving joint, (n,) [Nm, N].
+        resting: Additional threshold for a joint at rest: three standard deviations of its additional noise, (n,)
+            [Nm, N]. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
+        resting_speed: Velocity scale of the additional threshold, (n,) [rad/s, m/s].
+        peak_start: Smallest value of the exponential distribution, (n,) [1].
+        peak_scale: Scale of the exponential distribution, (n,) [1].
+        peak_count: Number of peaks per joint from which the scale is estimated.
+        load_variance: Factor by which the covariance of an estimated payload is multiplied.
+        load_freedom: Degrees of freedom of the estimate of `load_variance`.
+        speed: Largest speed of the training logs, (n,) [rad/s, m/s].
+        encoder: Encoder step, (n,) [rad, m].
+        effort: Torque limit, (n,) [Nm, N].
+        minutes: Duration of the training logs [min].
+        point: Position of the tip in the frame of the last body, (3,) [m].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -78,38 +89,38 @@ class NoiseLevels(BaseModel):
     def load_quantile(self) -> float:
         """Half width of 95 % intervals of a payload, in standard deviations.
 
-        It is a quantile of Student's t distribution, because the variance is estimated, times a factor. The factor
-        `load_variance` is estimated from logs without payload, and the decision between payload and no payload uses
-        it unchanged. Intervals are wider for two reasons: errors are larger on other days than in the training logs,
-        and a payload increases friction and the errors of friction.
+        It is a quantile of Student's t distribution, because the variance is an estimate, multiplied by a factor that
+        widens the intervals for two reasons. First, errors are larger on other days than in the training logs. Second,
+        a payload increases friction and its errors, and `load_variance` is estimated from logs without payload.
         """
         width = max(TUNING.other_days, math.sqrt(TUNING.prior_variance / self.load_variance))
         return float(stdtrit(self.load_freedom, 0.975)) * width
 
     @property
     def supported_alarms(self) -> float:
-        """Lowest rate of false alarms [1/min] that the training logs support: one in their whole duration."""
+        """Lowest rate of false alarms that can be estimated from the training logs: one in their duration [1/min]."""
         return 1 / self.minutes
 
     def resting_torque(self, qd: np.ndarray) -> np.ndarray:
         """Return the bound of the friction error near standstill, (..., n) [Nm, N], at velocities qd (..., n).
 
-        The error is bounded, so it is added to the thresholds. Noise in contrast has rare peaks, so thresholds contain
-        a multiple of it.
+        This bound is added once to a threshold. The standard deviation of the noise, which has rare peaks, is
+        multiplied by a factor (see `thresholds`).
         """
         torque: np.ndarray = self.resting * np.exp(-np.abs(qd) / self.resting_speed)
         return torque
 
     @property
     def tail_peaks(self) -> float:
-        """Number of peaks in the exponential tail per minute, for all joints together [1/min]."""
+        """Number of peaks per minute that exceed `peak_start`, all joints together [1/min]."""
         return 60 / TUNING.window * TUNING.tail * len(self.observer)
 
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the thresholds of the external torque divided by its standard deviation, (n,) [1].
 
-        The scale of an exponential tail, estimated from m = peak_count peaks, is uncertain. With the prior 1 / scale a
-        further peak exceeds the start by more than x with the probability (1 + x / (m scale))^-m.
+        Peaks above `peak_start` have an exponential distribution, whose scale is estimated from m = `peak_count` peaks.
+        With the prior density 1 / scale of the uncertain scale, a further peak exceeds `peak_start` by more than x with
+        the probability (1 + x / (m `peak_scale`))^-m.
 
         alarms_per_minute: rate of false alarms of all joints together [1/min].
         """

@@ -26,13 +26,22 @@ _UNITS = pseudo_inertia(torch.eye(10).double()).numpy()
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """Payload that is fixed to the last body, in the frame of this body; all values are zero without a payload.
+    """Payload that is fixed to the last body, in the frame of this body.
 
-    status: "payload", "no payload", or "not yet" if the motion does not determine which. log_odds: log odds of "no
-    payload" against a payload. limit: 95 % upper limit of the mass, for any status [kg]. mass [kg], center (3,) [m].
-    inertia: (xx, xy, xz, yy, yz, zz) about the centre of mass [kg m^2]. The fields ``..._interval`` are the lower and
-    upper limits of 95 % intervals, (2,), (3, 2) and (6, 2). parameters: mass m, first moments m c, and inertia about
-    the origin of the frame, (10,). covariance: covariance of the parameters, (10, 10).
+    The values from `mass` on are zero unless the status is "payload".
+
+    Attributes:
+        status: "payload", "no payload", or "not yet" if the motion does not determine whether there is a payload.
+        log_odds: Log odds of "no payload" against a payload.
+        limit: 95 % upper limit of the mass, for any status [kg].
+        mass: Mass [kg].
+        mass_interval: Lower and upper limit of the 95 % interval of the mass [kg].
+        center: Centre of mass, (3,) [m].
+        center_interval: Limits of 95 % intervals, (3, 2) [m].
+        inertia: Inertia about the centre of mass, (xx, xy, xz, yy, yz, zz) [kg m^2].
+        inertia_interval: Limits of 95 % intervals, (6, 2) [kg m^2].
+        parameters: Mass m, first moments m c, and inertia about the origin of the frame, (10,).
+        covariance: Covariance of the parameters, (10, 10).
     """
 
     status: Status = "not yet"
@@ -52,12 +61,13 @@ NO_REPORT = Payload()
 
 
 def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quantile: float) -> Payload:
-    """Return the payload for the estimate of the payload filter.
+    """Return a physically consistent payload, or "no payload", from the estimate of the payload filter.
 
-    The status is "not yet", too, if rounding errors make a matrix indefinite.
+    The status is also "not yet" if rounding errors make a matrix indefinite.
 
     Args:
-        mean, covariance: estimate of the filter, (10,) and (10, 10), including the filter's prior.
+        mean: inertial parameters that the filter estimates, with the filter's prior, (10,).
+        covariance: covariance of `mean`, (10, 10).
         factor: factor by which the covariance of the likelihood is multiplied (`NoiseLevels.load_variance`).
         quantile: half width of the 95 % intervals in standard deviations.
     """
@@ -74,7 +84,7 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
     log_odds = float(math.log(len(found)) - logsumexp(evidence))
     weights = softmax(evidence)
     theta = weights @ thetas
-    # covariance of a mixture = mean of the covariances + covariance of the means
+    # The covariance of a mixture is the mean of the covariances plus the covariance of the means.
     spread = np.tensordot(weights, inverses, 1) + np.cov(thetas.T, ddof=0, aweights=weights)
     limit = theta[0] + quantile * math.sqrt(spread[0, 0])
     if log_odds > TUNING.payload_odds:
@@ -92,14 +102,21 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
 def _at_scale(
     precision: np.ndarray, linear: np.ndarray, scale: float, start: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the MAP estimate, its covariance, and the log evidence, for a prior mean of mass ``scale``.
+    """Return the MAP estimate of the payload, its covariance, and the log evidence, for one prior mean.
 
     Newton's method minimizes w (1/2 theta^T precision theta - linear . theta) - 1/2 log det J + 1/2 tr(W^-1 J), with
-    the pseudo-inertia J of theta, the scale matrix W of the Wishart prior, and the weight w of the likelihood. With a
-    ``start``, w is 1. Otherwise the prior mean is the start, and w increases to 1: the maximum of the likelihood may be
-    far outside of the cone of consistent parameters, at whose boundary Newton's method would stall (Boyd and
-    Vandenberghe, Convex Optimization, 2004, 11.3). Twice the cost is self-concordant, so that steps damped by the
-    Newton decrement are feasible (9.6.4).
+    the pseudo-inertia J of theta, the scale matrix W of the Wishart prior, and the weight w of the likelihood.
+
+    Without a ``start``, Newton's method starts from the prior mean, and w increases to 1 in steps. With w = 1 from the
+    beginning it would stall at the boundary of the cone of physically consistent parameters, because the maximum of the
+    likelihood may be far outside of the cone (Boyd and Vandenberghe, Convex Optimization, 2004, 11.3). Twice the cost
+    is self-concordant, so steps that are damped by the Newton decrement remain in the cone (9.6.4).
+
+    Args:
+        precision: inverse covariance of the likelihood, (10, 10).
+        linear: precision times mean of the likelihood, (10,).
+        scale: mass of the prior mean [kg].
+        start: parameters from which Newton's method starts with w = 1, (10,).
     """
     # The prior mean is a ball whose centre is at a distance from the origin along z.
     height, about_z = TUNING.distance, 2 / 5 * TUNING.radius**2
@@ -119,8 +136,8 @@ def _at_scale(
             step = inverse @ gradient
             decrement = gradient @ step
             theta = theta - step / (1 + math.sqrt(2 * decrement) if decrement > 0.01 else 1)
-            # At the intermediate weights a decrement of 0.1 suffices, since only the start at the next weight depends
-            # on the result. At the final weight it must be 1e-12, which quadratic convergence reaches in a few steps.
+            # For a weight below 1 a decrement of 0.1 suffices, because the result is only the start for the next
+            # weight. For the weight 1 it must be 1e-12, which quadratic convergence reaches in a few steps.
             if decrement < (0.1 if power else 1e-12):
                 break
     inertia = np.einsum("i,iab->ab", theta, _UNITS)
@@ -132,7 +149,10 @@ def _at_scale(
 def _described(
     theta: np.ndarray, covariance: np.ndarray, quantile: float, log_odds: float, limit: float
 ) -> Payload:
-    """Return the payload with parameters theta (10,) and their covariance (10, 10); intervals are linearised."""
+    """Return the payload with parameters theta (10,) and their covariance (10, 10).
+
+    Its intervals are computed from the derivatives of mass, centre of mass and inertia with respect to theta.
+    """
     values = _mass_center_inertia(theta)
     # Complex-step derivatives have no cancellation errors (Squire and Trapp, SIAM Review 40:110, 1998).
     tiny = 1e-30
@@ -148,7 +168,10 @@ def _described(
 
 
 def _mass_center_inertia(theta: np.ndarray) -> np.ndarray:
-    """Return mass, centre of mass, and inertia (xx, xy, xz, yy, yz, zz) about it, (10,), of parameters (10,)."""
+    """Return mass, centre of mass and inertia about the centre of mass as one array (10,), for parameters (10,).
+
+    The entries of the inertia are (xx, xy, xz, yy, yz, zz).
+    """
     center = theta[1:4] / theta[0]
     about_origin = theta[0] * (center @ center * np.eye(3) - np.outer(center, center))
     return np.concatenate([theta[:1], center, theta[4:] - about_origin[np.triu_indices(3)]])

@@ -35,10 +35,16 @@ class ContactEvent:
 class LogEstimate:
     """The estimates along a log.
 
-    states: estimates after each sample. payload: estimate at the end of the log. since: time at which this payload was
-    first reported [s]; None without a payload. changes: times of detected changes of the load [s]. drift: relative
-    difference between friction at the end of the log and friction of the model, per joint [%]. refused: number of
-    refused samples for each reason.
+    Attributes:
+        log: The log.
+        joints: Names of the joints.
+        states: Estimates after each sample.
+        payload: Estimated payload at the end of the log.
+        since: Time at which a payload was first reported [s]; None without a payload.
+        changes: Times of detected changes of the load [s].
+        contacts: Contacts along the log.
+        drift: {joint: relative difference of friction at the end of the log from friction of the model [%]}.
+        refused: {reason: number of samples that were refused or only partly used}.
     """
 
     log: Trajectory
@@ -65,7 +71,7 @@ class LogEstimate:
         }
 
     def text(self) -> str:
-        """Return the lines of the text for users."""
+        """Return the estimates as text for users."""
         lines = [f"{self.log.name}: {payload_sentence(self.payload)}"]
         if self.since is not None:
             lines.append(f"  reported first at {self.since:.1f} s")
@@ -101,7 +107,7 @@ def payload_content(payload: Payload) -> dict[str, object]:
 
 
 def payload_sentence(payload: Payload) -> str:
-    """Return a text with mass and centre of mass and their 95 % intervals, or the reason why there are none."""
+    """Return a text about a payload: mass and centre of mass with 95 % intervals, or an upper limit of the mass."""
     if payload.status == "payload":
         low, high = payload.mass_interval
         center = ", ".join(
@@ -164,7 +170,7 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
 
 
 def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> list[ContactEvent]:
-    """Return the contacts in the estimates after consecutive samples; joints: names of the joints."""
+    """Return the contacts along a log. states: estimates after consecutive samples. joints: names of the joints."""
     touching = [state for state in states if state.contact.touched.any()]
     ends = np.flatnonzero(np.diff([state.t for state in touching]) > TUNING.merged) + 1
     events = []
@@ -173,7 +179,8 @@ def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> l
         torques = np.array([state.contact.external_torque for state in group])
         touched = np.array([state.contact.touched for state in group])
         named = np.flatnonzero(touched.any(axis=0)).tolist()
-        # For each joint, find the largest torque among the samples at which it exceeds the threshold of the joint.
+        # `peaks` are the samples of the largest torque of each joint, among the samples at which the torque exceeds the
+        # threshold of the joint.
         peaks = np.where(touched, np.abs(torques), 0.0).argmax(axis=0)[named]
         events.append(
             ContactEvent(

@@ -17,8 +17,8 @@ class LiveTuning:
     block: float = 0.1
     # [s] Longest time between two samples of a block. After a longer gap the friction state is unknown.
     gap: float = 0.25
-    # [1] A sample whose positions change faster than this multiple of the largest speed of the training logs is
-    # refused.
+    # [1] A sample is refused if its velocity, or the change of position since the last sample divided by the time,
+    # exceeds this multiple of the largest speed of the training logs.
     jump: float = 10.0
     # [1] Number of consecutive refused samples after which the estimator restarts at the new positions.
     restart: int = 5
@@ -27,39 +27,38 @@ class LiveTuning:
 
     # Constants of the filters (`live.filters`).
 
-    # [kg], [kg m], [kg m^2] The next three constants are prior standard deviations of the mass, the first moments and
-    # the inertia of a payload (as of 10 kg) in the payload filter. The final estimate removes this prior, so that a
-    # wider prior would only add rounding errors.
+    # Prior standard deviations of the payload in the payload filter: mass [kg], first moments [kg m] and inertia
+    # [kg m^2]. This prior is removed from the final estimate, so a wider prior would only add rounding errors.
     load_mass: float = 10.0
     load_moment: float = 2.0
     load_inertia: float = 0.4
     # [1] Prior standard deviation of the friction scale.
     friction: float = 0.02
-    # [1/s] Variance per second of the random walk of the friction scale.
+    # [1/s] Increase of the variance of the friction scale per second, as a random walk.
     friction_walk: float = 3e-5
     # [1] Prior standard deviation of the torque offset, relative to the effort limit.
     offset: float = 0.01
     # [1] Residuals beyond this number of standard deviations are treated as outliers, with a larger noise variance
     # (Huber, Robust Statistics, 1981).
     outlier: float = 3.0
-    # [1] Variance of friction with an unknown friction state, divided by the squared half width of the possible
-    # friction torques. A uniform distribution has 1/3. The value is larger, since the error is correlated over a
-    # block.
+    # [1] Variance of friction with an unknown friction state, divided by the square of `Balance.uncertainty`. It would
+    # be 1/3 for friction that is uniformly distributed between its bounds. The value is larger, because the errors of
+    # the samples of a block are correlated.
     uncertainty: float = 3.0
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
 
-    # [1] The hypothesis of a changed load starts if the sum of the squared residuals of a block exceeds its mean by
-    # this number of standard deviations.
+    # [1] The hypotheses of a changed load and of a contact start if the sum of the squared residuals of a block exceeds
+    # its expected value by this number of its standard deviations.
     surprise: float = 3.0
     # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
     contact_disturbance: float = 8.0
-    # A changed load is accepted if the log likelihood ratio exceeds `changed` [1], but not before `changed_after` [s]
-    # of motion.
+    # A changed load is accepted after `changed_after` [s] of motion or later, if the log likelihood of this hypothesis
+    # exceeds the log likelihoods of no change and of a contact by more than `changed` [1].
     changed: float = 15.0
     changed_after: float = 1.0
-    # The hypotheses are dropped after `dropped_after` [s] of motion, or already after `changed_after` if the log
-    # likelihood ratio is below `unlikely` [1].
+    # The hypotheses are dropped after `dropped_after` [s] of motion. They are dropped after `changed_after` if the
+    # difference of the log likelihoods is below `unlikely` [1].
     unlikely: float = -8.0
     dropped_after: float = 4.0
 
@@ -73,12 +72,13 @@ class LiveTuning:
     # [s] Time constant with which the estimated disturbance is subtracted from the external torque. Contacts are
     # detected in less time, so that the disturbance does not absorb them.
     baseline: float = 0.3
-    # [1] Factor on the thresholds: errors of a model are larger on later days than between training logs.
+    # [1] Smallest factor by which thresholds from the training logs are multiplied, because the errors of a model are
+    # larger on other days.
     other_days: float = 1.22
     # [1/min] Default rate of false contact alarms.
     alarms_per_minute: float = 1.0
-    # Thresholds are computed from the largest residual in each time window of `window` [s]. The fraction `tail` [1] of
-    # these peaks is modelled by an exponential distribution.
+    # Thresholds are computed from peaks, the largest residuals in time windows of `window` [s]. The largest peaks, a
+    # fraction `tail` [1] of all, are modelled by an exponential distribution.
     window: float = 0.5
     tail: float = 0.2
 
@@ -86,13 +86,15 @@ class LiveTuning:
 
     # [s] Time in motion between two reports of the payload.
     report: float = 1.0
-    # [m] The prior mean of a payload is a ball: its radius, and the distance of its centre from the origin along z.
+    # [m] The prior mean of a payload is a homogeneous ball of this radius, with its centre on the z axis of the last
+    # body at this distance from the origin.
     radius: float = 0.2
     distance: float = 0.05
-    # [kg] Masses of the prior means, of which the evidence is compared.
+    # [kg] Masses of the prior means of a payload. Each has the same prior probability.
     scales: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-    # [1] Log odds of "no payload" against a payload. A payload is reported below `payload_odds`, no payload above
-    # `no_payload_odds`, and "not yet" between both.
+    # [1] Limits of the log odds of "no payload" against a payload. A payload is reported if they are at most
+    # `payload_odds`, and "no payload" if they are greater than `no_payload_odds`. Between these limits, the status is
+    # "not yet".
     payload_odds: float = -5.0
     no_payload_odds: float = 3.0
 
@@ -107,8 +109,8 @@ class LiveTuning:
 
     # Constants of the estimation of noise levels (`live.levels`).
 
-    # [1] The logs are divided into `folds`, which are held out one at a time. A fit to the other folds needs at least
-    # `min_samples` samples of motion, and uses at most `max_samples`.
+    # [1] The logs are divided into `folds` parts, which are held out one at a time. A fit to the other parts needs at
+    # least `min_samples` samples of motion, and uses at most `max_samples`.
     folds: int = 3
     min_samples: int = 300
     max_samples: int = 2**11
@@ -118,12 +120,12 @@ class LiveTuning:
     disturbance_ratios: tuple[float, ...] = (0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5)
     # [1] Lengths of the trials of the payload filter, as numbers of blocks: 5 and 10 s.
     trial_blocks: tuple[int, ...] = (25, 50)
-    # [1] Prior value of the factor on the covariance of payloads, which has the weight of `prior_trials` trials: logs
-    # of an arm often have too few trials for an estimate.
+    # [1] Prior value of `NoiseLevels.load_variance`, with the weight of `prior_trials` trials. It is needed because the
+    # logs of an arm often have too few trials for an estimate.
     prior_variance: float = 2.25
     prior_trials: int = 4
-    # [1] The grid of the noise near standstill: speeds below which the noise increases, relative to the largest speed,
-    # and additional noise at rest divided by the noise in motion.
+    # [1] The grid of the noise near standstill: velocity scales divided by the largest speed, and the additional noise
+    # at rest divided by the noise in motion.
     resting_speeds: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
     resting_ratios: tuple[float, ...] = (0, 1, 2, 4, 8, 16)
 
@@ -139,9 +141,10 @@ class LiveTuning:
 
     @property
     def evidence(self) -> float:
-        """Sum of the terms of the log evidence that do not depend on logs or on the prior mean.
+        """Sum of the terms of the log evidence that depend neither on logs nor on the prior mean.
 
-        They are the constants of the Wishart density (with |dJ/dtheta| = 1/2) and of Laplace's approximation.
+        The terms are the constants of Laplace's approximation and of the Wishart density of the pseudo-inertia J, with
+        |dJ/dtheta| = 1/2 for the inertial parameters theta.
         """
         wishart = 2 * self.degrees * math.log(2) + float(multigammaln(self.degrees / 2, 4))
         return 5 * math.log(2 * math.pi) - math.log(2) - wishart

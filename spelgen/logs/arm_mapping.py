@@ -1,4 +1,4 @@
-"""Joints of logs and mapping of the logs' columns, determined from an arm, a model, or a list of joint names."""
+"""Determination of the joint names and column mapping of logs from an arm, a model, or a list of joint names."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,9 +28,9 @@ class JointNames(Protocol):
 
 @runtime_checkable
 class DescribedArm(Protocol):
-    """Loaded arm with settings that describe the arm's logs.
+    """Loaded arm whose settings contain the column mapping of its logs.
 
-    turning_joints: names of revolute joints without position limits.
+    turning_joints: names of the revolute joints without position limits.
     """
 
     @property
@@ -55,7 +55,7 @@ LoggedArm = DescribedArm | JointNames | Sequence[str]
 
 
 class LogSource(NamedTuple):
-    """Joints of logs, and the mapping of the logs' columns.
+    """Joints of logs, and the mapping of the logs' columns to the signals of these joints.
 
     joint_types: "revolute" or "prismatic" for each joint; None if the types are unknown.
     """
@@ -66,7 +66,7 @@ class LogSource(NamedTuple):
 
 
 def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
-    """Return the joints and the mapping of columns for the arguments `arm` and `mapping` of `read_logs`.
+    """Return the joints of logs and the mapping of the logs' columns; for the arguments see `read_logs`.
 
     Raises LogError if `arm` has a wrong type, SettingsError for a wrong mapping.
     """
@@ -91,9 +91,9 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
 
 
 def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
-    """Return a mapping as a LogMapping.
+    """Return the LogMapping for the argument `mapping` of `read_logs`: a LogMapping, a dict, or a file.
 
-    stated: mapping in the arm's settings, from which keys are taken that a mapping file or a dict does not contain.
+    stated: mapping in the arm's settings, which applies to all keys that the dict or the file does not contain.
     """
     # A LogMapping is complete and replaces the mapping of the settings. A file or a dict overrides single keys.
     if isinstance(mapping, LogMapping):
@@ -110,7 +110,7 @@ def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | 
 
 
 def _merged(stated: object, override: object) -> object:
-    """Return the union of two nested groups of keys; a key in both groups has the value of `override`."""
+    """Return the union of two nested dicts; a key in both dicts has the value of `override`."""
     if isinstance(stated, Mapping) and isinstance(override, Mapping):
         return {**stated, **{key: _merged(stated.get(key), value) for key, value in override.items()}}
     return override

@@ -24,7 +24,7 @@ from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
 MESSAGE = "sensor_msgs/msg/JointState"
-MEMORY = 2**29  # [B] memory that the reader may use in addition to a multiple of the bag's size
+MEMORY = 2**29  # [B] memory that the reader may use in addition to 20 times the bag's size
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
 MAGIC = b"\x89MCAP0\r\n"  # bytes at the beginning and at the end of a complete MCAP file
 SCHEMA, CHANNEL, MESSAGE_RECORD, CHUNK = 3, 4, 5, 6  # operation codes of MCAP
@@ -36,8 +36,11 @@ RawState = tuple[str, int, bytes]
 class StampedState(NamedTuple):
     """Joint state of one message.
 
-    topic: topic of the message. stamp: time stamp [ns] in the header; 0 if the publisher has set none. recorded: time
-    [ns] of the recorder. state: decoded message.
+    Attributes:
+        topic: topic of the message.
+        stamp: time stamp [ns] in the message header; 0 if the publisher has set none.
+        recorded: time [ns] at which the recorder received the message.
+        state: decoded message.
     """
 
     topic: str
@@ -69,10 +72,10 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[TimedState]:
-    """Return the joint states with times [ns] of one clock.
+    """Return the joint states, each with its time stamp [ns]; messages without a stamp are omitted.
 
-    The times are the stamps of the message headers or, if no message has a stamp, the times of the recorder. Both
-    clocks are never mixed, since they may differ by hours.
+    If no message has a stamp, the times are those at which the recorder received the messages. The two clocks may
+    differ by hours and are never mixed.
     """
     stamped = [(x.stamp, x.state) for x in messages if x.stamp]
     if messages and not stamped:
@@ -86,10 +89,11 @@ def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[Timed
 def _of_one_arm(
     messages: Sequence[StampedState], names: Sequence[str], path: Path, remarks: list[str]
 ) -> list[StampedState]:
-    """Return the messages that contain any of the joints `names`; they may be in several messages and topics.
+    """Return the messages that contain any of the joints `names`.
 
-    If most of these messages contain all joints, the others are omitted. Raises LogError if several topics contain the
-    same joint, and if no message contains a joint.
+    A message may contain only some of the joints, and joints may be on several topics. If most of the messages contain
+    all joints, the others are omitted. Raises LogError if several topics contain the same joint, or if a joint is in no
+    message.
     """
     arm = set(names)
     of_arm = [x for x in messages if not arm.isdisjoint(x.state.name)]
@@ -151,8 +155,8 @@ def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[st
 def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     """Return the advice to map joint names to names in the log.
 
-    names: names of the joints that were not found. logged: joint names in the log. If every joint name is the end of
-    exactly one logged name, as with a common prefix, the advice contains the settings that map the names.
+    names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains
+    the settings that map the names if every joint name is the end of exactly one logged name ("j1" and "left_j1").
     """
     found = {name: [x for x in logged if x.endswith(name)] for name in names}
     if any(len(each) != 1 for each in found.values()):
@@ -161,7 +165,7 @@ def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:
-    """Yield the joint states of one topic, with both time stamps.
+    """Yield the joint states on `topic`, or on all topics if it is None.
 
     Messages are decoded with the published definition of `JointState`; message definitions in the bag are ignored.
     """
@@ -182,8 +186,8 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     try:
-        # A damaged bag could exhaust the memory, since rosbags unpacks chunks of any size. The bound of 20 times the
-        # file size is ample: messages as arrays take ten times their bytes.
+        # A damaged bag could exhaust the memory, since rosbags unpacks chunks of any size. Messages decoded to arrays
+        # need ten times their size in the file, so the bound of 20 times the file size suffices.
         with limited_memory(MEMORY + 20 * size):
             messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, topic, path)
             unfinished = [] if is_ros1 else _unfinished(path)
@@ -195,14 +199,14 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
                 yield StampedState(name, clock.sec * 1_000_000_000 + clock.nanosec, recorded, state)
     except (LogError, GeneratorExit):
         raise
-    except Exception as error:  # rosbags, its storages and their decompressors raise many types
+    except Exception as error:  # rosbags and its decompressors raise exceptions of many types
         do = "a recording that was not closed may be repaired by `ros2 bag reindex` or `rosbag reindex`"
         got = f"an unreadable ROS bag ({in_one_line(error).rstrip('.')})"
         raise LogError(got, file=path, do=None if isinstance(error, MemoryError) else do) from error
 
 
 def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> Iterator[RawState]:
-    """Yield the encoded joint states of a topic, or of all topics for None, read with `rosbags`."""
+    """Yield the encoded joint states on `topic`, or on all topics if it is None, read with `rosbags`."""
     with open_bag(path) as reader:
         topics = {f"{x.topic} ({x.msgtype})" for x in reader.connections}
         connections = [x for x in reader.connections if x.msgtype == MESSAGE]
@@ -227,7 +231,7 @@ def _unfinished(path: Path) -> list[Path]:
 def _without_end(
     files: Sequence[Path], topic: str | None, path: Path, remarks: list[str]
 ) -> Iterator[RawState]:
-    """Yield the encoded joint states of a topic, or of all topics for None, from MCAP files without an end."""
+    """Yield the encoded joint states on `topic`, or on all topics if it is None, from MCAP files without an end."""
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
         got = "a recording that was not closed, without a complete message of joint states"
@@ -240,7 +244,8 @@ def _without_end(
 def _require_topic(topics: set[str], present: set[str], topic: str | None, path: Path) -> None:
     """Raise LogError for a bag without joint states, or without joint states on the requested topic.
 
-    topics: all topics with joint states. present: topics of all types, for the error. topic: None for any topic.
+    topics: all topics with joint states. present: topics with any type of message, which the error lists. topic: the
+    requested topic; None if any topic is accepted.
     """
     if not topics:
         got, expected = f"only the topics {', '.join(sorted(present)) or '(none)'}", f"one of {MESSAGE}"
@@ -268,7 +273,7 @@ def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:
 
 
 def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield operation code and body of all complete records, including the records within chunks."""
+    """Yield operation code and body of all complete records of an MCAP file, including the records within chunks."""
     start = 0
     while start + 9 <= len(data):
         code, length = struct.unpack_from("<BQ", data, start)
@@ -282,7 +287,10 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _unpacked(chunk: bytes) -> bytes:
-    """Return the decompressed records of a chunk; of an incomplete chunk, the part that can be decompressed."""
+    """Return the decompressed records of a chunk of an MCAP file.
+
+    If the chunk is incomplete, the part that can be decompressed is returned.
+    """
     if len(chunk) < 40:
         return b""
     (size,) = struct.unpack_from("<Q", chunk, 16)

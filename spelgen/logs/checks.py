@@ -50,13 +50,14 @@ class Check(Generic[Subject]):
     """Check for one fault of logs.
 
     Attributes:
-        code: name of the check in reports, and in `--accept`.
+        code: name of the check in reports; the option `--accept CODE` omits the check.
         severity: logs with a finding of severity "error" cannot be trained on.
-        find: function that returns the message about a checked object, or None if the object has no fault.
-        unless: codes of earlier checks whose findings explain this one; the check is then omitted.
-        everywhere: whether only a fault that occurs in all trajectories is reported.
+        find: function of the checked object that returns a message about the fault, or None if there is no fault.
+        unless: codes of earlier checks; if one of them has a finding, which explains this fault, too, this check is
+            omitted.
+        everywhere: if True, a fault is reported only if it occurs in all trajectories.
         expected: expected content of the log, for the error message.
-        do: advice how to correct the fault, for the error message.
+        do: advice for correcting the fault, for the error message.
     """
 
     code: str
@@ -68,7 +69,7 @@ class Check(Generic[Subject]):
     do: str | None = None
 
 
-# type of the keys of `LogChecks`, which collects findings about trajectories and about joints in one dict
+# Check of a trajectory or of a joint: `LogChecks` collects the findings of both in one dict.
 AnyCheck = Check[Any]
 
 
@@ -89,7 +90,8 @@ class Findings:
     ) -> None:
         """Add the message of a check, as an error or as a note according to the check's severity.
 
-        keys: settings of the group `logs` that correct the fault. A finding with such keys is always an error.
+        keys: settings of the group `logs` that correct the fault. A fault with such a correction is always an error, so
+        that no model is trained on the log without the correction.
         """
         if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
@@ -101,10 +103,11 @@ class Findings:
 def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
 ) -> list[tuple[Check[Subject], Advice]]:
-    """Return the checks that find a fault of `subject`, with their findings. accepted: codes of checks to omit."""
+    """Return (check, finding) for each check that finds a fault of `subject`. accepted: codes of checks to omit."""
     results: dict[str, tuple[Check[Subject], Advice]] = {}
     for check in checks:
-        # Each cause has one message. Velocities in degrees, for example, would also fail the check of derivatives.
+        # A check is omitted if the finding of another check explains the fault: velocities in degrees, for example, are
+        # also no derivatives of positions in rad.
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         advice = check.find(subject)
@@ -114,16 +117,16 @@ def run_checks(
 
 
 def find_no_torques(signals: JointSignals) -> str | None:
-    """Find recordings in which the torques of all joints are always 0."""
+    """Return a message if the torques of all joints are 0 throughout a trajectory in which the arm moves."""
     trajectory = signals.trajectory
-    # The finding is reported for the first joint only, since it concerns all joints.
+    # The fault concerns all joints, so it is reported only for joint 0.
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"
 
 
 def find_constant_torque(signals: JointSignals) -> str | None:
-    """Find torques of a joint that never change; logs of position commands have no torques and are skipped."""
+    """Return a message if the torque of the joint is constant; None for logs without torques (position commands)."""
     tau = signals.trajectory.tau
     if not tau.size or np.ptp(tau[:, signals.number]) > 0:
         return None
@@ -131,14 +134,14 @@ def find_constant_torque(signals: JointSignals) -> str | None:
 
 
 def find_rest(signals: JointSignals) -> str | None:
-    """Find a joint whose position never changes in a trajectory."""
+    """Return a message if the position of the joint is constant throughout the trajectory."""
     if np.ptp(signals.q) > 0:
         return None
     return "does not move: the logs do not excite its dynamics"
 
 
 def find_gaps(trajectory: Trajectory) -> str | None:
-    """Find gaps in the sample times: time steps that are much longer than the median step."""
+    """Return a message if there are gaps in the sample times: time steps longer than four median steps."""
     gaps = len(gap_ends(trajectory.t)) - 2
     if not gaps:
         return None
@@ -146,7 +149,10 @@ def find_gaps(trajectory: Trajectory) -> str | None:
 
 
 def find_low_rate(trajectory: Trajectory) -> str | None:
-    """Find a sample rate that is too low to compute accelerations; arms under position servos need none."""
+    """Return a message if the sample rate is below 50 Hz: accelerations are then inaccurate or cannot be computed.
+
+    Return None for logs of position commands, whose fits do not need accelerations.
+    """
     rate = trajectory.sample_rate
     if trajectory.u is not None or rate == 0 or is_dense(rate):
         return None
@@ -160,8 +166,8 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
 
 
 CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
-# These two checks find nothing themselves: their findings are the messages of the reader about changed rows (REPAIRED)
-# and about properties of the file (REMARKED).
+# These two are registered only for their code and severity: the reader of a log provides the messages, about changed
+# rows (REPAIRED) and about properties of the file (REMARKED).
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
@@ -221,8 +227,7 @@ class LogChecks:
 
     Trajectories are added one at a time, so that only one of them has to be in memory.
 
-    products: (2n, 2n) Gram matrix of the increments of the integrals of qd and of q, summed over all trajectories (see
-    `velocity_products`).
+    products: (2n, 2n) sum of the results of `velocity_products` for all trajectories.
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
@@ -232,7 +237,7 @@ class LogChecks:
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
-        """Check a trajectory, and add its findings."""
+        """Apply all checks to a trajectory, and add the findings."""
         self._count += 1
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
         findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
@@ -253,15 +258,15 @@ class LogChecks:
         self._results.setdefault((group, check), []).append(occurrence)
 
     def findings(self) -> Findings:
-        """Return the findings, summarised over trajectories.
+        """Return the findings of all trajectories: one error or note per fault, with the number of trajectories.
 
-        An error names all joints with the same fault. There is a separate note for each joint, and for each message
-        about whole trajectories.
+        An error names all joints with the same fault. Notes are separate for each joint.
         """
         summary = Findings()
         groups: dict[tuple[AnyCheck, str], list[str]] = {}
         for (group, check), occurrences in self._results.items():
-            # A joint at rest in one trajectory, for example, is no fault if it moves in another one.
+            # For checks with `everywhere`, the fault must occur in all trajectories: a joint may rest in some of them,
+            # for example.
             if not check.everywhere or len(occurrences) == self._count:
                 is_error = check.severity == "error" or occurrences[0][0].is_line
                 groups.setdefault((check, "" if is_error else group), []).append(group)
@@ -279,10 +284,10 @@ class LogChecks:
         return summary
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
-        """Return settings of the group `logs` that correct a fault. entries: keys per faulty joint.
+        """Return the settings of the group `logs` that correct a fault; entries: settings of each faulty joint.
 
-        A unit that most joints of a type need is also set for the joints of this type whose motion is too small to
-        determine the unit.
+        If most joints of the same type (revolute or prismatic) need the same units, the units are also set for the
+        other joints of this type, unless the motion of a joint contradicts them.
         """
         first, *_ = entries
         units, kinds = entries[first].get("units", {}), dict(zip(self._joints, self._kinds, strict=True))

@@ -29,7 +29,7 @@ class Beginning(NamedTuple):
         encoding: text encoding of the file.
         comments: number of comment lines before the header.
         header: the header line.
-        others: number of lines between the header and the values, such as a line of units.
+        others: number of lines between the header and the first row of values, such as a line of units.
         rows: the first rows of values.
     """
 
@@ -41,7 +41,7 @@ class Beginning(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with the only table of a CSV file; an incomplete last line is omitted, with a remark."""
+    """Return a list with one table, the content of a CSV file; an incomplete last line is omitted, with a remark."""
     table, header, cut = _csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
     return [
@@ -61,7 +61,7 @@ def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
     may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
     """
     text = _beginning(file)
-    # spaces also occur within names, and therefore separate columns only if nothing else does
+    # Names of columns may contain spaces, so spaces are the delimiter only if the header contains no other delimiter.
     delimiter = max(",;\t", key=text.header.count)
     if delimiter not in text.header:
         delimiter = " "
@@ -107,7 +107,7 @@ def _beginning(file: Path) -> Beginning:
     """Return the beginning of a CSV file, in which comments start with # and a line of units contains no digits."""
     encoding, head = _decoded_head(file)
     lines = head.splitlines() or [""]
-    # the last line is never skipped, so that a file has at least a header and, below, a row of values
+    # The last line of the head never counts as a comment, so that there is always a header.
     comments = len(list(takewhile(lambda line: line.startswith("#"), lines[:-1])))
     header, rows = lines[comments], lines[comments + 1 :]
     skipped = list(takewhile(lambda x: x and (x == header or not re.search(r"\d", x)), rows[:-1]))
@@ -115,7 +115,9 @@ def _beginning(file: Path) -> Beginning:
 
 
 def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
-    """Return the column names of a file that `ros2 topic echo --csv` wrote without a header. cells: its first line.
+    """Return the column names of a file that `ros2 topic echo --csv` wrote without a header.
+
+    cells: values of the first line, which contains the joint names after the time stamp.
 
     Raises LogError for any other file that begins with numbers.
     """

@@ -13,20 +13,28 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, TUNING, shows_accelerations
 
-FREQUENCY = 100.0  # [Hz] common sample rate: twelve times the cutoff of the low-pass filter
-SHORTEST = 1.0  # [s] shortest gap-free piece that is used: shorter pieces consist of filter transients
-# [s] Shortest gap at which a recording is cut: the filter would remove any signal within a shorter gap.
+FREQUENCY = 100.0  # [Hz] common sample rate, twelve times the default cutoff of the low-pass filter
+# [s] Shorter gap-free pieces are omitted: more than a fifth of them would be filter transients.
+SHORTEST = 1.0
+# [s] Shorter gaps do not cut a recording: the low-pass would remove motion that is fast enough to occur within them.
 HOLE = 0.25 / TUNING.automatic_cutoff
 AUTOMATIC = Preprocessing()
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicsSamples:
-    """Samples of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N], each (T, n); tau as logged.
+    """Filtered samples of one trajectory of n joints at T times.
 
-    z: (T, n, K) [rad, m] states of the K friction bristles of each joint, computed from the history of motion; None if
-    not computed. direction: (T, n) smoothed sign of the velocity for dry friction without a state, with the same filter
-    as tau; None if not computed. rate: sample rate [Hz].
+    Attributes:
+        name: name of the trajectory.
+        q: (T, n) positions [rad, m].
+        qd: (T, n) velocities [rad/s, m/s].
+        qdd: (T, n) accelerations [rad/s^2, m/s^2].
+        tau: (T, n) torques [Nm, N].
+        z: (T, n, K) [rad, m] states of the K friction bristles of each joint, filtered like tau; None if not computed.
+        direction: (T, n) smooth sign of the velocity, the factor of dry friction without bristles, filtered like tau;
+            None if not computed.
+        rate: sample rate [Hz].
     """
 
     name: str
@@ -39,7 +47,7 @@ class DynamicsSamples:
     rate: float = field(default=FREQUENCY, kw_only=True)
 
     def __getitem__(self, rows: slice) -> DynamicsSamples:
-        """Return the samples in a slice of rows; a step of the slice lowers the sample rate."""
+        """Return the samples in a slice of rows; the sample rate is divided by the step of the slice."""
         z = None if self.z is None else self.z[rows]
         direction = None if self.direction is None else self.direction[rows]
         motion = self.q[rows], self.qd[rows], self.qdd[rows], self.tau[rows]
@@ -55,15 +63,16 @@ def dynamics_samples(
 ) -> list[DynamicsSamples]:
     """Return the samples of each trajectory at which a joint moves (|qd| > 0.02 rad/s or m/s).
 
-    Trajectories whose sample rate is too low for accelerations are omitted.
+    q, qd and tau of each gap-free piece are filtered and resampled to 100 Hz; logs above 150 Hz are filtered first,
+    other logs are resampled first. The filter is the zero-phase low-pass of `preprocessing`, by default with a cutoff
+    of 8 Hz; its transients at both ends of a piece are removed. qdd is the central difference of the filtered qd.
+    Trajectories sampled below 24 Hz are omitted, since their accelerations are unknown.
 
-    Each gap-free piece is filtered and resampled to 100 Hz; the sample rate of a log must be at least 24 Hz, see
-    `resampled`. Logs below 100 Hz are resampled first, faster logs are filtered first. The filter is the zero-phase
-    low-pass of ``preprocessing``, by default with a cutoff of 8 Hz, for q, qd and tau. Its transients at both ends are
-    removed. qdd is the central difference of the filtered qd.
-
-    pauses: whether samples at standstill between the first and the last motion are returned, too. reach: break-away
-    displacements of the bristles whose states z are computed and filtered like tau; see ``bristles_along``.
+    Args:
+        trajectories: logs with torques.
+        pauses: if True, samples at standstill between the first and the last motion of a piece are returned, too.
+        preprocessing: cutoff of the filter, time steps that count as gaps, and delay of the torques.
+        reach: break-away displacements (n, K) of the friction bristles; None: bristle states z are not computed.
     """
     samples = []
     for trajectory in preprocessing.moved(trajectories):
@@ -71,7 +80,7 @@ def dynamics_samples(
         if not pieces or not shows_accelerations(trajectory.sample_rate):
             continue
         columns = [_columns(piece, pauses, preprocessing.acceleration_cutoff, reach) for piece in pieces]
-        # A single piece, which may be hours long, is not copied.
+        # The arrays of a single piece are not copied, since they may be hours long.
         joined = columns[0]
         if len(columns) > 1:
             joined = list(map(np.concatenate, zip(*columns, strict=True)))
@@ -80,9 +89,9 @@ def dynamics_samples(
 
 
 def long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
-    """Return the gap-free pieces of at least 1 s; shorter pieces would consist of filter transients.
+    """Return the gap-free pieces of a trajectory that last at least 1 s.
 
-    gap: a time step longer than this multiple of the median step is a gap.
+    gap: a time step longer than this multiple of the median step, and longer than 0.03 s, is a gap.
     """
     return [piece for piece in split_at_gaps(trajectory, gap, HOLE) if piece.duration >= SHORTEST]
 
@@ -90,20 +99,20 @@ def long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
 def _columns(
     piece: Trajectory, pauses: bool, cutoff: float | None, reach: BristleReach | None
 ) -> list[np.ndarray]:
-    """Return the columns of `DynamicsSamples` for one piece, at the samples at which a joint moves.
+    """Return the arrays of `DynamicsSamples` for one gap-free piece, at the samples at which a joint moves.
 
-    The columns are q, qd, qdd, tau (T, n) and, if `reach` is given, z (T, n, K) and the direction of friction (T, n).
-    pauses: whether samples at rest between the first and the last motion are included. cutoff: cutoff of the low-pass
-    filter [Hz]; None: no filter.
+    The arrays are q, qd, qdd and tau, (T, n). If `reach` is given, z (T, n, K) is added, and also the direction (T, n)
+    if `reach` contains a smoothing velocity. pauses: if True, samples at rest between the first and the last motion are
+    included. cutoff: cutoff of the low-pass filter [Hz]; None: no filter.
     """
     rate, times, t = piece.sample_rate, piece.t, regular_times(piece.t, FREQUENCY)
     is_denser = rate > 1.5 * FREQUENCY
 
     def sampled(signals: np.ndarray) -> np.ndarray:
-        """Return signals, given at the piece's times as (T, ...), filtered and resampled to the common rate."""
+        """Return signals of the piece, (T, ...), filtered and resampled to 100 Hz."""
         if cutoff is None:
             return resampled(times, signals, t, rate)
-        # filtering at the higher of the two rates prevents aliasing: it removes frequencies above half the lower rate
+        # A dense log is filtered before it is resampled: resampling first would alias frequencies above 50 Hz.
         if is_denser:
             return resampled(times, low_passed(times, signals, cutoff), t, rate)
         return low_passed(t, resampled(times, signals, t, rate), cutoff)
@@ -112,8 +121,8 @@ def _columns(
         require_cutoff(piece, rate if is_denser else FREQUENCY, cutoff)
     q, qd, tau = sampled(piece.q), sampled(piece.qd), sampled(piece.tau)
     selected = is_moving(qd)
-    # If a piece begins or ends during motion, the filter has a transient there, with an error of 20 times the noise.
-    # The samples within 0.75 periods of the cutoff from both ends are therefore removed.
+    # If a piece begins or ends during motion, the filter has a transient there, with an error of 20 times the noise. It
+    # lasts for 0.75 periods of the cutoff frequency; the samples in this time are removed at both ends.
     if cutoff is not None:
         unsettled = round(0.75 * FREQUENCY / cutoff)
         selected[:unsettled] = selected[len(selected) - unsettled :] = False
@@ -122,13 +131,13 @@ def _columns(
         selected[moving[0] : moving[-1]] = True
     columns = [q, qd, np.gradient(qd, t, axis=0), tau]
     if reach is not None and reach.elements:
-        # The filter smooths the steps of the torque at reversals of a joint. The friction state has the same filter:
-        # the steps of an unfiltered state would differ in time from the steps of the torque by up to one sample, an
-        # error that is confounded with inertia.
+        # The filter smooths the torque steps at reversals of a joint, so the bristle states need the same filter. The
+        # steps of unfiltered states would differ in time from the torque steps by up to one sample, an error that is
+        # confounded with inertia.
         path, speed = piece.q, piece.qd
         if cutoff is not None:
             path, speed = interpolated(t, q, times), interpolated(t, qd, times)
-        # One bristle is filtered at a time, to limit the memory.
+        # The states of one bristle of all joints are filtered at a time, to limit the memory.
         z = np.moveaxis(bristles_along(path, reach), 2, 0)
         columns.append(np.stack(list(map(sampled, z)), axis=2))
         direction = direction_along(speed, reach)

@@ -60,7 +60,7 @@ def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndar
     """Return signals (T, ...) of a constant rate [Hz], filtered by the zero-phase low-pass with a cutoff [Hz]."""
     from scipy.signal import sosfiltfilt
 
-    # signals are extended at both ends by three periods of the cutoff, which reduces the transients of the filter
+    # Signals are extended at both ends by three periods of the cutoff frequency, to reduce the filter's transients.
     padding = min(len(signals) - 1, int(3 * rate / cutoff))
     filtered = sosfiltfilt(_sections(rate, cutoff), signals, axis=0, padlen=padding)
     return np.ascontiguousarray(filtered)  # the filter returns a reversed view, which torch does not accept
@@ -79,7 +79,7 @@ def _sections(rate: float, cutoff: float) -> np.ndarray:
 
 
 def regular_times(t: np.ndarray, frequency: float) -> np.ndarray:
-    """Return evenly spaced times [s] of a frequency [Hz] within the range of the times t (T,)."""
+    """Return evenly spaced times [s] with the rate `frequency` [Hz], within the range of the times t (T,)."""
     return np.arange(t[0], t[-1], 1.0 / frequency)
 
 
@@ -102,9 +102,10 @@ def velocities(trajectory: Trajectory) -> np.ndarray:
 
 
 def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
-    """Return the time derivative of this order of positions q (..., T, n) at a sample rate [Hz]; order 0: smoothed q.
+    """Return the smoothed time derivative of positions q (..., T, n) at a sample rate [Hz]; order 0: smoothed q.
 
-    The derivative is from cubic polynomials over 0.18 s (Savitzky and Golay, Anal. Chem. 36, 1964).
+    order: order of the derivative, which is computed from local cubic polynomials over 0.18 s (Savitzky and Golay,
+    Anal. Chem. 36, 1964).
     """
     from scipy.signal import savgol_filter
 

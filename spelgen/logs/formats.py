@@ -33,7 +33,10 @@ def format_of(path: Path) -> LogFormat | None:
 
 
 def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the tables of a log. Raises LogError for a damaged file and for missing columns."""
+    """Return the tables of a log, read by the reader of its format.
+
+    path: file or folder, one of the results of `log_files`. Raises LogError for a damaged file and for missing columns.
+    """
     log_format = format_of(path)
     assert log_format is not None, "log_files gives logs alone"
     with reading(path):

@@ -23,8 +23,10 @@ from spelgen.logs.tuning import SIGNALS, shows_accelerations
 class Advice(NamedTuple):
     """Finding of a check, with the settings that correct the log.
 
-    message: the finding. joint: settings of the joint within the group `logs`. keys: settings of the group `logs`
-    itself. Both are empty if the check knows no correction.
+    Attributes:
+        message: the finding.
+        joint: settings that correct the log for this joint, `logs: {joints: {NAME: ...}}`; empty if there are none.
+        keys: settings that correct the log for all joints, `logs: {...}`; empty if there are none.
     """
 
     message: str
@@ -49,10 +51,10 @@ def mapping_line(keys: Mapping[str, object]) -> str:
 
 
 def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str]) -> dict[str, object]:
-    """Return the settings of joints as settings of the group `logs`.
+    """Return the content of the group `logs` that contains the given settings of single joints.
 
-    If all joints have the same unit as their only setting, it becomes the unit of the log. entries: settings per
-    joint. joints: names of all joints.
+    If all joints have the same units and no other settings, the units are set once for the whole log. entries: settings
+    of each joint, by its name. joints: names of all joints.
     """
     first = next(iter(entries.values()))
     if first.keys() == {"units"} and all(entries.get(joint) == first for joint in joints):
@@ -67,7 +69,7 @@ def plain_number(value: float, digits: int = 5) -> float:
 
 
 class JointSignals(NamedTuple):
-    """Signals of one joint in one trajectory, as the checks without the robot use them.
+    """Signals of one joint in one trajectory, the argument of checks that do not need the robot's model.
 
     Attributes:
         trajectory: the recording of all joints.
@@ -76,8 +78,8 @@ class JointSignals(NamedTuple):
         joints: names of all joints.
         q: (T,) positions of the joint [rad, m].
         qd: (T,) velocities of the joint [rad/s, m/s].
-        factor: ratio of dq/dt to qd; NaN for a joint at rest.
-        correlations: correlations of this joint's dq/dt with the qd of each joint; NaN for joints at rest.
+        factor: ratio of dq/dt to qd, 1 for correct units; NaN for a joint at rest.
+        correlations: correlation of this joint's dq/dt with the qd of each of the n joints; NaN for joints at rest.
     """
 
     trajectory: Trajectory
@@ -96,7 +98,7 @@ class JointSignals(NamedTuple):
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Names of the logged measurements, which exclude commands and differentiated velocities."""
+        """Names of the measured signals, of "q", "qd" and "tau", without commands and differentiated velocities."""
         if self.trajectory.u is None and self.trajectory.tau.size:
             return self.trajectory.mapping.quantities
         return ("q",)
@@ -123,26 +125,26 @@ class JointSignals(NamedTuple):
         return self.correlations[self.number]
 
     def changes_by(self, unit: float) -> bool:
-        """Return True if dq/dt is about `unit` times qd, which indicates a wrong unit."""
+        """Return True if dq/dt is about `unit` times qd: the unit of q or qd is then wrong by this factor."""
         return self.correlation > SIGNALS.agreement and is_factor(self.factor, unit)
 
 
 def is_factor(value: float, unit: float) -> bool:
     """Return True if a measured factor `value` equals the conversion factor `unit` within 25 %."""
-    # The tolerance is for noise of the velocities; conversion factors of different units differ by much more.
+    # Noisy velocities make the measured factor inexact. Conversion factors of different units differ by more than 25 %.
     return 0.8 < value / unit < 1.25
 
 
 def find_frozen(signals: JointSignals) -> str | Advice | None:
-    """Find frozen signals: a constant q while qd shows motion, a constant qd while q changes, or repeated values."""
+    """Return a finding if a signal is frozen while the joint moves: constant q, constant qd, or repeated old values."""
     from scipy.integrate import cumulative_trapezoid
 
-    # [rad, m] If q or the integral of qd changes by more than `motion`, the joint moves, and the other signal is frozen
-    # if its value is constant.
+    # [rad, m] A constant qd is frozen if q changes by more than `motion`. A constant q is frozen if the integral of qd
+    # changes by more than `motion`.
     t, q, qd, motion = signals.trajectory.t, signals.q, signals.qd, 0.05
     if np.ptp(qd) == 0 and np.ptp(q) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
-    # the integral averages noise of qd about zero, which would exceed a threshold on qd itself
+    # The integral of qd is tested and not qd itself: it averages the noise of qd about zero.
     drift = np.abs(cumulative_trapezoid(qd, t)).max(initial=0.0)
     if np.ptp(q) == 0 and drift > motion:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
@@ -156,7 +158,7 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
 
 
 def find_dropouts(signals: JointSignals) -> str | None:
-    """Find lost samples and outliers in the measured signals of a joint."""
+    """Return a message about the first measured signal that has lost samples or outliers; None if there is none."""
     for name in signals.measured:
         values = signals.signal(name)
         rows = np.flatnonzero(outlier_rows(name, values))
@@ -174,7 +176,7 @@ def find_dropouts(signals: JointSignals) -> str | None:
 
 
 def find_jumps(signals: JointSignals) -> str | Advice | None:
-    """Find jumps of signals, which are due to undecoded register words, wrapped angles or joined recordings."""
+    """Return a finding if a signal jumps, due to undecoded register words, wrapped angles or joined recordings."""
     for name in signals.trajectory.quantities:
         words = _find_words(signals, name)
         if words is not None:
@@ -190,15 +192,18 @@ def find_jumps(signals: JointSignals) -> str | Advice | None:
 
 
 def _find_words(signals: JointSignals, name: str) -> Advice | None:
-    """Find undecoded register words or wrapped angles in one signal of the joint: "q", "qd", "tau" or "u"."""
+    """Return a finding if a signal consists of undecoded register words or wrapped angles.
+
+    name: signal, "q", "qd", "tau" or "u". Register words are defined in the module `jumps`.
+    """
     mapping, values = signals.trajectory.mapping, signals.signal(name)
     scale, offset = mapping.scale(name, signals.joint), mapping.offset(name, signals.joint)
     unit = mapping.unit(name, signals.joint)
     turns: list[float | None] = [None]
     if signals.kind != "prismatic" and name in ("q", "u"):
-        # candidates for the size of a revolution in logged units: angles without a stated unit may be in degrees
+        # Candidates for one revolution in the unit of the log: angles without a stated unit may be in degrees.
         turns = [2 * np.pi / abs(scale), *([360.0] if unit is None else [])]
-    # Lost samples and outliers are removed, because their jumps are not due to a register.
+    # Lost samples and outliers are removed first, because their jumps have other causes than register words.
     values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
     for turn in turns:
         word = read_as_words((values - offset) / scale, turn)
@@ -223,10 +228,13 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
 
 
 def find_elastic(signals: JointSignals) -> str | None:
-    """Find joints whose apparent inertia shows the resonance of an elastic gear or belt (see the module)."""
+    """Return a message if the apparent inertia of the joint shows the resonance of an elastic gear or belt.
+
+    See the docstring of the module for the apparent inertia.
+    """
     piece = max(split_at_gaps(signals.trajectory), key=len)
     rate, k = piece.sample_rate, signals.number
-    # number of samples of a segment of 2 s, whose spectrum has a frequency resolution of 0.5 Hz
+    # Number of samples of a segment. Spectra of 2 s have a frequency resolution of 0.5 Hz.
     length = round(2.0 * rate)
     is_long = shows_accelerations(rate) and len(piece) >= 4 * length
     if not (is_long and piece.tau.size and np.ptp(piece.tau[:, k])):
@@ -240,19 +248,20 @@ def find_elastic(signals: JointSignals) -> str | None:
     candidates = []
     # a resonance at up to 1.5 times the highest excited frequency still changes the apparent inertia noticeably
     for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
-        # The apparent inertia H is multiplied by 1 - (f / f_0)^2, since its pole would give a band at the resonance f_0
-        # too much weight.
+        # H(f) is fitted after multiplication by 1 - (f / f_0)^2: the pole of H at the resonance f_0 would otherwise
+        # give a frequency band close to f_0 too much weight.
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error([factor, ones], factor * inertia)
         # the resonance of a link with less than a tenth of the motor's inertia is not visible
         if motor > 0 and link > 0.1 * motor:
             candidates.append((error, resonance, motor, link))
-    # A joint counts as elastic if the rigid model has an error of at least 10 %, and the elastic model one of at most
-    # 6 % and half of the rigid model's. With these thresholds no recorded arm counts as elastic.
+    # A joint counts as elastic if the RMS error of the rigid model is at least 10 %, and the RMS error of the elastic
+    # model is at most 6 % and at most half the error of the rigid model. With these thresholds no recorded arm counts
+    # as elastic.
     if rigid < 0.1 or not candidates or min(candidates)[0] > min(0.06, rigid / 2):
         return None
     _, resonance, motor, link = min(candidates)
-    # a rigid model is valid up to the frequency at which the apparent inertia is 10 % above its value at f = 0
+    # A rigid model counts as valid up to the frequency at which H(f) is 10 % above H(0).
     share = 0.1 * (motor + link) / link
     valid = resonance * float(np.sqrt(share / (1 + share)))
     unit = "kg" if signals.kind == "prismatic" else "kg m^2"
@@ -291,18 +300,17 @@ def _apparent_inertia(
     firsts = np.unique(np.searchsorted(frequency, edges))
     (moved, driven), together = np.add.reduceat(power, firsts, axis=1), np.add.reduceat(cross, firsts)
     means = np.add.reduceat(frequency, firsts) / np.diff(np.append(firsts, len(frequency)))
-    # A band is coherent if its squared in-phase coherence is above 0.85, and if it has enough motion for a ratio that
-    # is not noise.
+    # A band is coherent if its squared in-phase coherence is above 0.85. Bands with less than 0.1 % of the acceleration
+    # power of the strongest band are excluded, too, since their ratio would be noise.
     coherent = together**2 > 0.85 * moved * driven
     coherent &= moved > 1e-3 * moved.max(initial=0.0)
     return means[coherent], together[coherent] / moved[coherent]
 
 
 def _relative_error(columns: Sequence[np.ndarray], values: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the relative RMS residual of a least-squares fit, and the coefficients (C,).
+    """Return the RMS residual of a least-squares fit divided by the RMS of `values`, and the coefficients (C,).
 
-    columns: C columns of the regressor, (B,) each for B frequency bands. values: (B,) dependent variable, whose RMS is
-    the reference of the residual.
+    columns: C columns of the regressor, each (B,) for B frequency bands. values: (B,) dependent variable.
     """
     matrix = np.stack(columns, axis=1)
     x = np.linalg.lstsq(matrix, values, rcond=None)[0]

@@ -1,7 +1,8 @@
 """Detection of jumps of logged signals: lost samples, outliers, wrapped angles, register words, repeated rows.
 
-The functions apply to one signal (T,) or to the columns of a log (T, C), for logs of any format and any robot. A step
-is the difference between neighbouring samples; the typical step is the median magnitude of the nonzero steps.
+The functions apply to one signal (T,) or to a log of C columns (T, C), of any format and any robot. A step is the
+difference between neighbouring samples; the typical step is the median magnitude of the nonzero steps. Register words
+are the raw integers of a drive's register: they overflow at a period, or have a bit for the sign.
 """
 
 from itertools import pairwise
@@ -39,23 +40,24 @@ def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
 
 
 def is_lost(values: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of lost samples: loggers write exactly 0 for a missing value between values far from 0."""
+    """Return a mask (T,) of lost samples, for which loggers write exactly 0 between values far from 0."""
     lost = np.zeros(len(values), bool)
     logged = np.flatnonzero(values)
     if not logged.size or logged[-1] - logged[0] == len(logged) - 1:
-        return lost  # All zeros are at the ends of the signal, where the arm may have been at rest.
+        return lost  # Zeros occur only at the ends of the signal, where the arm may have been at rest.
     steps = np.abs(np.diff(values[logged]))
-    # a continuous signal that passes through 0 has samples close to 0 before and after
+    # Zeros between samples close to 0 are not lost: a continuous signal may pass through 0.
     nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))
     lost[logged[0] : logged[-1]] = np.repeat(nearest > TUNING.jump * _usual(steps), np.diff(logged))
     return np.asarray(lost & (values == 0))
 
 
 def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
-    """Return a mask (T,) of lost samples and of outliers.
+    """Return a mask (T,) of the samples that are lost or outliers.
 
-    smooth: True for positions, whose steps change gradually. False for torques and velocities, which may have genuine
-    steps: their outliers must also be outside the range of all other samples by half of this range.
+    An outlier is one of at most five samples between two opposite jumps. smooth: True for positions, which change
+    gradually. False for torques and velocities, which may have genuine steps: an outlier must also lie above or below
+    all other samples by more than half of their range.
     """
     outliers = is_lost(values)
     if len(values) < TUNING.jump_window:
@@ -64,7 +66,8 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     sizes = np.abs(steps)
     largest_step = TUNING.jump * _usual(sizes)
     logged = np.flatnonzero(values)
-    # Positions do not jump to 0 before the first or after the last logged value; torques and velocities may.
+    # Zeros at the beginning or end of positions are lost samples if the neighbouring position is far from 0. Torques
+    # and velocities may be 0 there.
     if smooth and len(logged) > TUNING.jump_window:
         first, last = logged[[0, -1]]
         outliers[:first] |= abs(values[first]) > largest_step
@@ -75,14 +78,15 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         return outliers
     for first, second in pairwise(np.flatnonzero(is_jump)):
         out, back = steps[first], steps[second]
-        # An excursion consists of two opposite jumps of similar size. It is an outlier if it lasts at most five
-        # samples; a signal that returns later has jumped twice.
+        # An excursion consists of two opposite jumps of similar size, with at most five samples between them. A signal
+        # that returns later has jumped twice and has no outlier.
         is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= 5
         if not is_excursion:
             continue
         low, high = max(0, first - TUNING.jump_window), second + 1 + TUNING.jump_window
-        # During fast motion the neighbouring steps are large, too, and the excursion is no outlier. The two largest
-        # neighbouring steps are ignored, since they may belong to another outlier.
+        # An excursion is an outlier only if its jumps are four times as large as the neighbouring steps, which are
+        # large during fast motion. The two largest neighbouring steps are ignored, since they may belong to another
+        # outlier.
         around = np.sort(np.concatenate([sizes[low:first], sizes[second + 1 : high]]))[:-2]
         if min(abs(out), abs(back)) > 4.0 * around.max(initial=0.0):
             outliers[first + 1 : second + 1] = True
@@ -97,9 +101,9 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
 def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.ndarray:
     """Return a mask (T,) of stale samples: repetitions of an old value while the measured quantity must have changed.
 
-    values: (T,) the signal. changes: (T,) another signal; if it changes by more than `min_change` within a block of
-    equal values, these values are stale. Quantised signals have genuine blocks of equal values: such a block is stale
-    only if the step at its end is large, too.
+    Stale values form a block of equal values that is more than 20 times as long as the median block, and within which
+    the signal `changes` changes by more than `min_change`. A quantised signal has genuine blocks of equal values:
+    there, the step at the end of a stale block must also be larger than four typical steps. values, changes: (T,).
     """
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
@@ -120,26 +124,26 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
 def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return the rows after which a position q (T,) at times t (T,) jumps.
 
-    A jump is faster than any arm, and much larger than the typical step. Steps across gaps in time are no jumps, since
-    the arm may have moved in the gap.
+    A jump is a step that is faster than any arm, and more than 20 times the typical step. Steps across gaps in time are
+    no jumps, since the arm may have moved in the gap.
     """
     if len(q) < TUNING.jump_window:
         return np.zeros(0, int)
     sizes, dt = np.abs(np.diff(q)), np.diff(t)
     median = float(np.median(dt))
     is_jump = (sizes > TUNING.jump * _usual(sizes)) & (dt <= TUNING.gap * median)
-    # No arm is faster than 40 rad/s or m/s. Time stamps of messages that arrive in bursts are too close: a step is
-    # assumed to last at least the median time.
+    # No arm is faster than 40 rad/s or m/s. A step is assumed to last at least the median time step, since messages
+    # that arrive in bursts have time stamps that are too close to each other.
     return np.flatnonzero(is_jump & (sizes > 40.0 * np.maximum(dt, median)))
 
 
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
-    A block of k equal rows consists of repeats if the arm moved during the block: the step at the end of the block is
-    then as large as k steps of the following motion. Equal rows of an arm at rest are no repeats, with one exception:
-    if each row during motion occurs m times, the logger writes each row m times, and of the rows at rest only every
-    m-th one is no repeat. positions: number of leading columns that are positions.
+    Equal rows are repeats of the first of them if the arm moved while they were written: the step at the end of a block
+    of k equal rows is then about as large as k steps of the following motion. Equal rows of an arm at rest are not
+    repeats. The exception is a logger that writes each row m times during motion: at rest, too, one of m rows is
+    original, and the others are repeats. positions: number of leading columns that are positions.
     """
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
     lengths = np.diff(np.append(starts, len(columns)))
@@ -147,7 +151,7 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     index = np.arange(len(columns)) - np.repeat(starts, lengths)
     if len(starts) < 4 or not index.any():
         return np.repeat(is_held, lengths), 1
-    # the step of each position at the end of each block of equal rows, except the last block
+    # step of each position at the end of each block of equal rows; the last block has no step
     steps = np.abs(np.diff(columns[starts, :positions], axis=0))
     speeds = steps[1:] / lengths[1:-1, None]
     quantum = np.min(np.where(steps > 0, steps, np.inf), axis=0)
@@ -159,12 +163,12 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
 
 
 def held_samples(values: np.ndarray) -> int:
-    """Return the number of consecutive samples for which a changing signal (T,) keeps each value; 1 if none is held."""
+    """Return the number of consecutive samples that a logger writes for each value of a signal (T,); normally 1."""
     changes = np.flatnonzero(np.diff(values))
     if len(changes) < TUNING.jump_window:
         return 1
     sizes = np.abs(np.diff(values)[changes])
-    # a slow quantised signal has equal samples without being held; only steps of several quantisation steps count
+    # Equal samples of a slow quantised signal are no repetitions, so only steps of several quantisation steps count.
     large = sizes[1:] > 2.5 * sizes.min()
     if large.sum() < TUNING.jump_window:
         return 1
@@ -174,8 +178,11 @@ def held_samples(values: np.ndarray) -> int:
 class Word(NamedTuple):
     """Decoding of a signal as register words.
 
-    key: setting of the mapping that decodes it, "period" or "sign_bit". value: value of this setting in logged units.
-    jumps: number of jumps of the undecoded signal. values: (T,) the decoded signal.
+    Attributes:
+        key: setting of the mapping that decodes the signal, "period" or "sign_bit".
+        value: value of this setting in the unit of the log.
+        jumps: number of jumps of the undecoded signal.
+        values: (T,) decoded signal in the unit of the log.
     """
 
     key: str
@@ -185,27 +192,27 @@ class Word(NamedTuple):
 
 
 def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
-    """Return the decoding as register words that removes the jumps of a signal (T,); None if no decoding does.
+    """Return the decoding of a signal as register words that removes at least half of its jumps; None if none does.
 
-    The candidates are words with a sign bit and words that overflow, with a size of 2^k quantisation steps or of 2^k
-    revolutions. The best decoding has the fewest remaining jumps and, if several have equally few, the smoothest
-    signal.
+    The candidates are words with a sign bit and words that overflow at a period. The sign bit or the period is a
+    multiple 2^k of a revolution or of the quantisation step. The decoding with the fewest remaining jumps is returned;
+    of several with equally few jumps, the one with the smoothest signal.
 
-    values: (T,) in logged units. turn: one revolution in logged units; None for a joint that does not rotate.
+    values: (T,) in the unit of the log. turn: one revolution in this unit; None for a joint that does not rotate.
     """
-    # The median step of so few values might itself be a jump.
+    # With fewer than four values, the median step might itself be a jump.
     if len(values) < 4:
         return None
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
     rows = np.flatnonzero(np.abs(steps) > limit)
-    # Noise about 0 changes the sign bit of words at half of the steps at most; with more jumps the signal does not
-    # consist of words.
+    # A signal in which more than half of the samples jump does not consist of register words: even noise about 0
+    # changes a sign bit at half of the steps at most.
     if not len(rows) or len(rows) > 0.5 * len(values):
         return None
     jump, usual = float(np.median(np.abs(steps[rows]))), _usual(np.abs(steps))
-    # Torques may reverse abruptly. A jump of a signal with negative values is therefore an overflow only if it is
-    # nearly as large as the range.
+    # Torques may reverse abruptly, so a jump of a signal with negative values is an overflow only if it is nearly as
+    # large as the range of the signal.
     is_signed = values.min() < -FINEST_WORD * np.ptp(values)
     if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * usual):
         return None
@@ -213,8 +220,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        # The decoding of words that overflow needs a range of at most one period (plus 1 % for noise). The decoding of
-        # a sign bit needs values above the sign bit, which represent the negative numbers.
+        # Words that overflow have a range of at most one period (plus 1 % for noise). Words with a sign bit have values
+        # above the sign bit, which represent negative numbers.
         readings = []
         if np.ptp(values) < 1.01 * size:
             readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))
@@ -222,8 +229,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
             jumps = np.abs(np.diff(reading.values))
-            # A wrong decoding is rejected: it shortens large steps of the motion by one period, but the steps remain
-            # large.
+            # A decoding is rejected if the jumps become shorter by one period but remain large: they are then steps of
+            # the motion.
             if np.median(jumps[rows]) > TUNING.jump * usual:
                 continue
             bends = np.abs(np.diff(reading.values, 2))
@@ -237,7 +244,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
 
 def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
-    """Return candidates for the size of a register in logged units: 2^k revolutions, and 2^k quantisation steps."""
+    """Return candidates for the period or sign bit in the log's unit: 2^k revolutions, and 2^k quantisation steps."""
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)
     differences = np.diff(levels)

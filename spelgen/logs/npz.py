@@ -31,7 +31,7 @@ class NpzArrays:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
             member = self._members[name]
-            # the size that the archive states is a reliable bound, since zipfile does not read more of a member
+            # The stated size bounds the memory even if it is wrong, since zipfile does not read more bytes of an array.
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
                 got, expected = (
@@ -51,7 +51,7 @@ class NpzArrays:
         return LogError(got, file=self.file, element=f"array {name}", expected=expected, do=do)
 
     def column(self, name: str) -> pa.Array:
-        """Return an array as a column of a table; a matrix becomes a column of lists."""
+        """Return the array of this name as a column of a table; the rows of a matrix become lists."""
         array = self[name]
         # The array is converted to double precision and native byte order, since Arrow rejects other types and byte
         # orders.
@@ -63,8 +63,8 @@ class NpzArrays:
 def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return one table per recording; only the arrays that the mapping names are read.
 
-    An archive contains several recordings if the mapping's name for the times contains `{trajectory}`. Each text that
-    an array's name has in this place is the name of a recording.
+    If the mapping's name of the times contains `{trajectory}`, the archive contains several recordings: with
+    "t_{trajectory}", the arrays "t_a" and "t_b" are the times of the recordings "a" and "b".
     """
     arrays, times = NpzArrays(file), mapping.columns.t
     if TRAJECTORY not in times:
@@ -86,8 +86,8 @@ def npz_columns(file: Path) -> pa.Table:
 def _trajectory_text(pattern: str, name: str) -> str | None:
     """Return the text that an array's name has in place of `{trajectory}`; None if the name does not match the pattern.
 
-    A pattern may contain `{trajectory}` several times, always for the same text. The text's length follows from the
-    length of the name: regular expressions with several wildcards would take exponential time on long names.
+    A pattern may contain `{trajectory}` several times, for the same text. The length of the text is computed from the
+    length of the name. A regular expression with several wildcards could take exponential time on long names.
     """
     start = pattern.index(TRAJECTORY)
     length = (len(name) - len(pattern)) // pattern.count(TRAJECTORY) + len(TRAJECTORY)
@@ -109,7 +109,7 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
     columns = stored_columns(layout, arrays.names)
     for name in columns:
         shape = arrays[name].shape
-        # an array may have two dimensions only if the layout refers to its elements, such as q[0], and not to itself
+        # An array may have two dimensions only if the layout names its columns, such as q[0], and not the whole array.
         if shape[:1] != samples or len(shape) > 1 + (name not in layout.columns):
             expected = f"a value for each of the {samples[0] if samples else 0} times"
             do = "resample it to these times"
@@ -120,9 +120,9 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
 def _with_matrix_columns(
     quantity: str, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping
 ) -> LogMapping:
-    """Return the mapping with columns such as `q[0]`, if the archive contains a quantity as a matrix (T, n).
+    """Return the mapping with columns such as `q[0]` for a quantity that is stored as a matrix (T, n).
 
-    Without such a matrix the mapping is returned unchanged.
+    If the archive contains no such matrix, the mapping is returned unchanged.
     """
     pattern = mapping.pattern(quantity)
     matrix = pattern.replace("{joint}", "").rstrip("_")
@@ -133,7 +133,7 @@ def _with_matrix_columns(
     columns: dict[str, dict[str, str | None]] = {}
     for joint, name in zip(joints, names, strict=True):
         column = mapping.column(quantity, joint)
-        # the mapping may assign the column of another joint to this joint
+        # The mapping may assign the column of another joint to this joint; owners[0] is the joint whose column it is.
         owners = [x for x in (name, *names) if pattern.replace("{joint}", x) == column]
         columns[joint] = {quantity: f"{matrix}[{column_of[owners[0]]}]" if owners else column}
     return mapping.with_joint_columns(columns)

@@ -16,17 +16,18 @@ from spelgen.logs.tables import LogFormat, LogTable, reading, stored_columns, ta
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.yaml_document import YamlDocument, validated
 
-INFO = "meta/info.json"  # description of a LeRobot data set, within the folder of the data set
+INFO = "meta/info.json"  # file that describes a LeRobot data set, in its folder
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
 ENDING = ".pos"
 # Largest normalised position: 100, with a tolerance for rounding to single precision.
 LARGEST_NORMALISED = 100.001
-# Doubt about positions in degrees; the check of servo logs removes it if the steps of the encoders decide.
+# Text of the remark that positions may be normalised and not in degrees. The check of servo logs removes this remark if
+# the step size of the encoders determines the unit.
 UNLESS_NORMALISED = "unless they are LeRobot's normalised values"
 
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with the only table of a file. The mapping is ignored for files that spelgen wrote."""
+    """Return a list with one table, the content of a file. The mapping is ignored for files that spelgen wrote."""
     schema = pa.parquet.read_schema(file)
     layout = table_layout(schema, joints, mapping, file)
     columns = stored_columns(layout, schema.names)
@@ -35,10 +36,10 @@ def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the tables of all files of a LeRobot data set, whose motors have the names of the joints.
+    """Return the tables of all Parquet files of a LeRobot data set; joints and motors are matched by their names.
 
-    Raises LogError if the data set has no files, if a joint is not among the motors, and for normalised positions
-    without a calibration.
+    Raises LogError if the data set has no Parquet files, if a joint is not among the motors, and for normalised
+    positions without a calibration.
     """
     info = read_json(folder / INFO, LogError)
     states, actions = _motor_names(folder, info, STATE), _motor_names(folder, info, ACTION)
@@ -62,7 +63,7 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         expected = "data/chunk-000/file-000.parquet"
         raise LogError("a data set without Parquet files", file=folder, expected=expected)
     mapping, remarks = _with_scale(folder, files, joints, mapping)
-    # Joint names of LeRobot 2 have no suffix, and its positions are in degrees: these remarks do not apply.
+    # LeRobot 2, whose joint names have no suffix, always writes degrees: remarks on the unit do not apply.
     if ENDING not in str(info["features"][STATE]["names"]):
         remarks = ()
     fps = info.get("fps")
@@ -120,7 +121,7 @@ def _with_scale(
 
 
 def _calibration(folder: Path) -> dict[str, MotorCalibration]:
-    """Return the calibration per motor from the calibration.json of a data set; {} if there is no such file."""
+    """Return {motor: calibration} from the file calibration.json of a data set; {} if there is no such file."""
     for file in (folder / "calibration.json", folder / "meta" / "calibration.json"):
         if file.is_file():
             document = YamlDocument(file, None)
@@ -129,7 +130,7 @@ def _calibration(folder: Path) -> dict[str, MotorCalibration]:
 
 
 def dataset_motors(folder: Path) -> list[str]:
-    """Return the names of the motors of a data set, in the order of the columns of its state."""
+    """Return the names of the motors of a data set, in the order of the elements of `observation.state`."""
     return _motor_names(folder, read_json(folder / INFO, LogError), STATE)
 
 
@@ -137,7 +138,7 @@ def _motor_names(folder: Path, info: Any, feature: str) -> list[str]:
     """Return the motors' names for a feature ("observation.state" or "action"), without LeRobot's suffix ".pos"."""
     try:
         names = info["features"][feature]["names"] or []
-        if isinstance(names, dict):  # LeRobot writes a list, or a group of lists
+        if isinstance(names, dict):  # LeRobot writes a list, or a dict of lists
             names = chain(*names.values())
         return [str(name).removesuffix(ENDING) for name in names]
     except (KeyError, TypeError, AttributeError) as error:

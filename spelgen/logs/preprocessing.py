@@ -17,11 +17,12 @@ from spelgen.logs.tuning import FAST, TUNING
 class Preprocessing:
     """Options for cutting, filtering and decimating logs. Raises SettingsError for invalid values.
 
-    cutoff: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: no filter; None: 8 Hz, but no filter for windows
-    if a log is sampled at 50 Hz or less.
-    decimation: number of log samples from one sample of a window to the next; None: chosen for the filter.
-    gap: a time step longer than this multiple of the median step is a gap, at which a recording is cut.
-    torque_delay: delay of logged torques relative to positions [s]; None: estimated in fits to torques.
+    Attributes:
+        cutoff: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: no filter; None: 8 Hz, but no filter for
+            windows if a log is sampled at 50 Hz or less.
+        decimation: number of log samples from one sample of a window to the next; None: chosen according to the cutoff.
+        gap: a time step longer than this multiple of the median step is a gap, at which a recording is cut.
+        torque_delay: delay of logged torques relative to positions [s]; None: estimated in fits to torques.
     """
 
     cutoff: float | None = None
@@ -49,7 +50,8 @@ class Preprocessing:
         cutoff, decimation = self.cutoff, self.decimation or 1
         if cutoff is None and all(rate > TUNING.dense_rate * FAST for rate in rates):
             cutoff = TUNING.automatic_cutoff
-        # by default only filtered logs are decimated, if their rate is higher than the filter needs
+        # By default, filtered logs are decimated to the lowest rate that the cutoff permits; other logs are not
+        # decimated.
         if self.decimation is None and cutoff:
             decimation = max(1, int(min(rates) * FAST / (TUNING.samples_per_period * cutoff)))
         return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=self.torque_delay or 0.0)
@@ -63,12 +65,12 @@ class Preprocessing:
 
     @property
     def filtered(self) -> bool:
-        """True if windows are cut from filtered logs; the options must be ``resolved``."""
+        """True if q, qd and tau are filtered before windows are cut from the logs; the options must be ``resolved``."""
         return bool(self.cutoff)
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """A remark with the cutoff if the logs are filtered, else []; the options must be ``resolved``."""
+        """List with one remark, the cutoff, if the logs are filtered, else []; the options must be ``resolved``."""
         if not self.cutoff:
             return []
         message = f"q, qd and tau filtered at {self.cutoff:g} Hz, zero phase"
@@ -94,7 +96,7 @@ class Preprocessing:
         return prepared
 
     def moved(self, trajectories: Sequence[Trajectory]) -> Sequence[Trajectory]:
-        """Return the trajectories with torques shifted back by `torque_delay`, to the times at which they acted."""
+        """Return the trajectories with torques shifted back in time by `torque_delay`."""
         delay = self.torque_delay
         # Most logs have no delay: the unchanged trajectories are returned, which need not be validated again.
         if not delay:

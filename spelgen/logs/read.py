@@ -50,7 +50,7 @@ def read_logs(
 
 
 class BoundedLogs(NamedTuple):
-    """Trajectories reduced to a bound of memory, and a note on the kept part; no note if all samples were kept."""
+    """Trajectories that fit into a limit of memory, and a note on the kept samples; no note if all were kept."""
 
     trajectories: list[Trajectory]
     notes: list[Diagnostic]
@@ -63,7 +63,7 @@ def read_bounded_logs(
 
     Files are read and reduced one at a time, so that only the largest file and the kept samples need to fit into
     memory. A reduced recording has gaps between its segments. The selection is deterministic. Raises the errors of
-    `read_logs`, but only for rows that are kept.
+    `read_logs`; faults of rows that are not kept are not detected.
     """
     segments = LogSegments(TUNING.kept_bytes)
     trajectories = _read(paths, log_source(arm, mapping), role, segments)
@@ -85,10 +85,10 @@ def _read(
     segments: LogSegments,
     joint_types: Sequence[str] | None = None,
 ) -> list[Trajectory]:
-    """Return the trajectories of all files, collected in `segments`; raise the first error of each file, as one error.
+    """Return the trajectories of all files, after `segments` has collected and reduced the rows.
 
-    source: joints and mapping. role: "train" or "test", if only the files of a folder with this name are read; None:
-    all files. joint_types: types of the joints, for the check of the units in the mapping.
+    If files have faults, the first error of each file is raised, in one LogError. source: joints and mapping. role: see
+    `read_logs`. joint_types: types of the joints, for the check of the units in the mapping.
     """
     collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))
     files, errors = log_files(paths, role)
@@ -113,10 +113,10 @@ def _read(
 def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: LoggedArm) -> Path:
     """Write trajectories to one Parquet or CSV file, as the suffix of the path states; return the path.
 
-    The file is complete, or not written if an error occurs. The column `trajectory` contains the names of the
-    trajectories. `read_logs` returns the same numbers from both formats. arm: result of `load_arm`, a model, or the
-    names of the joints. Raises LogError for another suffix, if there are no trajectories, and for trajectories whose
-    number of joints differs from the arm's.
+    If an error occurs, no incomplete file remains. The column `trajectory` contains the names of the trajectories.
+    `read_logs` returns the same numbers from both formats. arm: result of `load_arm`, a model, or the names of the
+    joints. Raises LogError for another suffix, if there are no trajectories, and for trajectories whose number of
+    joints differs from the arm.
     """
     path, joints = Path(path), log_source(arm).joints
     if path.suffix not in (".parquet", ".csv"):
@@ -131,7 +131,7 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     for quantity in trajectories[0].quantities:
         values = joined_column(trajectories, quantity)
         columns |= {f"{quantity}_{joint}": column for joint, column in zip(joints, values.T, strict=True)}
-    # the declaration of SI units in the metadata prevents that a mapping is applied when the file is read
+    # Metadata declare SI units, so that no mapping is applied when the file is read.
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
     with replacing(path) as unfinished:
         if path.suffix == ".csv":
@@ -142,9 +142,12 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
 
 
 def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Return the trajectories with unique names: the name, or file stem and name, or path and name."""
+    """Return the trajectories with unique names.
+
+    If names occur more than once, all names are preceded by the stems or paths of their files.
+    """
     names: list[str] = []
-    # the shortest form that is unique is used, since names occur in tables and messages
+    # The shortest unique form is used, since names occur in tables and messages.
     for form in ("{0.name}", "{0.file.stem}/{0.name}", "{0.file}/{0.name}"):
         names = list(map(form.format, trajectories))
         if len(set(names)) == len(names):

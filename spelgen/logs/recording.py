@@ -16,11 +16,11 @@ from spelgen.logs.values import foreign_rows, is_split
 from spelgen.settings.log_mapping import LogMapping
 
 Repaired = tuple[np.ndarray, tuple[str, ...]]
-"""Rows of a log (T, C) after a repair, and messages about the changes."""
+"""Rows of a log, (T, C) with C columns, after a repair, and messages about the changes."""
 
 
 def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:
-    """Return the trajectory of the rows `data` (T, C) in SI units, whose columns the layout describes.
+    """Return the trajectory of the rows `data`, (T, C) in SI units, with the C columns of the layout.
 
     First wrapped angles and overflowed registers are unwrapped, and repeated rows are removed; with the setting
     'dropouts: dropped' lost rows and outliers are removed, too. Then the signals are shifted by the mapping's delays,
@@ -41,7 +41,7 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     qd = logged.get("qd", np.zeros_like(q))
     if "qd" not in logged:
         for rows in _pieces(t):
-            qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # qd is the central difference of q
+            qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # central difference of q
     tau = logged.get("tau", np.zeros((len(t), 0)))
     return Trajectory(
         t, q, qd, tau, name, layout.file, layout.accepted, logged.get("u"), repairs, layout.remarks + wraps, mapping
@@ -49,9 +49,10 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
 
 
 def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> Repaired:
-    """Return rows (T, C) in which the signals with a period in the mapping are unwrapped, and remarks about them.
+    """Return the rows `data`, (T, C) with C columns, after unwrapping of signals, and remarks about the wraps.
 
-    signals: quantity and joint of each column after the times.
+    Signals are unwrapped if the mapping states a period for them. signals: quantity and joint of each column after the
+    times.
     """
     remarks: list[str] = []
     if not any(mapping.word("period", *signal) for signal in signals):
@@ -65,10 +66,11 @@ def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping
         count = jump_count(column, period)
         result = unwrapped(column, period)
         if quantity == "u":
-            # Registers of commands and of positions may start in different revolutions: the median difference of the
-            # unwrapped signals is reduced to less than half a period
+            # Registers of commands and of positions may start in different revolutions. The commands are shifted by
+            # whole periods, so that their median difference from the positions is at most half a period.
             result = result - period * np.round(np.median(result - values["q", joint]) / period)
-        # an angle that does not wrap keeps its logged revolution; all other signals are centred about zero
+        # Signals are shifted by whole periods to a median close to 0. Only angles without a wrap remain unchanged:
+        # their revolution is known.
         elif count or abs(period - 2 * pi) > 1e-6:
             offset = mapping.offset(quantity, joint)
             result = centred(result - offset, period) + offset
@@ -79,7 +81,7 @@ def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping
 
 
 def _without_repeats(data: np.ndarray, positions: int, mapping: LogMapping) -> Repaired:
-    """Return rows (T, C) without repeated rows, and a message about the repeats.
+    """Return the rows `data`, (T, C) with C columns, without repeated rows, and a message about the repeats.
 
     Repeats are removed if every row is written several times, or with the setting 'dropouts: dropped'; otherwise they
     are only reported. positions: number of columns of positions.
@@ -104,7 +106,11 @@ def _without_repeats(data: np.ndarray, positions: int, mapping: LogMapping) -> R
 
 
 def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> Repaired:
-    """Return rows (T, C) without lost samples, outliers and stale values, and a message that lists the removed rows."""
+    """Return the rows `data`, (T, C) with C columns, without rows that contain lost samples, outliers or stale values.
+
+    The second result is a message that lists the removed rows. signals: quantity and joint of each column after the
+    times.
+    """
     outliers = np.zeros(len(data), bool)
     dropped = []
     columns = dict(zip(signals, data[:, 1:].T, strict=True))
@@ -123,7 +129,7 @@ def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> R
 
 
 def _without_delays(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> np.ndarray:
-    """Return rows (T, C) in which the signals are shifted back by their delays in the mapping.
+    """Return the rows `data`, (T, C) with C columns, in which signals are shifted back by their delays in the mapping.
 
     Rows near the ends of a gap-free piece, for which a delayed signal was not logged, are removed.
     """
@@ -152,34 +158,36 @@ def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
 def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of the samples of "q", "qd" or "tau" that repeat an old value although the joint moves.
 
-    A constant torque at its largest or smallest value is clipped, not stale. A constant torque at the end of a
-    recording is accepted, since the motor may be at rest.
+    A torque that remains at the largest or smallest torque of the recording is not stale, since the drive limits the
+    torque. A torque that is constant until the end of the recording is not stale, since the motor may be at rest.
     """
     if quantity == "tau":
         stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
         return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
     from scipy.integrate import cumulative_trapezoid  # imported only if needed, since the import takes long
 
-    # if q or qd is frozen, the integral of qd drifts from q; a drift of more than 0.05 rad or m is evidence
+    # If q or qd is frozen while the joint moves, the integral of qd drifts from q. Values are stale if it drifts by
+    # more than 0.05 rad or m.
     return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)
 
 
 def listed_times(t: np.ndarray) -> str:
-    """Return a text that lists the first few of the times (T,) [s] and the number of the remaining times."""
+    """Return a text that lists at most the first five of the times (T,) [s], and the number of the remaining times."""
     times = ", ".join(f"{x:.4g}" for x in t[: TUNING.listed].tolist())
     unlisted = len(t) - TUNING.listed
     return f"{times} s" + (f" and {unlisted} more" if unlisted > 0 else "")
 
 
 def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaired:
-    """Return the values (T, C) with increasing times, and messages about repairs.
+    """Return the rows `data`, (T, C) with C columns, with increasing times, and messages about repairs.
 
-    Rows are sorted by time if this makes the positions smoother. Of several rows with equal times the first is kept; if
-    the resolution of the clock is too low for the rows, evenly spaced times are reconstructed instead. Rows of another
-    topic or publisher are removed, and signals in separate rows are joined.
+    Signals in separate rows are joined, and rows of another topic or publisher are removed. Rows are sorted by time,
+    unless positions are then less smooth. Of several rows with equal times only the first is kept. If many of them
+    differ, the resolution of the clock is too low, and evenly spaced times are reconstructed. With the setting
+    `sample_rate`, the logged times are replaced by evenly spaced times.
 
-    data: (T, C) values in SI units. rows: (T,) row numbers in the file, for errors. Raises LogError for a clock that
-    restarts, and for times that cannot be reconstructed.
+    data: values in SI units, with times in the first column. rows: (T,) row numbers in the file, for errors. Raises
+    LogError for a clock that restarts, and for times that cannot be reconstructed.
     """
     repairs: tuple[str, ...] = ()
     if is_split(data):
@@ -198,15 +206,16 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
     if late:
         ordered = data[np.argsort(t, kind="stable")]
         positions = slice(1, 1 + len(layout.joints))
-        # the clock of two recordings in one file restarts: sorting would interleave them, with rougher positions
+        # If sorted positions are rougher, the clock restarted between two recordings in the file, and sorting would
+        # interleave the recordings.
         if _roughness(ordered[:, positions]) > _roughness(data[:, positions]):
             raise _backward_times(t, rows, layout)
         data = ordered
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
-    # Many rows with equal times and different values show that the resolution of the clock is too low. Up to ten such
-    # rows, or 2 %, count as accidental.
+    # The resolution of the clock is too low if more than ten rows, and more than 2 % of all rows, have the same time as
+    # the row before but other values.
     if np.count_nonzero(differs) > max(10, 0.02 * len(data)):
         t, message = _reconstructed(data[:, 0], layout)
         return np.column_stack([t, data[:, 1:]]), (*repairs, message)
@@ -218,10 +227,11 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
 
 
 def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:
-    """Return the rows (T, C) of the rarest signal, with all other signals at their times, and a message.
+    """Return rows (T, C) that contain all C columns, from signals that are logged in separate rows, and a message.
 
-    If these rows are complete, the others are omitted. Otherwise the other signals are interpolated between their own
-    samples; rows beyond the first or last sample of a signal, or within a gap of the signal, are omitted.
+    The times are the times of the signal with the fewest samples. If more than 90 % of its rows contain all signals,
+    the complete rows are returned. Otherwise the other signals are interpolated at these times. Rows within a gap of a
+    signal, or before its first or after its last sample, are omitted.
     """
     finite = np.isfinite(data)
     base = finite[:, 1 + int(finite[:, 1:].sum(axis=0).argmin())]
@@ -237,7 +247,7 @@ def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:
         rows = finite[:, k]
         t, values = data[rows, 0], data[rows, k]
         period = abs(mapping.scale(*signal)) * (mapping.word("period", *signal) or 0.0)
-        if period:  # an angle between two samples before and after a wrap is not between their values
+        if period:  # interpolated angles are wrong across a wrap
             values = unwrapped(values, period)
         joined[:, k] = np.interp(times, t, values, left=np.nan, right=np.nan)
         after = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
@@ -299,7 +309,7 @@ def _pieces(t: np.ndarray) -> Iterator[slice]:
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
     """Return delayed values (T, n), sampled at times t (T,), shifted back by the delay [s].
 
-    Beyond the ends of a gap-free piece the values are constant.
+    At the ends of a gap-free piece, the first or last value of the piece replaces values that were not logged.
     """
     if not delay:
         return values

@@ -1,4 +1,4 @@
-"""Collector of recordings from log tables, which keeps all rows, or evenly spread segments within a bound of memory."""
+"""Collector of recordings from log tables: all rows, or evenly spread segments if the rows exceed a limit of memory."""
 
 from collections.abc import Iterator
 from math import inf
@@ -15,7 +15,7 @@ from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import clock_start, values_in_si
 
 Piece = tuple[int, str, np.ndarray]
-"""Number of a recording, its name, and the row numbers (T,) of a part of the recording."""
+"""Number and name of a recording, and the row numbers (T,) of a part of the recording."""
 
 
 class Segment(NamedTuple):
@@ -24,9 +24,9 @@ class Segment(NamedTuple):
     Attributes:
         recording: number of the recording among all recordings.
         name: name of the recording.
-        layout: columns of the file.
+        layout: columns of the file, with their units.
         rows: (T,) row numbers in the file, from 0.
-        values: (T, C) columns of the layout in SI units.
+        values: (T, C) values of the C columns of the layout, in SI units.
     """
 
     recording: int
@@ -37,11 +37,11 @@ class Segment(NamedTuple):
 
 
 class LogSegments:
-    """Collector of segments of recordings. Segments are numbered in the order of the files; every k-th one is kept.
+    """Collector of the segments of recordings; within a limit of memory it keeps every k-th segment.
 
-    The attribute `every` is k. It is 1 at first, and doubled whenever the kept segments would exceed `kept_bytes`.
-    Therefore the kept segments are evenly spread over all files, and the selection depends only on the files. Without a
-    bound of memory each recording is one segment. The attribute `rows` is the number of all rows.
+    Segments are numbered in the order of the files. The attribute `every` is k: it is 1 at first, and is doubled
+    whenever the kept segments would exceed `kept_bytes`, so that they are evenly spread over all files. Without a
+    limit, each recording is one segment. The attribute `rows` is the number of rows of all added tables.
     """
 
     def __init__(self, kept_bytes: float = inf) -> None:
@@ -52,7 +52,10 @@ class LogSegments:
         self._bytes = self._recordings = self._count = 0
 
     def add(self, layout: Layout, table: pa.Table) -> None:
-        """Add the recordings of a table. Raises LogError if it is empty, and for kept values that are not numbers."""
+        """Add the recordings of a table.
+
+        Raises LogError if the table has no rows, or if a kept row contains values that are not numbers.
+        """
         if not table.num_rows:
             raise LogError("no rows", file=layout.file, expected="at least one window of samples")
         start, pieces = clock_start(table, layout), []
@@ -61,8 +64,8 @@ class LogSegments:
             pieces += [(self._recordings, name, piece) for piece in np.array_split(rows, count)]
             self._recordings += 1
         pieces = self._selected(pieces, 8 * len(layout.columns))
-        # A table that is kept completely is converted in one call. This is faster than a call per recording, and an
-        # error states how many rows of the whole table have the fault.
+        # A table that is kept completely is converted in one call. This is faster than one call per recording, and an
+        # error can state the number of faulty rows in the whole table.
         data = values_in_si(table, layout, start, range(table.num_rows)) if self.every == 1 else None
         for recording, name, rows in pieces:
             values = values_in_si(_taken(table, rows), layout, start, rows) if data is None else data[rows]
@@ -71,8 +74,12 @@ class LogSegments:
         self.rows += table.num_rows
 
     def trajectories(self) -> Iterator[Trajectory | LogError]:
-        """Yield the trajectory of each recording, or the error about its times, and remove the recording's segments."""
-        # segments are removed from the list when they are joined, so that their memory is not needed twice
+        """Yield the trajectory of each recording, or a LogError if its times are wrong.
+
+        The collector is empty afterwards.
+        """
+        # Segments are removed from the list before they are joined, so that the list does not keep a second copy of all
+        # rows.
         segments, self._segments = self._segments[::-1], []
         while segments:
             group = [segments.pop()]
@@ -88,9 +95,10 @@ class LogSegments:
                 yield error
 
     def _selected(self, pieces: list[Piece], row_bytes: int) -> list[Piece]:
-        """Return the pieces of a table that are kept; remove earlier segments if the bound of memory is exceeded.
+        """Return the segments of a table that are kept.
 
-        row_bytes: memory of one row of the table [B].
+        If the limit of memory is exceeded, `every` is doubled, and every second one of the segments that were collected
+        before is removed. row_bytes: memory of one row of the table [B].
         """
         while True:
             selected = pieces[-self._count % self.every :: self.every]
@@ -98,27 +106,27 @@ class LogSegments:
             if size <= self._kept_bytes or len(self._segments) + len(selected) <= 1:
                 self._count += len(pieces)
                 return selected
-            # every second segment is removed, so that the remaining segments are evenly spread
+            # Every second segment is removed, so that the remaining segments are evenly spread.
             self.every *= 2
             self._segments = self._segments[::2]
             self._bytes = sum(x.values.nbytes for x in self._segments)
 
 
 def _taken(table: pa.Table, rows: np.ndarray) -> pa.Table:
-    """Return the rows of a table with these numbers (T,); consecutive rows are not copied."""
+    """Return the rows of a table whose indices are `rows` (T,); consecutive rows are not copied."""
     first, count = int(rows[0]), len(rows)
     return table.slice(first, count) if int(rows[-1]) - first + 1 == count else table.take(rows)
 
 
 def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]:
-    """Return the name and the row numbers (T,) of each recording in a table, in order of their first rows."""
+    """Return (name, row numbers (T,)) for each recording in a table, in the order of their first rows."""
     if layout.labels is None:
         return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
-    # Labels are encoded as numbers, which stores each text once. A small compressed file may contain a label of a
-    # megabyte in each of a million rows.
+    # Labels are encoded as numbers, so that each text is stored once: a small compressed file may repeat a label of a
+    # megabyte in a million rows.
     labels = table[layout.labels].dictionary_encode("encode").combine_chunks()
     numbers = labels.indices.to_numpy()
-    # sorting the labels avoids a pass over all rows for each recording
+    # Rows are sorted by label once, which avoids a search of all rows for each recording.
     rows = np.argsort(numbers, kind="stable")
     ends = np.cumsum(np.bincount(numbers))
     return list(zip(map(str, labels.dictionary.to_pylist()), np.split(rows, ends[:-1]), strict=True))

@@ -1,7 +1,7 @@
-"""Draft of a mapping for a log without one, from the names and the first values of the log's columns.
+"""Draft of the mapping of a log's columns to quantities and joints, from the names and first values of the columns.
 
-A quantity gets an SI unit if its unit is unknown from the column names and from the steps of the times. The checks of
-logs then detect e.g. degrees, and state which settings to write.
+Units are derived from the column names, and the unit of times also from the time steps. Unknown units are assumed to be
+SI units: the checks of logs then detect degrees, for example, and state the settings to write.
 """
 
 import difflib
@@ -28,7 +28,7 @@ WORDS = {
     "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega"},
     "tau": {"tau", "torque", "torques", "effort", "efforts", "current", "currents", "curr", "cur", "moment", "load"},
 }  # fmt: skip
-# Words in the names of commanded values, which otherwise resemble the names of measured ones.
+# Words that distinguish the names of commanded values from the names of measured values.
 COMMANDED = {
     "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
     "demand",
@@ -45,7 +45,8 @@ UNITS = {
     "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
-BARE = {"s", "n", "a", "m"}  # letters that are units only in brackets, since they are ambiguous otherwise
+# Letters that are units only in brackets: without brackets they may be part of a name.
+BARE = {"s", "n", "a", "m"}
 CURRENT = {"current", "currents", "curr", "cur"}
 
 
@@ -57,7 +58,7 @@ class Suggestion(NamedTuple):
 
 
 class ColumnName(NamedTuple):
-    """Name of a column, with the lower-case words in it, and the unit in it ("" if it contains none)."""
+    """Name of a column, the set of its words in lower case, and its unit ("" if the name contains none)."""
 
     name: str
     words: set[str]
@@ -89,13 +90,15 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     if not columns_of["t"]:
         got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
         raise LogError(got, file=file, expected="one of times, called t or time")
-    # Of several columns of times, the stamp in a message's header is preferred: it is the time of measurement, while
-    # others may be times of receipt. Otherwise the name with the fewest words is used.
+    # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
+    # measurement. Without a stamp, the name with the fewest words is used.
     clock = min(columns_of.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
-    # the order of the joints in the log is read from cells with names: loggers differ, and ROS often sorts by name
+    # Numbered columns are assigned by cells that contain joint names, since the order in a log may differ from the
+    # arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)
     by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in columns_of.items()}
-    # a mapping has velocities of all joints or none: if one is missing, all velocities are differentiated
+    # A mapping has columns of velocities for all joints or for none. If one is absent, all velocities are computed from
+    # positions.
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)
@@ -166,8 +169,8 @@ def _by_quantity(
 
     The quantity of a column is determined by the words in its name or, if these do not determine it, by its unit.
 
-    commands: True for logs with commanded positions "u" instead of velocities and torques. joints: names of the joints;
-    a joint's name in a column's name does not count as a word for commands, even if it is one.
+    commands: True for logs with commanded positions "u" instead of velocities and torques. joints: names of the joints.
+    The name of a joint in a column's name does not mark commands, even if it is a word such as "d" or "target".
     """
     by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
     names = {joint.lower() for joint in joints}
@@ -187,11 +190,11 @@ def _by_quantity(
 def _units(
     clock: ColumnName, by_joint: Mapping[str, Mapping[str, ColumnName]], table: pa.Table
 ) -> dict[str, str]:
-    """Return the unit per quantity from the names of its columns; for times without a unit, from their steps."""
+    """Return {quantity: unit}, from the names of the columns; the unit of times may be derived from the time steps."""
     units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
     for quantity, named in by_joint.items():
         for column in named.values():
-            # commands have no unit of their own: the unit of positions applies to them
+            # A mapping has no separate unit of commands: the unit of positions applies to them.
             stated = UNITS.get(quantity, {}).get(column.unit)
             if stated is None and quantity == "qd":
                 stated = {"deg": "deg/s", "rad": "rad/s"}.get(units.get("q", ""))
@@ -203,7 +206,7 @@ def _units(
 
 
 def _unit_of_times(name: str, table: pa.Table) -> str | None:
-    """Return the unit in which the median step of a column of times is plausible; None if no unit is."""
+    """Return the unit in which the median step of a column of times is plausible; None if there is no such unit."""
     if name not in table.schema.names:
         return None
     times = table[name].drop_null()
@@ -214,10 +217,10 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
-    """Return each joint's index in the log, from cells that contain joint names.
+    """Return {joint: index in the log} from the cells of the first row that contain joint names.
 
-    Such cells are in columns `name0`, `name1`, ..., or in a column with a list of names per row. Only the first row is
-    used; joints without a cell are omitted.
+    Such cells are in columns `name0`, `name1`, ..., or in a column of lists of names. Joints without a cell are
+    omitted.
     """
     order: dict[str, int] = {}
     for name, column in zip(table.schema.names, table.columns if len(table) else (), strict=False):
@@ -230,7 +233,10 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
 
 
 def _names(table: pa.Table) -> list[str]:
-    """Return the names of all columns whose name is unique; a column of lists has a name per element, like `q[0]`."""
+    """Return the names of the columns; a column of lists is replaced by its elements, such as `q[0]`, `q[1]`.
+
+    Columns with the same name as another column are omitted.
+    """
     names: list[str] = []
     for name, column in zip(table.column_names, table.columns, strict=True):
         values = column.drop_null()
@@ -243,10 +249,10 @@ def _names(table: pa.Table) -> list[str]:
 def _by_joint(
     columns: Sequence[ColumnName], joints: Sequence[str], order: Mapping[str, int]
 ) -> dict[str, ColumnName]:
-    """Return the column per joint: the column whose name contains the joint's name.
+    """Return {joint: column}: the column whose name contains the name of the joint.
 
-    If no name of a column contains a joint's name, columns are assigned by the last number in their names: according to
-    `order`, index per joint, or else in ascending order of the numbers.
+    If no column name contains a joint name, columns are assigned by the last number in their names: `order` contains
+    {joint: number}. If `order` does not contain all joints, they are assigned to the numbers in ascending order.
     """
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
     numbers = [(re.findall(r"\d+", column.name), column) for column in columns]

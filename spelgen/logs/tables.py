@@ -17,11 +17,12 @@ from spelgen.errors import LogError, shortened
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-UNITS_KEY = b"units"  # key in the metadata of a Parquet file under which it declares its units
-UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # codes of the checks of units
+UNITS_KEY = b"units"  # key of the units that a Parquet file declares in its metadata
+# Codes of the checks of units, which are omitted if a file declares its units.
+UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # declaration of units in files that spelgen wrote
 
-# types of the errors that Arrow, NumPy and zipfile raise for damaged files
+# Types of the errors that Arrow, NumPy and zipfile raise for damaged files.
 UNREADABLE = (
     pa.ArrowException, OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
@@ -33,8 +34,8 @@ class Layout:
 
     Attributes:
         file: path of the log, for errors and trajectories.
-        columns: names of the columns of t, then of q, qd and tau for each joint; without qd if velocities are
-            differentiated, and with u instead of qd and tau for logs of commands.
+        columns: names of the columns of t, of q of all joints, of qd of all joints, and of tau of all joints; without
+            qd if velocities are differentiated, and with u instead of qd and tau for logs of commands.
         labels: column with the names of recordings; None if the table has none.
         joints: names of the joints in the URDF.
         mapping: mapping of the columns, with units, signs and offsets.
@@ -55,7 +56,7 @@ class Layout:
     header: int = 1
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about a column in a row of values (counted from 0), with the line number for a CSV file."""
+        """Return an error about the value in a row (counted from 0) and column; for a CSV file also with the line."""
         line = int(row) + 1 + self.header if self.file.suffix == ".csv" else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
@@ -68,7 +69,7 @@ class LogFormat(NamedTuple):
     """Format of logs: its files, and its reader.
 
     Attributes:
-        read: function of a path, the joint names and the mapping that returns tables, or raises LogError.
+        read: reader (path, joint names, mapping) -> tables of a log; it raises LogError for a damaged log.
         suffixes: suffixes of files in this format.
         columns: function that returns all columns of a file, for a draft of a mapping; None if the format itself
             defines the columns.
@@ -86,8 +87,8 @@ class LogFormat(NamedTuple):
 def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, file: Path) -> Layout:
     """Return the layout of a table with this schema. Raises LogError if a column is missing or occurs twice.
 
-    For files that spelgen wrote, only the input and the accepted checks of the mapping apply: they have SI units and
-    the default names of columns.
+    Files that spelgen wrote have SI units and default column names. Of the mapping, only the input (torque or
+    position), the accepted checks and the wraps of angles apply to them.
     """
     metadata = schema.metadata or {}
     # files of spelgen, e.g. simulated logs, are in SI units, even if the arm's mapping describes another logger
@@ -107,11 +108,12 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     if missing:
         raise missing_columns(missing, schema.names, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
-    # a column of lists would raise an obscure error when it is used as names of recordings
+    # A column of lists is rejected here: used as names of recordings, it would raise an error that is hard to
+    # understand.
     if labels and pa.types.is_nested(schema.field(labels).type):
         got = f"values of type {schema.field(labels).type}"
         raise LogError(got, file=file, element=f"column {labels}", expected="names")
-    # units that the file declares are not checked
+    # Units are not checked if the file declares them.
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
@@ -119,7 +121,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
 
 
 def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
-    """Return the column and the index that a name like `position[2]` refers to; None for other names.
+    """Return ("position", 2) for a name like `position[2]`: a column of lists and an index; None for other names.
 
     columns: names of the table's columns.
     """
@@ -130,7 +132,10 @@ def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
 
 
 def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
-    """Return the file's columns that must be read for a layout, each once: for `position[2]` this is `position`."""
+    """Return the file's columns that must be read for a layout, each once.
+
+    For columns of the layout such as `position[0]` and `position[1]` this is the file's column `position`.
+    """
     elements = [list_element(name, columns) or (name, 0) for name in layout.columns]
     labels = [layout.labels] if layout.labels else []
     return list(dict.fromkeys([name for name, _ in elements] + labels))
@@ -147,7 +152,8 @@ def missing_columns(
     patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]
     of_joints = dict(zip(joints, zip(*of_quantity.values(), strict=True), strict=True))
     unlogged = [joint for joint, names in of_joints.items() if set(names) <= set(missing)]
-    # a joint without any column was not logged, whereas a wrong name in the mapping affects a single column
+    # If only some joints have no column at all, they were not logged. A wrong name in the mapping affects one column
+    # only, or all joints.
     if unlogged and len(unlogged) < len(joints):
         logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (
@@ -156,7 +162,7 @@ def missing_columns(
         )
     elif mapping.input == "torque" and _are_commands(columns, mapping, joints):
         do = "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
-    # only velocities are missing, as with many loggers: they can be computed from the positions
+    # Many loggers do not log velocities, which can be computed from the positions.
     elif set(missing) <= set(of_quantity.get("qd", ())):
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
@@ -179,14 +185,15 @@ def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequenc
 def _renaming(
     name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
 ) -> str:
-    """Return the advice for the missing column `name`: rename a similar unused column of this joint, or map the names.
+    """Return the advice for the missing column `name`: rename a similar column, or map the names.
 
-    of_quantity: names of the expected columns per quantity. joints: the joints' names in the log.
+    A similar column is an unused column whose name contains the same joint. of_quantity: names of the expected columns
+    per quantity. joints: the joints' names in the log.
     """
     named = [
         joint for names in of_quantity.values() for x, joint in zip(names, joints, strict=True) if x == name
     ]
-    # columns of accelerations are not proposed in place of torques: files of `excite` contain both
+    # Columns of accelerations are not proposed as torques: files of the command `excite` contain accelerations, too.
     unused = [
         x
         for x in columns
@@ -208,7 +215,7 @@ def names_joint(column: str, joint: str) -> bool:
 
 @contextmanager
 def reading(file: Path) -> Iterator[None]:
-    """Convert the exceptions that libraries raise for a damaged file to a LogError that names the file."""
+    """Context manager that converts exceptions of libraries about a damaged file to a LogError with its name."""
     try:
         yield
     except UNREADABLE as error:

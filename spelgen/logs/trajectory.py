@@ -29,18 +29,22 @@ IN_SI = LogMapping()
 class Trajectory:
     """Recording of an arm with n joints; lists, NumPy arrays and tensors are converted to float64 arrays.
 
-    t: (T,) sample times [s], strictly increasing, not necessarily regular.
-    q, qd: (T, n) joint positions and velocities [rad, rad/s; m, m/s for prismatic joints].
-    tau: (T, n) joint torques or forces [Nm; N]. In a simulated log tau[k] is constant from t[k] to t[k+1]; in a
-        measured log it is the torque at t[k]. Logs of commands u have no torques: tau is then (T, 0).
-    u: (T, n) commanded positions of joints with servos [rad; m], u[k] constant from t[k] to t[k+1]; None without
-    servos.
-    name: unique among the trajectories that are used together.
-    file: source of the recording; None if it was not read from a file.
-    accepted: codes of checks (see `spelgen.logs.checks`) that are omitted.
-    repairs: messages about rows that the reader changed or removed. remarks: messages about properties of the log.
-    mapping: columns and units of the log.
-    Raises LogError for inconsistent shapes, for numbers that are not finite or impossibly large, and for times that do
+    Attributes:
+        t: (T,) sample times [s], strictly increasing, not necessarily regular.
+        q: (T, n) joint positions [rad; m for prismatic joints].
+        qd: (T, n) joint velocities [rad/s; m/s].
+        tau: (T, n) joint torques or forces [Nm; N]. In a simulated log tau[k] is constant from t[k] to t[k+1]; in a
+            measured log it is the torque at t[k]. Logs of commands u have no torques: tau is then (T, 0).
+        u: (T, n) commanded positions of joints with servos [rad; m], u[k] constant from t[k] to t[k+1]; None without
+            servos.
+        name: name, unique among the trajectories that are used together.
+        file: source of the recording; None if it was not read from a file.
+        accepted: codes of checks (see `spelgen.logs.checks`) that are omitted.
+        repairs: messages about rows that the reader changed or removed.
+        remarks: messages about properties of the log.
+        mapping: columns and units of the log.
+
+    Raises LogError for inconsistent shapes, for numbers that are not finite or extremely large, and for times that do
     not increase.
     """
 
@@ -59,7 +63,8 @@ class Trajectory:
     def __post_init__(self) -> None:
         columns = ("t", *self.quantities)
         for column in columns:
-            # This converts lists and tensors to arrays. The frozen dataclass does not allow a normal assignment.
+            # Lists and tensors are converted to arrays. The dataclass is frozen and does not permit a normal
+            # assignment.
             object.__setattr__(self, column, self._as_array(column))
         if self.t.ndim != 1 or not self.t.size:
             raise self.error(f"an array of shape {self.t.shape}", "(T,), a time for each sample", column="t")
@@ -71,13 +76,13 @@ class Trajectory:
                 raise self.error(f"an array of shape {shape}", expected, column=column)
         for column in columns:
             values, largest = self.column(column), TUNING.latest if column == "t" else TUNING.largest_value
-            possible = np.abs(values) < largest  # NaN is not possible: comparisons with NaN are False
+            possible = np.abs(values) < largest  # False for NaN, too: comparisons with NaN are False
             if not possible.all():
                 row = int(np.argwhere(~possible)[0, 0])
                 is_finite = np.isfinite(values[row]).all()
                 expected = f"numbers below {largest:g}" if is_finite else "finite numbers"
                 raise self.error(f"{values[row].tolist()} at sample {row}", expected, column=column)
-        # a time step of nearly zero would give infinite velocities by differentiation
+        # Time steps of nearly zero are rejected: velocities computed by differentiation would be infinite.
         backward = np.flatnonzero(np.diff(self.t) < TUNING.shortest_step)
         if backward.size:
             k = backward[0]
@@ -118,10 +123,7 @@ class Trajectory:
 
     @cached_property
     def regular_steps(self) -> np.ndarray:
-        """Time steps between samples [s], gaps excluded.
-
-        Gaps are excluded because a gap of a minute would bias the mean sample rate.
-        """
+        """Time steps between samples [s] without the gaps, which would bias the mean sample rate."""
         steps = np.diff(self.t)
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 
@@ -175,19 +177,20 @@ def _summary(x: Trajectory) -> tuple[str, ...]:
 
 
 def require_joints(trajectory: Trajectory, joints: Sequence[str]) -> None:
-    """Raise LogError unless the number of joints in the trajectory is the number of these joints."""
+    """Raise LogError if the number of joints in the trajectory differs from the number of names in `joints`."""
     count = trajectory.q.shape[1]
     if count != len(joints):
         raise trajectory.error(f"{count} joints", f"{len(joints)}: {', '.join(joints)}")
 
 
 def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
-    """Return the first row of each gap-free piece of the times t (T,) [s], followed by T.
+    """Return the index of the first sample of each gap-free piece of the times t (T,) [s], followed by T.
 
-    gap, hole: a gap is a time step longer than `gap` median steps and longer than `hole` [s].
+    A gap is a time step longer than `gap` median steps and longer than `hole` [s].
     """
     steps = np.diff(t)
-    # few recordings have gaps: this test avoids the median, which takes most of the time
+    # Few recordings have gaps. This test of the longest and shortest step avoids the median, which takes most of the
+    # time.
     if not steps.size or steps.max() <= gap * steps.min():
         return [0, len(t)]
     return [0, *(np.flatnonzero(steps > max(gap * np.median(steps), hole)) + 1).tolist(), len(t)]
@@ -213,7 +216,7 @@ def joined_column(trajectories: Sequence[Trajectory], name: str) -> np.ndarray:
 
 
 def set_aside(items: Sequence[T], numbers: np.ndarray) -> tuple[list[T], list[T]]:
-    """Return the items whose indices are not in `numbers` (k,), and the items whose indices are, both in order."""
+    """Return two lists: the items whose index is not in `numbers` (k,), and the items whose index is in it."""
     chosen = set(numbers.tolist())
     remaining = [item for k, item in enumerate(items) if k not in chosen]
     return remaining, [item for k, item in enumerate(items) if k in chosen]
@@ -245,24 +248,24 @@ LogRows = tuple[Trajectory, slice]
 
 def steps_between(trajectory: Trajectory, longest: float = 3.4e-3) -> int:
     """Return the number of integration steps per sample interval, so that a step is at most ``longest`` [s]."""
-    # The default is 3.4 ms: with longer steps, fits of position servos had armatures biased by a few per cent.
+    # `longest` is 3.4 ms by default: with longer steps, fits of position servos had armatures biased by a few per cent.
     return max(1, math.ceil(1 / (trajectory.sample_rate * longest) - 1e-6))
 
 
 def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: int) -> np.ndarray:
-    """Return the delayed commands (K, steps, n) [rad, m], averaged over each integration step.
+    """Return the commands (K, steps, n) [rad, m], delayed by `delay` [s] and averaged over each integration step.
 
-    Each of the K intervals between the samples of ``rows`` is divided into ``steps`` equal steps. A command is held
-    until the next one. Means over steps are differentiable with respect to the delay [s], values at single times are
-    not.
+    `rows` selects K + 1 samples. Each of the K intervals between them is divided into `steps` integration steps of
+    equal length. A command is constant until the next command. The averages are differentiable with respect to the
+    delay, unlike the values of a step function at single times.
     """
     samples = trajectory.t[rows]
     earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)
-    # the first row has the command that was held at the earliest delayed time
+    # The first of these rows contains the command that acts at the earliest delayed time.
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
-    previous = np.concatenate([u[:1], u[:-1]])  # the command that acts until each sample
-    # [s] The first command is assumed to have been held for a long time before the recording.
+    previous = np.concatenate([u[:1], u[:-1]])  # command that acts before each sample
+    # [s] Before the recording, the first command is assumed to have been constant for 1,000 s.
     corners = np.concatenate([t[:1] - 1e3, t])
     integral = np.zeros((len(t) + 1, u.shape[1]))
     integral[1:] = np.cumsum(np.diff(corners)[:, None] * previous, axis=0)

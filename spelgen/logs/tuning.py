@@ -7,12 +7,12 @@ from dataclasses import dataclass
 class LogTuning:
     """Constants of the reading and preprocessing of logs."""
 
-    # [B] Largest size of all logs together that a fit keeps in memory: 25 minutes of seven joints at 1 kHz, or 76,000
-    # samples of a torque fit, which is about the number that the last iterations of the fit use. Windows of five
-    # samples take five times this memory.
+    # [B] Memory limit of the log samples that a fit keeps. It suffices for 25 minutes of seven joints at 1 kHz, from
+    # which a torque fit makes 76,000 samples, about the number that its last iterations use. Windows of five samples
+    # take five times this memory.
     kept_bytes: int = 2**28
-    # [1] Largest number of samples of a segment if the logs exceed `kept_bytes`, and only some of their segments are
-    # kept: 16 s at 1 kHz, which is long compared with filter transients.
+    # [1] Largest number of samples of a segment. Logs that exceed `kept_bytes` are divided into segments, of which only
+    # some are kept. 16 s at 1 kHz is long compared with filter transients.
     segment_samples: int = 2**14
     # [B] Largest unpacked size of an NPZ archive: a small archive of zeros may be a thousand times as large unpacked.
     npz_bytes: int = 2**30
@@ -22,8 +22,9 @@ class LogTuning:
     latest: float = 1e24
     # [s] Shortest time between samples, so that the fourth power of a time step does not underflow.
     shortest_step: float = 1e-15
-    # [1] A step of a signal that exceeds this multiple of the typical step is a jump. A 0 between samples whose
-    # magnitudes exceed the same multiple is a missing value: continuous signals approach 0 gradually.
+    # [1] A step of a signal that exceeds this multiple of the typical step is a jump. A value of 0 between samples
+    # whose magnitudes exceed the same multiple of the typical step is a lost sample: continuous signals approach 0
+    # gradually.
     jump: float = 20.0
     # [1] Number of samples on each side of an outlier with which the outlier is compared.
     jump_window: int = 8
@@ -34,7 +35,8 @@ class LogTuning:
     automatic_cutoff: float = 8.0
     # [1] Smallest number of samples per period of the filter's cutoff frequency; Nyquist's bound is two.
     samples_per_period: int = 3
-    # [Hz] Logs of a lower sample rate are interpolated by cubics instead of lines, and their windows are not filtered.
+    # [Hz] Logs below this sample rate are interpolated by cubic instead of linear functions. Windows of logs at this
+    # rate or below are not filtered by default.
     dense_rate: float = 50.0
     # [1] Largest number of columns or times that a message lists.
     listed: int = 5
@@ -44,13 +46,14 @@ class LogTuning:
 class SignalCheckTuning:
     """Thresholds of the checks of logs that several checks use."""
 
-    # [1] Two signals count as proportional from this correlation on. A factor between signals counts as 1 if it
-    # differs from 1 by at most 1 minus this number.
+    # [1] Two signals count as proportional if their correlation is at least this number. A factor between signals
+    # counts as 1 if it differs from 1 by at most 1 minus this number.
     agreement: float = 0.9
     # [1] Number of samples over which the changes of q and of the integral of qd are compared. Between neighbouring
     # samples the quantisation step of q may be larger than the change of q.
     increments: int = 10
-    # [s] Delay of velocities relative to positions from which it is reported; filters of drives have shorter ones.
+    # [s] Shorter delays of velocities relative to positions are not reported, since they are due to the filters of
+    # drives.
     longest_lag: float = 0.03
     # [s] Smallest plausible median time between samples: no arm is sampled above 10 kHz.
     fastest_step: float = 1e-4
@@ -62,20 +65,20 @@ class SignalCheckTuning:
 class SampleTuning:
     """Constants of the filtered samples at a common rate to which dynamics are fitted."""
 
-    # [rad/s, m/s] A joint is at rest below this speed. Samples at which all joints rest are omitted.
+    # [rad/s, m/s] A joint is at rest if its speed is lower. Samples at which all joints are at rest are omitted.
     moving: float = 0.02
 
 
 TUNING, SIGNALS, SAMPLES = LogTuning(), SignalCheckTuning(), SampleTuning()
 
 SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff  # [Hz] lowest sample rate for accelerations
-# [1] A sample rate that is below a bound by up to this factor still satisfies the bound: loggers with a nominal rate of
-# 50 Hz have measured rates of 49.95 Hz or 50.1 Hz.
+# [1] Tolerance of comparisons with a sample rate: loggers with a nominal rate of 50 Hz have measured rates between
+# 49.95 Hz and 50.1 Hz.
 FAST = 1.002
 
 
 def shows_accelerations(rate: float) -> bool:
-    """Return True if accelerations can be computed from logs of this sample rate [Hz]: 24 Hz by default or more."""
+    """Return True if accelerations can be computed from logs of this sample rate [Hz]: it must be at least 24 Hz."""
     return rate * FAST >= SLOWEST
 
 

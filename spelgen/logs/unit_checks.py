@@ -19,8 +19,8 @@ from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SIGNALS, TUNING, shows_accelerations
 from spelgen.settings.log_mapping import SCALES, TIMES
 
-TURNS = 4 * np.pi  # [rad] largest range of a joint with limits: a larger range of q shows another unit
-# units of positions and of velocities that loggers use, per joint type; the SI unit, the default, is first
+TURNS = 4 * np.pi  # [rad] largest range of a joint with limits; if the range of q is larger, q is not in rad
+# Units of positions and of velocities that loggers use, per joint type. The SI unit is first.
 UNITS = {
     "revolute": (("rad", "deg", "turns", "mrad"), ("rad/s", "deg/s", "rpm", "turns/s", "mrad/s")),
     "prismatic": (("m", "mm"), ("m/s", "mm/s")),
@@ -28,9 +28,9 @@ UNITS = {
 
 
 def velocity_products(trajectory: Trajectory) -> np.ndarray:
-    """Return the Gram matrix (2n, 2n) of the increments of 2n signals over ten samples.
+    """Return the Gram matrix (2n, 2n) of 2n signals: n integrals of qd, then n positions q.
 
-    Rows 0 to n-1 are the integrals of qd, rows n to 2n-1 are q.
+    An element is the scalar product of the increments of two signals over ten samples.
     """
     # SciPy is imported here, since the import takes half a second.
     from scipy.integrate import cumulative_trapezoid
@@ -48,11 +48,10 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
 
 
 def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the factors (n,) between dq/dt and qd of each joint, and the correlations (n, n) of all qd and dq/dt.
+    """Return factors (n,) and correlations (n, n) between velocities qd and derivatives of positions dq/dt.
 
-    A factor times qd is dq/dt in the least-squares sense. Correlation (i, j) is between qd of joint i and dq/dt of
-    joint j; it is NaN if one of these joints is at rest. products: (2n, 2n) Gram matrix of the increments of the
-    integrals of qd, then of q.
+    The factor c of a joint is the least-squares solution of dq/dt = c qd. Correlation (i, j) is between qd of joint i
+    and dq/dt of joint j; it is NaN if one of these joints is at rest. products: (2n, 2n), see `velocity_products`.
     """
     n = len(products) // 2
     qd_squares, q_squares = np.split(products.diagonal(), 2)
@@ -62,9 +61,9 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_units(signals: JointSignals) -> str | Advice | None:
-    """Find wrong units of q or qd: a range of q of more than two turns, or dq/dt that is a multiple of qd."""
+    """Return a finding if q or qd has a wrong unit: the range of q exceeds two turns, or dq/dt is a multiple of qd."""
     mapping, joint = signals.trajectory.mapping, signals.joint
-    # dq/dt is wrong because the times are in another unit, which another check reports.
+    # Times with a median step above 0.5 s are in another unit, so dq/dt is wrong. The check of times reports it.
     if signals.step > SIGNALS.slowest_step:
         return None
     is_far = np.ptp(signals.q) > TURNS and signals.kind != "prismatic" and not signals.turns
@@ -80,14 +79,14 @@ def find_units(signals: JointSignals) -> str | Advice | None:
 
 
 def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float, dict[str, Any]]]:
-    """Yield a distance and the settings of the joint, for all combinations of units that its mapping does not state.
+    """Yield (distance, settings of the joint) for all combinations of units of q and qd that the mapping permits.
 
-    The distance is |log r|, where r is the ratio of dq/dt to qd with these units, plus a penalty for units other than
-    SI. is_far: True if the range of q is more than two turns.
+    The distance is |log r|, with r the ratio of dq/dt to qd in these units, plus a penalty for units other than SI.
+    is_far: True if the range of q is more than two turns; combinations with such a range are then omitted.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
-    # the ratio is known only if velocities were logged and are proportional to dq/dt; otherwise only the range of q
-    # shows a unit
+    # The ratio r is known only if velocities were logged and are proportional to dq/dt. If it is unknown, only the
+    # range of q indicates a unit.
     is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
     is_known &= "qd" in mapping.quantities
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
@@ -107,14 +106,17 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
 
 
 def find_time_unit(signals: JointSignals) -> str | Advice | None:
-    """Find times that are not in seconds: the sample rate is below 2 Hz, or dq/dt is a power of 1000 times qd."""
+    """Return a finding if times are not in seconds.
+
+    Either the sample rate is then below 2 Hz, or dq/dt is a power of 1000 times qd.
+    """
     step, is_stated = signals.step, signals.trajectory.mapping.units.t != "s"
     message, unit = f"a sample every {step:.3g} s", time_unit(step)
     if step <= SIGNALS.slowest_step:
         message = f"q that changes {signals.factor:.3g} times as fast as qd"
         unit = next((x for x in TIMES if x != "s" and signals.changes_by(TIMES[x])), None)
     elif signals.number:
-        # The finding is reported for the first joint only, since all joints share the times.
+        # All joints have the same times, so the fault is reported only for joint 0.
         return None
     elif unit is not None:
         message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
@@ -124,7 +126,7 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 
 
 def time_unit(step: float) -> str | None:
-    """Return the unit in which a time step between samples is plausible for a robot's log; None if no unit is."""
+    """Return the unit in which a time step of a robot's log is plausible; None if there is no such unit."""
     # Several units may be plausible, since they differ by factors of 1000, and the plausible steps range over a factor
     # of 5000. The largest plausible unit is returned.
     slowest, fastest = SIGNALS.slowest_step, SIGNALS.fastest_step
@@ -132,9 +134,9 @@ def time_unit(step: float) -> str | None:
 
 
 def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
-    """Find velocities that are not the derivative of the positions, and a sign or other columns that fit better."""
+    """Return a finding if qd is not dq/dt, with advice if another sign or other columns correct it."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
-    # times in a wrong unit also make dq/dt wrong; the check of times reports this cause
+    # Times with a median step above 0.5 s are in another unit, so dq/dt is wrong. The check of times reports it.
     if signals.step > SIGNALS.slowest_step:
         return None
     if np.isnan(correlation):
@@ -149,10 +151,10 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         )
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
-        # The increments are too few for advice: two samples always have a correlation of 1 or -1.
+        # At most ten samples have a single increment, whose correlation is always 1 or -1: too little for advice.
         return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
-        # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
+        # Only the sign of qd is wrong: q is correct, and its derivative can replace qd.
         return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
     trajectory, mapping, k = signals.trajectory, signals.trajectory.mapping, signals.number
     for joint, fit in zip(signals.joints, signals.correlations, strict=True):
@@ -168,9 +170,9 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
 
 
 def _velocity_lag(signals: JointSignals) -> float:
-    """Return the delay [s] of a joint's velocity relative to dq/dt, by least squares; 0 if it is not visible.
+    """Return the least-squares delay [s] of the joint's qd relative to dq/dt; 0 if the log does not determine it.
 
-    The integral of a delayed velocity differs from q by minus the delay times the velocity, and by a slow drift.
+    The difference between q and the integral of a delayed qd is the delay times qd, plus a slow drift.
     """
     from scipy.integrate import cumulative_trapezoid
 
@@ -186,12 +188,12 @@ def _velocity_lag(signals: JointSignals) -> float:
     power = float(speed @ speed)
     lag = float(speed @ difference) / power if power else 0.0
     residual = difference - lag * speed
-    # integrated noise drifts, too: the lag must explain most of the difference
+    # Noise also makes q and the integral of qd differ, so the delay must explain 75 % of the squared difference.
     return lag if residual @ residual < 0.25 * difference @ difference else 0.0
 
 
 def find_copied(signals: JointSignals) -> str | None:
-    """Find torques that are proportional to the torque of another joint without any noise: one column is a copy."""
+    """Return a message if the joint's torque is a copy: proportional to another joint's torque, without noise."""
     trajectory, k = signals.trajectory, signals.number
     if not trajectory.tau.size or np.ptp(trajectory.tau[:, k]) == 0 or len(signals.q) < TUNING.jump_window:
         return None
@@ -199,7 +201,7 @@ def find_copied(signals: JointSignals) -> str | None:
     lengths = np.linalg.norm(centred, axis=0)
     correlations = np.abs(centred[:, k] @ centred) / np.where(lengths > 0, lengths[k] * lengths, np.inf)
     correlations[k] = 0.0
-    # noise of two sensors of 18 bits would lower the correlation by 1e-11
+    # Two sensors are never correlated this closely: even noise of 18-bit sensors lowers the correlation by 1e-11.
     copies = np.flatnonzero(correlations > 1 - 1e-12)
     if not copies.size:
         return None
@@ -208,7 +210,7 @@ def find_copied(signals: JointSignals) -> str | None:
 
 
 def find_held(signals: JointSignals) -> str | None:
-    """Find signals of a moving joint that keep each value for several rows."""
+    """Return a message if a measured signal of the joint keeps each value for several rows."""
     rate = signals.trajectory.sample_rate
     for name in signals.measured:
         often = held_samples(signals.signal(name))
@@ -219,7 +221,10 @@ def find_held(signals: JointSignals) -> str | None:
 
 
 def find_too_rare(signals: JointSignals) -> str | Advice | None:
-    """Find held signals whose values change too rarely to compute accelerations; arms under servos need none."""
+    """Return a finding if a signal keeps each value for so long that accelerations cannot be computed.
+
+    Return None for logs of position commands, whose fits do not need accelerations.
+    """
     rate = signals.trajectory.sample_rate
     if signals.trajectory.u is not None or not shows_accelerations(rate):
         return None
@@ -227,18 +232,18 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
     message = find_held(signals)
     if message is None or shows_accelerations(rate / max(repeated.values())):
         return None
-    # if only velocities are held, they can be computed from the positions instead
+    # If only velocities are repeated in several rows, they can be computed from the positions instead.
     is_mended = all(often == 1 for name, often in repeated.items() if name != "qd")
     return Advice(message, keys={"velocity": "differentiated"}) if is_mended else message
 
 
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
-    """Find velocities without sign: qd is |dq/dt|."""
-    # `share` is a threshold: qd has no sign if its extreme velocity of one sign is below 5 % of its extreme velocity of
-    # the other sign.
+    """Return a message if the velocities of the joint have no sign: qd is |dq/dt|."""
+    # qd has no sign if its largest magnitude in one direction is below 5 % (`share`) of its largest magnitude in the
+    # other direction.
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
     lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
-    # velocities of both signs are not magnitudes, and differentiated ones cannot lack their sign
+    # Velocities in both directions have a sign, and so do velocities computed from positions.
     if trajectory.mapping.velocity == "differentiated" or lowest > share * highest or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)

@@ -22,11 +22,11 @@ Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 
 
 def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows: Rows) -> np.ndarray:
-    """Return the columns of a layout as numbers (T, C) in SI units.
+    """Return the C columns of a layout as numbers (T, C) in SI units.
 
-    Rows of another topic or publisher (see `foreign_rows`) and rows of a log whose signals are in separate rows (see
-    `is_split`) contain NaN. Raises LogError, with row and column, for
-    values that are not numbers, and for values beyond the range of any arm.
+    Absent values are NaN in rows of another topic or publisher (see `foreign_rows`), and in logs whose signals are in
+    separate rows (see `is_split`). Raises LogError, with row and column, for values that are absent elsewhere, that are
+    not numbers, or that are beyond the range of any arm.
 
     Args:
         table: the logged columns.
@@ -47,12 +47,12 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         logged.append(signed(values, sign_bit) if sign_bit else values)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
     offsets = np.array([0.0, *starmap(mapping.offset, signals)])
-    # warnings of NumPy are suppressed, since values that overflow are reported below with their rows
+    # NumPy's warnings are suppressed: values that overflow are reported below, with their rows.
     with np.errstate(over="ignore", invalid="ignore"):
         data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
     largest = np.array([TUNING.latest, *[TUNING.largest_value] * len(signals)])
     foreign = foreign_rows(data, len(layout.joints))
-    bad = ~(np.abs(data) < largest)  # NaN is bad, too: a comparison with NaN is False
+    bad = ~(np.abs(data) < largest)  # True for NaN, too: comparisons with NaN are False
     if is_split(data):
         bad[:, 1:] &= ~np.isnan(data[:, 1:])
     elif not foreign.all():
@@ -70,39 +70,39 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 
 
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
-    """Return a mask (T,) of the rows that another topic or publisher logged: all values except positions are missing.
+    """Return a mask (T,) of the rows of another topic or publisher: they contain positions only, or no values at all.
 
-    data: (T, 1 + C), times and values. joints: number of joints, whose positions are the first values.
+    data: (T, 1 + C), times and C values. joints: number of joints, whose positions are the first values.
     """
     empty = np.isnan(data[:, 1 + joints :])
     return np.asarray(empty.all(axis=1))
 
 
 def is_split(data: np.ndarray) -> bool:
-    """Return True if signals of a log (T, 1 + C) are in separate rows: at most half of the rows have the rarest signal.
+    """Return True if at least one of the C signals of a log (T, 1 + C) has values in at most half of the rows.
 
-    Topics of different rates, or joints in different messages, have such rows.
+    Signals are in separate rows if topics have different rates, or if joints are in different messages.
     """
     rarest = int(np.isfinite(data[:, 1:]).sum(axis=0).min(initial=len(data)))
     return TUNING.jump_window <= rarest <= len(data) / 2
 
 
 def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
-    """Return the logged time that becomes 0: the first time if the times are dates; None for relative times."""
+    """Return the first logged time if the times are dates, to be subtracted from them; None for relative times."""
     first_row = table.slice(0, 1)
     times, _ = _clock(first_row, layout)
     is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
     if not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
         return None
-    # Dates are times since 1970, which as floating-point numbers have too few digits. Times of a clock that starts with
-    # the recording are below 1e8 in any unit.
+    # Times since 1970 have too few digits as floating-point numbers. A clock that starts with the recording has a first
+    # time below 1e8 in any unit.
     first = times[0].as_py()
     is_date = first is not None and (is_stamp or 1e8 < abs(first) < np.inf)
     return times[0] if is_date else None
 
 
 def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
-    """Return the column of times as numbers, and the unit of these numbers in seconds.
+    """Return the column of times as numbers, and the factor that converts these numbers to seconds.
 
     Raises LogError for dates beyond the range of Arrow.
     """
@@ -131,7 +131,7 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
 def _nanoseconds(texts: Column) -> pa.Array | None:
     """Return times [ns] from texts of a clock ("10:00:00.123", also with a date) or with a unit ("10 ms").
 
-    Times of day that start again at midnight continue. Returns None for other texts.
+    Times of day continue to increase after midnight. Returns None for other texts.
     """
     texts = pa.compute.utf8_trim_whitespace(pa.compute.replace_substring(texts.cast(pa.string()), "µ", "u"))
     first = next((x for x in texts.slice(0, 1).to_pylist() if x), "")
@@ -175,7 +175,7 @@ def _column(table: pa.Table, name: str) -> Column:
     if is_text:
         bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[(]\s*|\s*[\])].*$", "")
         lists = pa.compute.split_pattern_regex(bare, r"[,;\s]+")
-    # an element beyond the end of a list becomes a missing number, where Arrow would raise an error
+    # Arrow would raise an error for lists that are too short, so they are replaced by null.
     long_enough = pa.compute.greater(pa.compute.list_value_length(lists), index)
     lists = pa.compute.if_else(long_enough, lists, pa.scalar(None, lists.type))
     elements = pa.compute.list_element(lists, index)
@@ -189,11 +189,11 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
     number.
     """
     try:
-        # an unsafe cast rounds integers beyond 2^53, such as times in nanoseconds; a safe one would raise an error
+        # Integers beyond 2^53, such as times in nanoseconds, are rounded: a safe cast would raise an error for them.
         floats = values.cast(pa.float64(), safe=not pa.types.is_integer(values.type))
         return np.asarray(floats.to_numpy(zero_copy_only=False))
     except (pa.ArrowException, ValueError) as error:
-        # the error of Arrow does not contain the row of the value, which is therefore searched
+        # Arrow's error does not state the row of the value, so the row is searched.
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
         for index, text in enumerate(texts):
             if text and not is_number(text):

@@ -22,11 +22,13 @@ LAST_PART = " (last part)"
 class Windows:
     """W windows of K consecutive samples of n joints.
 
-    dt: (W, K-1) time steps between the samples [s], which need not be equal.
-    q, qd: (W, K, n) measured positions and velocities [rad, rad/s; m, m/s].
-    tau: (W, K-1, n) input, constant over each step: torques [Nm, N].
-    z: (W, n, B) [rad, m] states of the B friction bristles per joint at the first sample, computed from the history of
-        motion; None if not computed.
+    Attributes:
+        dt: (W, K-1) time steps between the samples [s], which need not be equal.
+        q: (W, K, n) measured positions [rad, m].
+        qd: (W, K, n) measured velocities [rad/s, m/s].
+        tau: (W, K-1, n) torques [Nm, N], the input, constant over each step.
+        z: (W, n, B) [rad, m] states of the B friction bristles per joint at the first sample of a window, computed from
+            the motion before it; None if not computed.
     """
 
     dt: torch.Tensor
@@ -75,16 +77,18 @@ def cut_windows(
     measured: bool,
     reach: BristleReach | None = None,
 ) -> Windows:
-    """Return the windows of gap-free pieces. The input of a step is the time average of the torque over the step.
+    """Return the windows of `window` samples, cut from gap-free pieces.
+
+    The input of a step, from one sample of a window to the next, is the time average of the torque over the step.
 
     Args:
         pieces: trajectories without gaps.
         window: number of samples of a window.
         stride: number of samples of a piece from the start of a window to the start of the next window.
         decimation: number of samples of a piece from one sample of a window to the next.
-        measured: False: tau[k] is constant from t[k] to t[k+1], as in a simulation with zero-order hold. True: tau[k]
-            was measured at t[k], and the torque between two samples is the mean of both; without this mean
-            torques would be delayed by half a sample.
+        measured: if True, tau[k] was measured at t[k], and the torque between two samples is the mean of both;
+            otherwise torques would be delayed by half a sample. If False, tau[k] is constant from t[k] to t[k+1], as in
+            a simulation with zero-order hold.
         reach: (n, B) break-away displacements of the bristles whose states z are computed, starting from zero at the
             start of each piece; None: z is not computed.
 
@@ -98,9 +102,10 @@ def cut_windows(
             tau = piece.tau[:-1]
             if measured:
                 tau = (tau + piece.tau[1:]) / 2
-            # torques are weighted by their time steps, which differ if the clock has jitter
+            # The torques of a step are weighted by their time steps, which differ if the clock has jitter.
             impulses = tau * np.diff(piece.t)[:, None]
-            impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)  # (T - decimation, n)
+            # [Nm s, N s], (T - decimation, n)
+            impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)
             dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
             columns = [(dt, window - 1), (piece.q, window), (piece.qd, window), (impulse / dt, window - 1)]
             steps, *motion = (_slide(values, size, stride, decimation) for values, size in columns)
@@ -125,7 +130,7 @@ def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> tor
 
 
 class Split(NamedTuple):
-    """Trajectories for training and for validation, without common samples, and a note that names the latter."""
+    """Trajectories for training, others for validation, and a note that names the validation trajectories."""
 
     training: tuple[Trajectory, ...]
     validation: tuple[Trajectory, ...]
@@ -133,9 +138,10 @@ class Split(NamedTuple):
 
 
 def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: int) -> Split:
-    """Split trajectories into training and validation: a random `fraction` of them, at least one, is for validation.
+    """Return the split of trajectories: a random `fraction` of them is for validation, the others are for training.
 
-    A single trajectory is cut in time; its last part, a `fraction` of its duration, is used for validation.
+    At least one trajectory is for validation, and at least one for training. A single trajectory is cut in time: its
+    last part, a `fraction` of its duration, is for validation.
     """
     total = len(trajectories)
     if total == 1:
@@ -149,7 +155,7 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
         note = Diagnostic("info", "validation-split", "logs", None, message)
         last = replace(trajectory[cut:], name=trajectory.name + LAST_PART)
         return Split((trajectory[:cut],), (last,), note)
-    # whole trajectories are set aside, since neighbouring windows of a trajectory have common samples
+    # Validation uses whole trajectories, since neighbouring windows of one trajectory have common samples.
     count = min(max(1, round(fraction * total)), total - 1)
     training, validation = set_aside(trajectories, np.random.default_rng(seed).permutation(total)[:count])
     names = ", ".join(x.name for x in validation) if count <= 3 else f"{count} of {total} trajectories"

@@ -40,12 +40,12 @@ def inspection_page(
 
     Args:
         inspection: The derived structure.
-        closed: Closed-form formulas of the entries of M and V.
-        proof: Verification of the structure.
-        urdf: URDF of the arm, for a picture of it.
+        closed: Closed-form formulas of the entries of M and V; None: the page has no formulas.
+        proof: Verification of the structure; None: the structure was not verified.
+        urdf: URDF of the arm, from which the picture of the arm is drawn; None: the page has no picture.
     """
     text = None
-    if closed:  # SymPy is slow to import and needed for formulas only
+    if closed:  # SymPy is slow to import, so it is imported only if the page has formulas.
         from spelgen.certificate.formula_files import text as written
 
         text = written(closed, width=100)
@@ -63,7 +63,7 @@ def inspection_page(
 def identification_page(identification: Identification, arm: Arm) -> str:
     """Return the page about an identification: base parameters with intervals, the arm, and the torque residual."""
     record: Content = identification.to_dict()
-    # The page is made from the content of the JSON output, so that both agree.
+    # The page is made from the content of the JSON output, so that page and JSON agree.
     words = [parameter["determined"] for parameter in record["base_parameters"]]
     never = [name for name, visibility in record["identifiability"].items() if visibility == "never"]
     return render_page(
@@ -85,8 +85,8 @@ def identification_page(identification: Identification, arm: Arm) -> str:
 def motion_page(excitation: Excitation, arm: Arm) -> str:
     """Return the page about a proposed motion of `arm`, including the approach to its first position."""
     motion = excitation.approach.then(excitation.motion)
-    # The motion has up to twice the points of a chart's line, because the animation uses the same arrays.
-    step = -(-len(motion.t) // (2 * TUNING.points))  # rounded up
+    # Charts subsample their lines, but the animation shows every point. Therefore the motion is subsampled here.
+    step = -(-len(motion.t) // (2 * TUNING.points))  # The quotient is rounded up.
     t, q, qd = (x[::step] for x in (motion.t, motion.q, motion.qd))
     drawn = AnimatedMotion("motion", "approach and motion", t.round(3), q.round(4))
     rows = [
@@ -117,16 +117,18 @@ def logs_page(report: LogReport, arm: Chain, inputs: np.ndarray) -> str:
 
 
 def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
-    """Return the charts of each joint: position; velocity with dq/dt; torque with the gravity torque of the URDF.
+    """Return the charts of each joint: position, velocity and torque.
 
-    For position servos there is one chart: position with command. inputs: input matrix G (n, n), see `logs_page`.
+    The chart of the velocity also shows dq/dt, and the chart of the torque also shows the gravity torque of the URDF.
+    A log of position servos has only the chart of the position, which also shows the command. inputs: input matrix G
+    (n, n): joint torques = G times logged torques.
     """
     # The log is split at gaps first, so that dq/dt contains no difference across a gap.
     segments = [segment[:: -(-len(log.t) // TUNING.points)] for segment in split_at_gaps(log)]
     t, q = joined_column(segments, "t"), joined_column(segments, "q")
     position = [("logged", q, "truth")]
     rows = [JointRow("position", "position", "position", position)]
-    # Logs of position servos contain commands and no torques.
+    # Logs of position servos contain commands and no torques, so charts of velocity and torque are omitted.
     if log.u is not None:
         position.append(("commanded", joined_column(segments, "u"), "predicted"))
     else:
@@ -136,7 +138,7 @@ def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
         if any(body.inertia for body in arm.bodies):
             # Only the gravity torque is shown: with the other terms a wrong sign or unit of the torque is hard to see.
             still = np.zeros_like(q)
-            gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
+            gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n) [Nm, N]
             torque.append(("gravity of the URDF", gravity, "predicted"))
         rows.append(JointRow("velocity", "velocity", "velocity", velocity))
         rows.append(JointRow("torque", "torque", "torque", torque))
@@ -144,7 +146,7 @@ def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
 
 
 def _derivative(segment: Trajectory) -> np.ndarray:
-    """Return dq/dt, (T, n) [rad/s, m/s], by differences of the subsampled positions; NaN for a single sample."""
+    """Return dq/dt, (T, n) [rad/s, m/s], by central differences of the positions; NaN for a segment of one sample."""
     if len(segment.t) < 2:
         return np.full_like(segment.q, np.nan)
     derivative: np.ndarray = np.gradient(segment.q, segment.t, axis=0)

@@ -26,7 +26,11 @@ from spelgen.templates import json_data
 class Cell:
     """Cell of the table of M, for one entry of M.
 
-    style: zero, constant or varying. joints: indices of the joints on whose positions the entry depends.
+    Attributes:
+        style: "zero", "constant" or "varying".
+        text: "0" for a zero entry, "C" for a constant entry, otherwise the joints on which the entry depends.
+        joints: Indices of the joints on whose positions the entry depends.
+        explanation: Reason for the structure of the entry, and its formula.
     """
 
     style: str
@@ -37,10 +41,15 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class AnimatedMotion:
-    """A motion of the animated picture: positions q and predicted, (T, n) [rad, m], at times t (T,) [s].
+    """A motion of the animated picture.
 
-    error: (T, n) errors that colour the links, from 0 to 1 for the whole colour scale. name: identifier that charts of
-    this motion refer to. label: text in the list of motions.
+    Attributes:
+        name: Identifier by which charts refer to this motion.
+        label: Text in the list of motions.
+        t: Times, (T,) [s].
+        q: Joint positions, (T, n) [rad, m].
+        error: Colour values of the links, (T, n), see `_colour`; None: the links have no error colours.
+        predicted: Predicted joint positions, (T, n) [rad, m], drawn as a second arm; None: no second arm.
     """
 
     name: str
@@ -65,7 +74,7 @@ class AnimatedArm:
 
 
 def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
-    """Return all entries of M, (n, n) cells: each with the joints it depends on, the reason and a short formula."""
+    """Return the table of M: n rows of n cells, one cell per entry of M."""
     explanations = _explanations(arm, structure)
     cells = {}
     for entry in structure.entries:
@@ -77,8 +86,11 @@ def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
 
 
 def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
-    """Return name of an entry of M -> text: the joints it depends on, the facts that mention it, and its formula."""
-    # `spelgen inspect` prints the same facts, so that pages and the terminal explain an entry equally.
+    """Return {name of an entry of M: explanation}.
+
+    The explanation states the joints that the entry depends on, the facts that mention the entry, and its formula.
+    """
+    # `spelgen inspect` prints the same facts, so that pages and the terminal give the same explanation of an entry.
     every_fact = facts(arm, structure)
     closed = {formula.name: formula for formula in formulas(arm, structure).rows}
     explanations = {}
@@ -88,7 +100,7 @@ def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
         default = f"depends on {joints_in_ranges(entry.joints)} only"
         lines = [f"{name} {predicates.get(entry.kind, default)}."]
         for fact in every_fact:
-            # The fact that M does not depend on some joints applies to every varying entry.
+            # The fact "M does not depend on ..." mentions no entry by name, but applies to every varying entry.
             of_all = entry.kind == "varying" and fact.statement.startswith("M does not depend")
             if of_all or name in re.findall(r"M\d+(?:,\d+)?", fact.statement):
                 lines.append(str(fact))
@@ -104,7 +116,10 @@ def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
 
 
 def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) -> AnimatedArm:
-    """Return the animated arm with its motions; if there are none, with a motion through the joint ranges."""
+    """Return the animated picture of an arm with the given motions.
+
+    Without motions the arm moves through its joint ranges.
+    """
     shapes = scene(urdf, arm.joint_names)
     motions = motions or [_sweep(arm)]
     data = record(shapes) | {"motions": list(map(record, motions))}
@@ -112,7 +127,10 @@ def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) 
 
 
 def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
-    """Return predicted motions, whose colour is the position error, then test motions, coloured by torque residual."""
+    """Return the animated motions of an evaluation: predicted motions, then the motions with a torque residual.
+
+    The colour of a link shows the position error of a predicted motion, or the torque residual.
+    """
     motions = []
     for example in traces.trajectories:
         extent = np.ptp(example.q, axis=0)
@@ -129,18 +147,19 @@ def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
 
 
 def _colour(error: np.ndarray) -> np.ndarray:
-    """Return relative errors (T, n) on the colour scale [0, 1], whose last colour represents an error of 0.5."""
+    """Return colour values (T, n) for relative errors (T, n): 0 for no error, 1 for an error of 0.5 or -0.5."""
     return np.asarray((np.abs(error) / 0.5).round(3))
 
 
 def _sweep(arm: Chain) -> AnimatedMotion:
-    """Return sines of all joints about the middle of their ranges, with three different periods."""
+    """Return a motion of 12 s in which each joint moves sinusoidally about the middle of its range."""
     t = np.linspace(0, 12, 121)
     low, high = np.array(list(map(working_range, arm.coordinates))).T
     # Amplitudes are at most 1.2 rad and 0.3 m: some URDFs have limits of 100 revolutions, too fast for a picture.
     largest = [0.3 if coordinate.joint_type == "prismatic" else 1.2 for coordinate in arm.coordinates]
     joint = np.arange(len(low))
-    # Periods of 12, 6 and 4 s make the motions of neighbouring joints distinguishable; the sum repeats after 12 s.
+    # Neighbouring joints have different periods (12, 6 or 4 s), so that their motions can be distinguished. The motion
+    # of the arm repeats after 12 s.
     phase = 2 * np.pi / 12 * t[:, None] * (1 + joint % 3) + joint
     q = (low + high) / 2 + np.minimum(0.4 * (high - low), largest) * np.sin(phase)
     return AnimatedMotion("sweep", "a motion through the joints' ranges", t.round(3), q.round(4))

@@ -17,7 +17,7 @@ Values = Sequence[float] | np.ndarray
 
 @dataclass(frozen=True)
 class Margins:
-    """Margins around the plot area [pixels]. bare: bottom margin of a chart whose x axis has no numbers."""
+    """Margins around the plot area [pixels]. `bare` replaces `bottom` if the x axis has no numbers and no label."""
 
     left: int = 52
     right: int = 14
@@ -35,17 +35,18 @@ class RenderTuning:
 
     # [1] Largest number of points of a line: on 400 pixels more points are not visible, and the page becomes larger.
     points: int = 300
-    # [1] Largest number of decades of a logarithmic axis, counted from its largest value.
+    # [1] Largest number of decades of a logarithmic axis. Values that are smaller by more decades are cut off.
     decades: float = 8.0
-    # [1] Errors of baselines above this multiple of the model's error are cut off, so that other lines remain
-    # distinguishable.
+    # [1] Errors of baselines above this multiple of the model's largest error do not extend the axis of the prediction
+    # errors: otherwise one diverged baseline would compress all other lines.
     outlier: float = 100.0
-    # [1] If the RMS error exceeds this multiple of the median, a few predictions dominate the RMS; a normal
-    # distribution has a ratio of 1.5.
+    # [1] If the RMS prediction error exceeds this multiple of the median error, the report states that a few
+    # predictions dominate the RMS. A normal distribution has a ratio of 1.5.
     dominated: float = 2.0
-    # [1] Quantile of the measured friction that limits the axis, so that outliers are cut off.
+    # [1] The axis of the friction chart ends at this quantile of the measured friction, so that outliers do not
+    # extend it.
     bulk: float = 0.995
-    # [1] An entry of M below this fraction of the largest entry is treated as a rounding error of zero.
+    # [1] An entry of M below this fraction of the largest entry is treated as zero: it is a rounding error.
     zero: float = 1e-9
     # [1] Largest number of faces of all links together, for pages below 1 MB.
     faces: int = 4000
@@ -108,7 +109,7 @@ class Line:
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
         """Return the SVG path of the segments between gaps; coordinates are rounded to tenths of a pixel."""
         x, y = _floats(self.x), _floats(self.y)
-        # Evenly spaced samples include the last one, so that the line ends at the last value.
+        # The samples are evenly spaced and include the last sample, so that the line ends at the last value.
         rows = np.linspace(0, len(x) - 1, min(len(x), TUNING.points)).round().astype(int)
         x, y = x[rows], y[rows]
         gaps = ~(np.isfinite(x) & np.isfinite(y))
@@ -132,7 +133,10 @@ class Dots(Line):
     shape = "dots"
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return an SVG path with a line of length zero per point within both axes: its round caps are a dot."""
+        """Return the SVG path of the points within both axes.
+
+        Each point is a line of length zero, whose round caps are visible as a dot.
+        """
         x, y = _floats(self.x), _floats(self.y)
         inside = x_axis.contains(x) & y_axis.contains(y)
         dots = np.stack([x_axis.pixels(x[inside]), y_axis.pixels(y[inside])], axis=1)
@@ -156,8 +160,8 @@ class Band:
         return np.concatenate([_floats(self.low), _floats(self.high)])
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the SVG path of the outline, clipped to the axis; NaN is drawn as infinity."""
-        # A diverged prediction may have an infinite upper quantile and a finite lower quantile.
+        """Return the SVG path of the outline, clipped to both axes. Values that are NaN are drawn at the top."""
+        # Quantiles of diverged predictions are NaN or infinite: the band of such times extends to the top of the chart.
         low, high = (np.nan_to_num(_floats(y), nan=np.inf) for y in (self.low, self.high))
         # The outline follows the lower curve, then the upper curve backwards.
         x = x_axis.pixels(_floats(self.x))
@@ -276,15 +280,15 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
     room = pad * (high - low)
     # A nearly constant curve gets a wider axis; otherwise its rounding errors of about 1e-16 would fill the chart.
     if high - low <= 1e-9 * max(abs(low), abs(high)):
-        room = 0.5 * abs(high) or 1.0  # a constant line lies in the middle
+        room = 0.5 * abs(high) or 1.0  # With equal margins above and below, the line lies in the middle.
     return Axis(low - room, high + room, start, end)
 
 
 def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Return ticks (K,) and labels of a logarithmic axis at powers of ten.
+    """Return ticks (K,) and labels of a logarithmic axis: powers of ten, if at least three are on the axis.
 
-    If there are fewer than three, 2 and 5 times powers of ten are added; if there are still fewer than three, the ticks
-    are chosen as on a linear axis (`_steps`).
+    Otherwise the ticks are 1, 2 and 5 times powers of ten. If fewer than three of these values are on the axis, the
+    ticks are equidistant, as on a linear axis (`_steps`).
     """
     # The tolerance includes a power of ten at the end of the axis despite rounding.
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)

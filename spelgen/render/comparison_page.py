@@ -27,7 +27,7 @@ STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 class SimulatedCurves:
     """Charts of a simulated arm: validation losses, predictions, and entries of M.
 
-    They show only the first run of each preset, as lines of several seeds would overlap.
+    The charts show only the first run of each preset, as lines of several seeds would overlap.
     """
 
     losses: Chart
@@ -73,7 +73,8 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
     if examples:
         prediction = trajectory_panels(examples, styles, named_joints(arm.joint_names, arm.joint_types))
         learned = {name: figures.mass for name, figures in first.items() if figures.mass is not None}
-        # All presets have the same test logs, so the examples have the same measured motion: any of them will do.
+        # All presets are evaluated on the same test logs, so the measured motion of the first example is the motion of
+        # every example.
         along = next(iter(examples.values()))
         true = true_mass(truth, torch.from_numpy(along.q), arm.joint_names).numpy()
         # Only the lower triangle is shown, since M is symmetric.
@@ -86,12 +87,12 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
 def _losses(folders: Mapping[str, Path], styles: Mapping[str, str]) -> Chart:
     """Return the chart of the best validation loss of each preset over the training steps.
 
-    folders: preset -> run folder. styles: preset -> CSS class.
+    folders: {preset: run folder}. styles: {preset: CSS class}.
     """
     lines = []
     for name, style in styles.items():
         records = RunFolder(folders[name]).read_metrics()
-        # A preset whose run failed has no metrics.
+        # A preset whose run failed has no metrics, and so no line in the chart.
         if records:
             steps, losses = array([(record["step"], record["best"]) for record in records]).T
             lines.append(Line(name, steps, losses, style))

@@ -33,7 +33,7 @@ def mass_chart(result: LogEstimate) -> Chart | None:
         return None
     low, high = np.array([state.payload.mass_interval for state in result.states]).T
     t = _times(result)
-    # The estimate is constant between changes: the band needs only two points at each change of the payload.
+    # The estimated mass is piecewise constant, so the band has points only before and after each change.
     corners = np.flatnonzero(np.diff(mass, prepend=np.nan) != 0)
     rows = np.unique(np.concatenate([corners, np.maximum(corners - 1, 0), [len(t) - 1]]))
     marks: list[Mark] = [
@@ -44,7 +44,10 @@ def mass_chart(result: LogEstimate) -> Chart | None:
 
 
 def joint_panels(fit: Fit, result: LogEstimate) -> list[Panel]:
-    """Return two charts per joint: external torque with its thresholds, and friction relative to the model."""
+    """Return two charts per joint: external torque with the thresholds of contact, and friction drift [%].
+
+    The friction drift is the relative difference between the estimated friction and the friction of the model.
+    """
     contacts = [state.contact for state in result.states]
     threshold = np.array([contact.threshold for contact in contacts])
     torque = [

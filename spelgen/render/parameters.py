@@ -45,10 +45,10 @@ def parameter_tables(
     """Return the tables of a run's parameters.
 
     Args:
-        model: the trained model.
-        arm: arm of the URDF; None if the URDF is unknown.
-        identified: result of least squares on the same logs.
-        posterior: posterior of the model, with 95 % intervals; None for a model without a posterior.
+        model: The trained model; None if the run has no weights.
+        arm: The arm with the parameters of the URDF; None if the URDF is unknown.
+        identified: Result of linear least squares on the same logs, as JSON content.
+        posterior: Posterior of the model, from which the 95 % intervals are computed; None: no intervals.
     """
     tables: list[Listing] = []
     if arm is not None and identified and "base_parameters" in identified:
@@ -73,7 +73,11 @@ def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
 def base_table(
     model: ArmModel | None, arm: Arm, identified: Content, posterior: Posterior | None = None
 ) -> ParameterTable:
-    """Return the table of base parameters: from the URDF, and with intervals from least squares and the model."""
+    """Return the table of base parameters.
+
+    Its columns are the values of the URDF, of the model and of linear least squares. The values of least squares have
+    95 % intervals; the values of the model have 95 % intervals if there is a posterior.
+    """
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
     # The base parameters are derived again here, because they depend on the URDF and friction model only, not on logs.
@@ -81,14 +85,15 @@ def base_table(
     parameters = identified["base_parameters"]
     names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
     nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
-    # A URDF has no parameters of this friction model and of drives, and may have no inertials: their cells are empty.
+    # A cell is empty if the URDF has no value: it has none for friction and drives, and may have no inertials.
     nominal[base.bodies :] = np.nan
     if not arm.chain.inertials_complete:
         nominal[:] = np.nan
     columns = {"parameter": names, "URDF": list(map(_number, nominal))}
     note = "Intervals are of 95 % [kg, m, s]"
     if posterior is not None:
-        # Only base parameters of bodies and armatures are compared, as the friction models differ.
+        # The posterior has only base parameters of bodies and armatures, because the friction model of the fit differs
+        # from the friction model of least squares. The other cells of this column are empty.
         estimates = {x.name: x for x in posterior.base_parameters}
         columns["model, 95 %"] = [estimates[name].text if name in estimates else "" for name in names]
         pairs = zip(names, determined, strict=True)
@@ -98,8 +103,8 @@ def base_table(
             "squares has no column for"
         )
     elif isinstance(model, RigidBodyDynamics):
-        # For every friction model the first columns of the regressor belong to inertial parameters and armatures,
-        # which the trained model has, too.
+        # The regressor of least squares starts with the columns of the inertial parameters and armatures, which are
+        # also parameters of the trained model. The columns of friction have no counterpart in the model.
         common = np.concatenate([body_parameters(model).ravel(), model.armature.detach().numpy()])
         learned = base.combination[:, : len(common)] @ common
         for k in range(base.bodies, len(names)):
@@ -124,7 +129,7 @@ def _number(value: float) -> str:
 
 
 def _interval(parameter: Content) -> str:
-    """Return the value of a base parameter with its confidence interval, if it has one."""
+    """Return the value of a base parameter as text, with its confidence interval if it has one."""
     if parameter["deviation"] is None:
         return _number(parameter["value"])
     return Interval("", parameter["value"], parameter["deviation"]).text
@@ -159,7 +164,7 @@ def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None
 
 def _about_center(body: np.ndarray) -> tuple[str, str, str]:
     """Return mass, centre of mass and principal moments about the centre as text. body: inertial parameters (10,)."""
-    # A body in a URDF may have no mass, and then has no centre of mass.
+    # A body in a URDF may have no mass. The cells of its centre of mass and principal moments are then empty.
     if body[0] <= 0:
         return f"{body[0]:.4g}", "", ""
     mass, center, tensor = about_center(body)
@@ -171,15 +176,18 @@ def _listed(values: np.ndarray) -> str:
 
 
 def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) -> Listing:
-    """Return the table of armature, friction and torque offset of each joint of a model, with 95 % intervals."""
+    """Return the table of armature, friction and torque offset of each joint of a model.
+
+    The values have 95 % intervals if there is a posterior.
+    """
     units = [UNITS[joint_type] for joint_type in model.joint_types]
     torques = [unit.torque for unit in units]
     dampings = [f"{unit.torque} s/{unit.position}" for unit in units]
     columns = {"joint": list(model.joint_names)}
     note = "Viscous and Coulomb friction are fitted to the model's friction law."
     if posterior is not None:
-        # The posterior has friction parameters with intervals. Without a posterior, the friction of the model is
-        # approximated by viscous and Coulomb friction, without intervals.
+        # The posterior contains friction parameters and their intervals. Without a posterior, `nearest_friction` fits
+        # viscous and Coulomb friction to the friction torque of the model.
         columns |= posterior.drive_columns
         note += " Intervals are of 95 %."
     else:
@@ -189,7 +197,8 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
         joints = arm.chain.coordinates
         if posterior is None:
             friction = nearest_friction(arm.chain, model, sampled_positions(arm.chain))
-            # The damping gain of a position servo includes the viscous friction of the joint.
+            # A model of position servos has no column of viscous friction, because the damping gain of the servo
+            # includes it.
             if not parameters_of_kind(model, "damping"):
                 columns["viscous"] = _with_units(friction.viscous, dampings)
             columns["coulomb"] = _with_units(friction.coulomb, torques)
@@ -205,10 +214,10 @@ def _with_units(values: Sequence[float] | np.ndarray, units: Sequence[str]) -> l
 def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]) -> Listing:
     """Return the table of the learned constants of M, with the entries of M that contain each constant."""
     count = len(mass.raw_constants)
-    # M is a linear combination of learned functions of q and of learned constants, so dM / d constant,
-    # (constants, n, n), does not depend on q.
+    # M is linear in the learned functions of q and in the learned constants. Therefore the derivative of M with respect
+    # to a constant does not depend on q. `bases` contains the derivatives, (constants, n, n).
     functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
-    # M for a unit vector of constants is the basis matrix of that constant.
+    # The derivative is M itself if this constant is 1, and all other constants and all functions are 0.
     zeros = torch.zeros(functions, count, dtype=torch.float64)
     units = torch.eye(count, dtype=torch.float64)
     rows = []

@@ -43,7 +43,7 @@ MEASURES: tuple[tuple[str, str, Callable[[Growth], Mapping[str, Quantiles]]], ..
 
 @dataclass(frozen=True)
 class Panel:
-    """A group of charts with a title: of one joint, of one entry of M or of one error."""
+    """A group of charts with a common title, for example the charts of one joint."""
 
     name: str
     charts: tuple[Chart, ...]
@@ -53,9 +53,12 @@ class Panel:
 class JointRow:
     """A row of charts, one per joint.
 
-    axis: label of the y axis. quantity: position, velocity or torque, for the unit of the y axis; "": no unit. columns:
-    label, values (T, n) and CSS class of each curve; the chart of joint k shows column k of the values. height: height
-    of a chart [pixels], without the numbers of the time axis.
+    Attributes:
+        title: Title of the charts, without the name of the joint.
+        axis: Label of the y axis.
+        quantity: "position", "velocity" or "torque", which determines the unit of the y axis; "": no unit is shown.
+        columns: Label, values (T, n) and CSS class of each curve. The chart of joint k shows column k of the values.
+        height: Height of a chart without the numbers of its time axis [pixels].
     """
 
     title: str
@@ -98,8 +101,8 @@ def growth_panels(
     """Return the charts of relative error and tip error over the prediction horizon.
 
     Args:
-        growths: Name of a line -> errors of an evaluation, and the predictor whose errors the line shows.
-        styles: Name of a line -> CSS class.
+        growths: {name of a line: (errors of all predictors of an evaluation, name of the predictor to show)}.
+        styles: {name of a line: CSS class}.
         banded: Names of the lines with a band from the 10 % to the 90 % quantile.
     """
     panels = []
@@ -124,7 +127,11 @@ def growth_panels(
 
 
 def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None:
-    """Return the range of all medians and the model's band, without outlying baselines; None if there is no model."""
+    """Return the limits of the error axis; None if `errors` has no entry of the model, or no positive error.
+
+    The limits include the medians of all predictors and the quantiles of the model. Errors of diverged baselines are
+    excluded.
+    """
     # A page of several runs has one line per run and no baselines, so its axis is not limited.
     if MODEL not in errors:
         return None
@@ -146,13 +153,13 @@ def trajectory_panels(
     """Return the charts of each joint: position and position error and, if logged, velocity and velocity error.
 
     Args:
-        predictions: Name of a line -> prediction; all predictions are of the same motion.
-        styles: Name of a line -> CSS class.
+        predictions: {name of a line: prediction}; all predictions are of the same motion.
+        styles: {name of a line: CSS class}.
         joints: Names and units of the joints.
         motion: Name of the animated motion with the same time axis.
     """
     measured = next(iter(predictions.values()))
-    # A replayed log of position servos has no velocities.
+    # A replayed log of position servos has no velocities, so its charts of velocity are omitted.
     positions = {name: x.predicted_q for name, x in predictions.items()}
     velocities = {name: x.predicted_qd for name, x in predictions.items() if x.predicted_qd is not None}
     rows = []
@@ -184,13 +191,13 @@ def mass_panels(
 
     Args:
         t: Times, (T,) [s].
-        masses: Name of a line -> lower triangle of M in row-major order, (entries, T) [kg m^2, kg m, kg].
-        styles: Name of a line -> CSS class.
+        masses: {name of a line: lower triangle of M in row-major order, (entries, T) [kg m^2, kg m, kg]}.
+        styles: {name of a line: CSS class}.
         joint_types: Types of the joints, for the units of the entries.
         width: Width of each chart [pixels].
     """
     panels = []
-    # Entries below this bound are zero except for rounding.
+    # An entry of M whose magnitude never exceeds `zero` is zero except for rounding errors, and gets no chart.
     zero = TUNING.zero * max(np.nanmax(np.abs(mass)) for mass in masses.values())
     for number, (i, j) in enumerate(np.argwhere(np.tri(len(joint_types))).tolist()):
         lines = [Line(label, t, mass[number], styles[label]) for label, mass in masses.items()]

@@ -18,21 +18,21 @@ from spelgen.spec import ModelSpec
 
 
 def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
-    """Return section of the report -> charts; a section without curves has None or an empty list."""
+    """Return {section of the report: charts}; the value is None or empty if the evaluation has no curves for it."""
     joints = named_joints(spec.joint_names, spec.joint_types)
     # Every section has a value, None by default, because an undefined name is an error in the template.
     drawn: dict[str, object] = dict.fromkeys(("growth", "mass", "friction", "energy"))
     growth, mass = traces.growth, traces.mass
     if growth is not None:
         growths = {name: (growth, name) for name in growth.relative}
-        # Only these two have bands, since the bands of all predictors would overlap.
+        # Only the model and least squares have bands of quantiles, since bands of all predictors would overlap.
         drawn["growth"] = plots.growth_panels(growths, plots.STYLES, (MODEL, LEAST_SQUARES))
     if mass is not None and mass.by:
         entries = {name: curves.entries for name, curves in mass.by.items()}
         drawn["mass"] = plots.mass_panels(mass.t, entries, plots.STYLES, spec.joint_types)
     if traces.friction is not None:
         drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
-    if traces.torques:  # the energy terms of one trajectory are sufficient
+    if traces.torques:  # One trajectory is sufficient to show the terms of the energy balance.
         drawn["energy"] = energy_chart(traces.torques[0])
     torques, trajectories = {}, {}
     for trace in traces.torques:
@@ -45,7 +45,7 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
 
 
 def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
-    """Return the title of a predicted motion or of a replayed log; it states the error."""
+    """Return the title of the charts of a predicted motion or a replayed log; the title contains the error."""
     which = example.which.capitalize()
     if example.start is None:
         distance = None if example.error is None else 1000 * example.error
@@ -59,7 +59,7 @@ def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
     """Return the chart of training and validation loss over the epochs, with a line at the epoch of the best model."""
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
     epochs, *losses = array(columns).T
-    # The line ends at the smallest and largest loss: zero does not exist on a logarithmic axis.
+    # The vertical line extends from the smallest to the largest loss. It cannot start at zero on a logarithmic axis.
     ends = (np.nanmin(losses), np.nanmax(losses))
     lines = [
         Line("training loss", epochs, losses[0], "train"),
@@ -86,10 +86,11 @@ def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Pane
 def friction_panels(
     friction: FrictionTrace, torques: Sequence[TorqueTrace], joints: Sequence[NamedJoint]
 ) -> list[Panel]:
-    """Return a chart per joint of friction over velocity: curves at constant velocity, loops along measured motion.
+    """Return one chart per joint: friction over velocity.
 
-    Measured friction is the measured torque minus the model's rigid-body torque. Loops show hysteresis; in a model
-    without a friction state, loops show only friction that depends on the load.
+    A chart shows the friction of each model at constant velocity, and the measured and modelled friction along the
+    trajectories. The measured friction is the measured torque minus the rigid-body torque of the model. Along a
+    trajectory the curve forms loops if friction has hysteresis or depends on the load.
     """
     panels = []
     for k, joint in enumerate(joints):
@@ -102,7 +103,7 @@ def friction_panels(
             measured = modelled + trace.measured[:, k] - trace.predicted[MODEL][:, k]
             values.append(measured)
             marks.append(Dots("measured", qd, measured, "truth"))
-            # Loops of one trajectory only, as the loops of two would overlap.
+            # Loops are drawn for the first trajectory only, since loops of several trajectories would overlap.
             if trace is torques[0]:
                 marks.append(Line("measured, over time", qd, measured, "loop"))
                 marks.append(Line("model, over time", qd, modelled, "loop model"))
@@ -137,7 +138,8 @@ def coverage_panels(
         charts = []
         for key, quantity in (("q", "position"), ("qd", "velocity")):
             bands = [_histogram(name, covered[key][k]) for name, covered in logs.items() if covered]
-            if not bands:  # without a coverage of the logs, no joint has a histogram
+            # Without least squares and without an evaluation there are no histograms, and the charts are omitted.
+            if not bands:
                 return []
             marks: list[Mark] = list(bands)
             top = max(float(np.max(band.high)) for band in bands)

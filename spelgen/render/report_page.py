@@ -37,7 +37,8 @@ def write_report(
 
     Args:
         folder: Run folder.
-        output: File of the page, report.html in the run folder by default; .json writes the data of the page.
+        output: File of the page; default: report.html in the run folder. A file with the suffix .json gets the data
+            of the page instead.
         robot: URDF with its meshes, for the picture of the arm; default: the URDF in the run folder.
 
     Raises:
@@ -86,7 +87,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
     spec, record = run.spec, run.config
-    # The page of a run without evaluation has the same sections, each with a note that it is empty.
+    # A run without evaluation gets the same page from empty results: each section then has a note that it is empty.
     traces, tables = Traces({}), []
     if run.results is not None:
         traces, tables = run.results.traces, result_tables(run.results)
@@ -137,7 +138,7 @@ def render_runs(folders: Sequence[Path]) -> str:
     runs: dict[str, Run] = {}
     results: dict[str, Results] = {}
     for name, folder in zip(_names(folders), folders, strict=True):
-        RunFolder(folder).read_record()  # raises an error if the folder is not a run
+        RunFolder(folder).read_record()  # This call only checks that the folder contains a run.
         run = open_run(folder)
         if run.results is None:
             raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
@@ -155,8 +156,11 @@ def render_runs(folders: Sequence[Path]) -> str:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the shortest distinct ends of the folders' paths; whole paths would disclose home folders."""
-    # Paths are resolved, because `.` has no name, and two links to one folder are the same run.
+    """Return one name per run folder: the last n parts of its path, with the smallest n that makes all names distinct.
+
+    Whole paths are avoided, since they would disclose the user's home folder.
+    """
+    # Paths are resolved, because `.` has no name.
     paths = list(map(Path.resolve, folders))
     names: list[str] = []
     for count in range(1, max(len(path.parts) for path in paths) + 1):
@@ -168,7 +172,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 def _verdict(runs: Mapping[str, Results]) -> str:
     """Return sentences that name the run with the smallest value of each error that all runs have."""
-    # Figure -> (value, run, text) of each run; `min` compares the values first.
+    # {label of an error: (value, run, text) of each run}. The value is the first element, so that `min` compares it.
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():
         for figure in figures(results):
@@ -179,7 +183,7 @@ def _verdict(runs: Mapping[str, Results]) -> str:
         if len(of_runs) == len(runs):
             _, name, text = min(of_runs)
             smallest.setdefault(name, []).append(text)
-    # Runs without a common figure, for example with other horizons, cannot be ranked.
+    # Runs that have no error in common, for example runs with different horizons, cannot be compared.
     if not smallest:
         return "These runs have no common horizons or logs."
     sentences = [f"{name} has the smallest {listed(labels)}." for name, labels in smallest.items()]

@@ -81,7 +81,7 @@ class Run:
         if self.model is None or self.config is None or not self.folder.checkpoint.is_file():
             return None
         content = self.folder.load_checkpoint().posterior
-        # The posterior depends on the torque delay, which shifts the torques of the fit.
+        # The tables of the posterior state the torque delay, by which the fit has shifted the logged torques.
         delay = self.config.preprocessing.torque_delay or 0.0
         return None if content is None else posterior_of(self.model, content, delay, self.folder.checkpoint)
 
@@ -108,7 +108,7 @@ def head_numbers(run: Run) -> list[tuple[str, str]]:
     summary = None if run.config is None else servo_summary(run.config.servo)
     if summary is not None:
         numbers.append(summary.headline)
-    # Parameters that the fit switched off are not counted: the number is the size of the model in use.
+    # The number of parameters excludes residual terms that the fit did not select.
     elif run.model is not None:
         numbers.append((f"{used_parameter_count(run.model):,}", "trained parameters"))
     for last in run.metrics[-1:]:
@@ -117,7 +117,10 @@ def head_numbers(run: Run) -> list[tuple[str, str]]:
 
 
 def outlier_note(results: Results) -> str:
-    """Return a sentence if few predictions dominate the RMS error, which is then far above the median; else ""."""
+    """Return a sentence for the report if the RMS prediction error is far above the median error; else "".
+
+    A few predictions with large errors then dominate the RMS.
+    """
     growth = results.traces.growth
     if growth is None or MODEL not in growth.relative or not results.horizons:
         return ""
@@ -131,13 +134,13 @@ def outlier_note(results: Results) -> str:
 
 def best_epoch(metrics: Sequence[Content]) -> int:
     """Return the epoch of the best model; 0 if no epoch was better than the initial model."""
-    # The last record contains the smallest validation loss, which is the initial loss if no epoch was better.
+    # "best" of the last record is the smallest validation loss of the fit, including the loss of the initial model.
     best = metrics[-1]["best"]
     return next((epoch["epoch"] for epoch in metrics if epoch["validation"] == best), 0)
 
 
 def training_facts(run: Run, record: Record) -> dict[str, str]:
-    """Return label -> text about the logs, the preprocessing and the duration of a fit."""
+    """Return {label: text} about the logs, the preprocessing and the duration of a fit."""
     preprocessing = record.preprocessing
     facts = {
         "objective": record.objective,
@@ -146,7 +149,7 @@ def training_facts(run: Run, record: Record) -> dict[str, str]:
         "windows": f"{record.training_windows:,} for training, {record.validation_windows:,} for validation",
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
-    # Least squares uses only samples with accelerations, so their number may be smaller than for the model.
+    # Least squares uses only samples with accelerations, so it may use fewer samples than the fit of the model.
     if "samples" in run.baselines:
         count = f"{run.baselines['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
@@ -169,7 +172,7 @@ def training_facts(run: Run, record: Record) -> dict[str, str]:
 
 
 def settings(record: Record) -> dict[str, str]:
-    """Return label -> text of the options of a fit."""
+    """Return {name: value} of the options of a fit, both as text."""
     options = record.options.items()
     return {key.replace("_", " "): str(value) for key, value in options if value is not None}
 
@@ -180,10 +183,14 @@ def _names(trajectories: Sequence[str]) -> str:
 
 
 def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str]:
-    """Return the commands that reproduce a run; LOGS represents the paths of the logs, which are not recorded."""
+    """Return the commands that reproduce a run.
+
+    The run does not record the paths of its logs, so the commands contain the placeholder LOGS.
+    """
     # Options with default values are omitted, to keep the command short.
     options = asdict(spec.options)
-    if spec.options.design is not None:  # the YAML file of the design is not in the run folder
+    # The run folder has no copy of the design's YAML file, so the command names a file of the user.
+    if spec.options.design is not None:
         options["preset"] += ".yaml"
     # The folder of the URDF is omitted, as it may be a folder of another machine.
     robot, option = shlex.quote(Path(spec.urdf).name), ""
@@ -211,7 +218,7 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
 
 
 def _changed(options: Mapping[str, object], defaults: Mapping[str, object]) -> dict[str, object]:
-    """Return the options that differ from their defaults, without nested groups of options."""
+    """Return {name: value} of the options that differ from their defaults; values that are mappings are omitted."""
     changed = {}
     for key, value in options.items():
         if value is not None and value != defaults.get(key) and not isinstance(value, Mapping):

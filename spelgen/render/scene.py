@@ -30,9 +30,19 @@ if TYPE_CHECKING:
 class SceneLink:
     """A link and its motion relative to its parent.
 
-    rotation (3, 3) and position (3,) [m] are the pose of the joint frame in the parent's frame. The link rotates about
-    axis (3,) in the joint frame by ratio * q[joint] + offset [rad]; if `slides`, it moves along the axis by this
-    distance [m]. parent: index of the parent link, -1 for the root. joint: index of the joint, -1 for a fixed link.
+    The displacement of the joint is ratio * q[joint] + offset [rad, m].
+
+    Attributes:
+        name: Name of the link.
+        parent: Index of the parent link; -1 for the root.
+        rotation: Rotation from the joint frame to the parent's frame, (3, 3).
+        position: Origin of the joint frame in the parent's frame, (3,) [m].
+        axis: Joint axis in the joint frame, (3,).
+        slides: Whether the link moves along the axis; otherwise it rotates about the axis.
+        joint: Index of the joint in q; -1 for a link that does not move relative to its parent.
+        ratio: Displacement per displacement of q[joint].
+        offset: Displacement for q[joint] = 0 [rad, m].
+        shape: Triangles of the link.
     """
 
     name: str
@@ -60,7 +70,7 @@ class Scene:
 
 
 def scene(urdf: Path, joints: Sequence[str]) -> Scene:
-    """Return the scene of the arm whose moving joints have these names. Raises the errors of ``read_urdf``."""
+    """Return the scene of an arm. joints: names of its moving joints. Raises the errors of ``read_urdf``."""
     robot = read_urdf(urdf)
     constraint = mimic_constraint(robot, joints)
     # Other branches of the robot (a second arm, a base with wheels) are not drawn.
@@ -70,8 +80,9 @@ def scene(urdf: Path, joints: Sequence[str]) -> Scene:
     if not visual.shapes:
         tubes = " No meshes were read; links are drawn as tubes."
     lengths = [np.linalg.norm(joint.xyz) for name, joint in robot.joint_above.items() if name in names]
-    # The extent is the sum of all lengths, as the distance to the tip depends on the configuration.
-    extent = max(float(sum(lengths)), 1e-3)  # the extent is positive even if all joints coincide
+    # The extent is the sum of all lengths, as the distance to the tip depends on the configuration. The lower bound
+    # avoids an extent of zero if all joints coincide.
+    extent = max(float(sum(lengths)), 1e-3)
     links = []
     for name in names:
         if name in visual.unread or not visual.shapes:
@@ -113,8 +124,8 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
     """Return the names of the drawn links, parents first.
 
-    Drawn are the links from the root to each of the `joints`, all links that move with the joints, and links that are
-    fixed to another drawn link.
+    The drawn links are the links from the root to each of the `joints`, all links that move with the joints, and links
+    that are fixed to another drawn link.
     """
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
     carried: set[str] = set()
@@ -137,14 +148,15 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
     for carried in below:
         end = np.array(carried.xyz, dtype=float)
         meshes += tube(np.zeros(3), end, radius)
-        if carried.type == "prismatic":  # a thin tube along the travel of the prismatic joint
+        if carried.type == "prismatic":  # A thin tube shows the range of the prismatic joint.
             travel = max(abs(carried.lower or 0.0), abs(carried.upper or 0.0))
             meshes += tube(end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius)
     # A last link without child joints gets a tube to its centre of mass; otherwise it would be invisible.
     if not below and inertial is not None:
         meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
-        # A prismatic joint is drawn as a square block, a revolute joint as a drum. Width and half length in tube radii.
+        # A prismatic joint is drawn as a square block, a revolute joint as a drum. `width` is the radius of the block
+        # or drum and `half` is half of its length, both in radii of the tube.
         sides, width, half = (4, 1.8, 2.4) if joint.type == "prismatic" else (10, 1.5, 1.725)
         ends = half * radius * _axis(joint)
         meshes += tube(-ends, ends, width * radius, sides)
@@ -184,8 +196,8 @@ def tube(start: np.ndarray, end: np.ndarray, radius: float, sides: int = 10) -> 
     """Return a closed prism as a list of one mesh; an empty list if the prism is shorter than half its radius.
 
     Args:
-        start: First end of the axis, (3,) [m].
-        end: Last end of the axis, (3,) [m].
+        start: First end point of the prism's axis, (3,) [m].
+        end: Second end point of the prism's axis, (3,) [m].
         radius: Radius of the circumscribed cylinder [m].
         sides: Number of sides.
     """

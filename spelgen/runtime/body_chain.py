@@ -1,4 +1,4 @@
-"""The bodies of an arm: inertial parameters, and the motion of the four point masses of each body."""
+"""The bodies of an arm: their inertial parameters and motion. Four point masses represent each body."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,19 +13,19 @@ from spelgen.runtime.rows import Joint, Link, vector
 
 
 class ChainConfiguration(NamedTuple):
-    """Configuration cache of a ``BodyChain``: quantities at q, in the base frame.
+    """Positions, joint axes and Jacobian of a ``BodyChain`` at q, in the base frame (configuration cache).
 
     Each body is represented by four point masses.
     """
 
     place: Tensor  # positions [m] of the points times the square roots of their masses, (..., 3, bodies, 4)
     mass: Tensor  # square roots of the masses of the four points of each body, (..., 1, bodies, 4)
-    axes: Tensor  # twist of a body per rate of its own joint, (..., 6, bodies)
-    # Derivatives of the points' coordinates, times square roots of the masses, with respect to the
-    # displacement of each body's own joint, (..., bodies, 12 bodies): 3 coordinates of 4 points per body.
+    axes: Tensor  # twist of each body relative to its parent per unit joint rate, (..., 6, bodies)
+    # Derivatives of the coordinates of all points with respect to the joint displacement of each body, times
+    # the square roots of the masses, (..., bodies, 12 bodies): 3 coordinates of 4 points per body.
     jacobian: Tensor
-    # Upward acceleration that is equivalent to gravity, times square roots of the masses, for each
-    # coordinate of each point, (..., 12 bodies).
+    # Minus the acceleration of gravity, times the square root of the mass, for each coordinate of each
+    # point, (..., 12 bodies) [m/s^2 kg^(1/2)].
     weight: Tensor
 
 
@@ -33,11 +33,11 @@ class BodyChain(nn.Module):
     """A tree of bodies: each rotates about or translates along an axis of the body or base that carries it.
 
     Twists are (angular, linear) in the base frame (Featherstone, Rigid Body Dynamics Algorithms, 2008);
-    frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). Each body is represented by four
-    point masses with the same inertia: the columns (position, 1) * sqrt(mass) of a matrix root of the
-    body's pseudo-inertia. Only the frames are computed recursively. Sums over the bodies that a joint
-    carries, or over the joints that carry a body, are products with a mask, because for small arms the
-    time is proportional to the number of tensor operations.
+    frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). Each body is represented by four point
+    masses that have the same pseudo-inertia P: the columns (position, 1) * sqrt(mass) of a matrix Q with Q
+    Q^T = P. Only the frames are computed recursively. A sum over the bodies that a joint carries, or over the
+    joints that carry a body, is one product with a mask: for small arms the time is proportional to the
+    number of tensor operations.
     """
 
     def __init__(
@@ -47,13 +47,13 @@ class BodyChain(nn.Module):
         parent: Sequence[int],  # index of the carrying body; -1: the base
         joint: Sequence[int],
         revolute: Sequence[bool],  # True: rotation about z of the joint frame; False: translation along z
-        ratio: Row,  # a body's displacement is ratio * q + offset
+        ratio: Row,  # displacement of a body's joint: ratio * q + offset
         offset: Row,
         placement: Sequence[Rows],  # joint frame in the parent frame: three rows of [R p], p in m
     ) -> None:
         super().__init__()
         self.parents, count, turns = parent, len(parent), vector(revolute)
-        # The displacements of all bodies are ratios q + offset; ratios: (bodies, n), offset: (bodies,).
+        # The joint displacements of all bodies are ratios q + offset; ratios: (bodies, n), offset: (bodies,).
         self.ratios = nn.Buffer(vector(ratio).unsqueeze(-1) * torch.eye(n)[list(joint)])
         self.offset, self.turns = nn.Buffer(vector(offset)), nn.Buffer(turns)
         # Rodrigues' formula for the 4 x 4 transform of a joint, with the identity matrix I and the generator
@@ -63,8 +63,8 @@ class BodyChain(nn.Module):
         rate[:, 1, 0], rate[:, 0, 1], rate[:, 2, 3] = turns, -turns, 1 - turns
         first, second = (start @ rate).flatten(1), (start @ rate @ rate).flatten(1)
         by_feature = [-second, turns.unsqueeze(-1) * first, (1 - turns).unsqueeze(-1) * first]
-        # Linear map, (16 bodies, 3 bodies), from cosines, sines and values of the displacements to the
-        # frames of the bodies relative to their parents; `fixed` is the constant term of the map.
+        # The 4 x 4 frame of each body relative to its parent is linear in cos, sin and value of the joint
+        # displacement: `table`, (16 bodies, 3 bodies), has the coefficients and `fixed` the constant terms.
         blocks = [torch.ops.aten.block_diag([*x.unsqueeze(-1)]) for x in by_feature]
         self.table = nn.Buffer(torch.cat(blocks, dim=1))
         self.fixed = nn.Buffer((start.flatten(1) + second).flatten())
@@ -83,20 +83,19 @@ class BodyChain(nn.Module):
         self.carriers = nn.Buffer(carriers)
         # The same mask with a column for each coordinate of each point, (bodies, 12 bodies).
         self.carried = nn.Buffer(carriers.repeat_interleave(4, dim=1).repeat(1, 3))
-        # Upward acceleration of the base that is equivalent to gravity, (3, 1, 1) [m/s^2].
+        # Minus the acceleration of gravity, in the base frame, (3, 1, 1) [m/s^2].
         self.base = nn.Buffer(-vector(gravity)[:, None, None])
 
     def forward(self, q: Tensor, points: Tensor) -> ChainConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m].
+        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m].
 
         points: point masses of the bodies in body frames, four columns (position, 1) * sqrt(mass) per
         body, as a block diagonal matrix, (4 bodies, 4 bodies).
         """
-        # The displacements of all bodies, including mimic joints, are linear functions of q.
+        # Joint displacements of all bodies; the displacement of a mimic joint is linear in q of its leader.
         value = q @ self.ratios.mT + self.offset
         features = torch.cat([value.cos(), value.sin(), value], dim=-1)
-        # The frames relative to the parents are linear in these features, so one product gives all of
-        # them.
+        # Frames of the bodies relative to their parents: one matrix product for all bodies.
         relative = torch.unflatten(F.linear(features, self.table, self.fixed), -1, (-1, 4, 4)).unbind(dim=-3)
         # Parents precede their children, so the frame of a parent in the base frame is known.
         placed: list[Tensor] = []
@@ -108,25 +107,26 @@ class BodyChain(nn.Module):
         # The twist of a unit rate is (z, origin x z) for a rotation, (0, z) for a translation.
         axes = torch.cat([angular, torch.linalg.cross(origin, angular, dim=-2) + (z - angular)], dim=-2)
         points = frames @ points
-        # Velocity of every point per rate of every joint; the mask keeps points that the joint's body
-        # carries.
+        # Velocity of every point per unit rate of every joint. The mask `carried` sets it to zero for the
+        # points that the joint does not carry.
         motions = torch.unflatten(axes.mT @ self.motions, -1, (3, 4)).flatten(-3, -2) @ points
         jacobian = torch.unflatten(motions, -2, (-1, 3)).flatten(-2) * self.carried
         place, mass = torch.unflatten(points, -1, (-1, 4)).tensor_split((3,), dim=-3)
         return ChainConfiguration(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, cache: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return velocities of the points, twists of the bodies, and rates of the joint axes at qd, (..., n).
+        """Return velocities of the points, twists of the bodies, and time derivatives of the joint axes.
 
-        Velocities, (..., 3, bodies, 4), are multiplied by the square roots of the masses. Twists and
-        rates of the axes are (..., 6, bodies) (Featherstone, 2.31).
+        qd: velocities, (..., n). The velocities of the points, (..., 3, bodies, 4), are multiplied by the
+        square roots of the masses. Twists and derivatives of the axes are (..., 6, bodies) (Featherstone,
+        2.31).
         """
         rates = qd @ self.ratios.mT
-        # The products with masks are sums over the joints that carry a body.
+        # The product with the Jacobian, and with the mask `carriers`, sums over the joints that carry a body.
         velocity = torch.unflatten(applied(cache.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (cache.axes * rates.unsqueeze(-2)) @ self.carriers
         (w, u), (a, m) = twists.chunk(2, dim=-2), cache.axes.chunk(2, dim=-2)
-        # The rate of a joint axis (a, m) that moves with the twist (w, u) is (w x a, w x m + u x a).
+        # A joint axis (a, m) that moves with the twist (w, u) has the time derivative (w x a, w x m + u x a).
         linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
         return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
@@ -135,8 +135,8 @@ class BodyChain(nn.Module):
         velocity, twists, turning = self.motion(cache, qd)
         steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
         w, (a, u) = twists[..., :3, :, None], steady.unsqueeze(-1).chunk(2, dim=-3)
-        # (w, u) is the twist of a body, (w', u') its time derivative at constant joint rates: the point p
-        # with velocity v then has the acceleration w x v + w' x p + u'. In the code, a is w', u is u'.
+        # A point p of a body with twist (w, u0) and velocity v has the acceleration w x v + a x p + u, where
+        # (a, u) is the time derivative of the twist, here at constant joint rates.
         turned = torch.linalg.cross(w, velocity, dim=-3) + torch.linalg.cross(a, cache.place, dim=-3)
         return torch.addcmul(turned, u, cache.mass).flatten(-3) + cache.weight
 
@@ -145,15 +145,15 @@ class BodyChain(nn.Module):
         velocity, _, turning = self.motion(cache, qd)
         # Angular momentum of the points about the origin of the base, and linear momentum.
         momenta = [torch.linalg.cross(cache.place, velocity, dim=-3), cache.mass * velocity]
-        # The gradient is the momentum of all bodies that a joint carries, projected onto the rate of
-        # the joint's axis. Rotating the points' velocities with the joint does not change the energy:
-        # (a x v) . v = 0.
+        # The derivative with respect to a joint's displacement is the scalar product of the momentum of all
+        # bodies that the joint carries and the time derivative of the joint's axis. The rotation of the
+        # points' velocities contributes nothing: (a x v) . v = 0.
         carried = torch.cat(momenta, dim=-3).sum(dim=-1) @ self.carriers.mT
         return (turning * carried).sum(dim=-2) @ self.ratios
 
 
 def chain_of_links(joints: Sequence[Joint], links: Sequence[Link], gravity: Row) -> BodyChain:
-    """Return the chain of these links; gravity: acceleration in the base frame, (3,) [m/s^2]."""
+    """Return the ``BodyChain`` of the links; gravity: acceleration in the base frame, (3,) [m/s^2]."""
     names, number = [link.name for link in links], {joint.name: k for k, joint in enumerate(joints)}
     types = [link.joint_type or joints[number[link.joint]].joint_type for link in links]
     return BodyChain(
@@ -173,8 +173,8 @@ def chain_of_links(joints: Sequence[Joint], links: Sequence[Link], gravity: Row)
 def body_factor(parameters: Tensor) -> Tensor:
     """Return the upper triangular matrix T, (..., 4, 4), of log-Cholesky parameters.
 
-    The pseudo-inertia of a body is C T T^T C^T, where C C^T is the pseudo-inertia of the given link (see
-    ``InertialParameters``). parameters: (..., 4, 4), each parameter at the place of its entry of T.
+    The pseudo-inertia of a body is C T T^T C^T, with C C^T its initial value (see ``InertialParameters``).
+    parameters: upper triangular matrix, (..., 4, 4), with the logarithms of extents and mass on the diagonal.
     """
     logarithms = parameters.diagonal(dim1=-2, dim2=-1)
     sizes, mass = logarithms[..., :3], logarithms[..., 3:] / 2
@@ -200,29 +200,30 @@ class InertialParameters(nn.Module):
     """Inertial parameters of bodies that are physically consistent for any trained parameters.
 
     The pseudo-inertia of a body is [[S, m c], [(m c)^T, m]] with the second moments of mass S in the
-    joint's frame. It is C T T^T C^T with upper triangular C and T, where C C^T is the pseudo-inertia of
-    the given link. T is a function of the trained log-Cholesky parameters (Rucker and Wensing, IEEE
-    RA-L 7:4352, 2022): logarithms of mass and of the extents along three axes, relative to the given
-    link, and shear and center of mass in units of the extents. All parameters are zero at first, so
-    that T is the identity.
+    joint's frame. It is C T T^T C^T with upper triangular C and T, where C C^T is the initial pseudo-inertia,
+    of the links that are passed. T is a function of the trained log-Cholesky parameters (Rucker and Wensing,
+    IEEE RA-L 7:4352, 2022). The parameters of a body are the logarithms of its mass and of its extents along
+    three axes, divided by the initial values, and shear and displacement of the center of mass in units of
+    the extents. All parameters are initially zero, so that T is the identity.
     """
 
     parameter_groups = (("raw", "bodies", "kg, kg m, kg m^2"),)
 
     def __init__(self, links: Sequence[Link]) -> None:
         super().__init__()
-        # Linear map from the entries of an upper triangle, rows in sequence, to the matrix.
+        # Linear map, (10, 16), from the entries of an upper triangle, in row-major order, to the flattened
+        # matrix.
         row, column = torch.triu_indices(4, 4)
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
         pseudo = torch.stack([pseudo_inertia(link) for link in links])
-        # torch has only lower Cholesky factors: the upper factor is the lower factor of the matrix with
-        # rows and columns in reverse order, reversed again.
+        # torch has only lower Cholesky factors. With rows and columns in reverse order, the lower factor of
+        # the reversed matrix becomes the upper factor.
         self.factors = nn.Buffer(torch.linalg.cholesky(pseudo.flip(-1, -2)).flip(-1, -2))
         self.raw = nn.Parameter(torch.zeros(len(links), 10, dtype=torch.float64))
 
     def forward(self) -> Tensor:
-        """Return four point masses with the inertia of each body, the columns of C T, (bodies, 4, 4).
+        """Return the four point masses of each body as the columns of C T, (bodies, 4, 4).
 
-        A column is (position, 1) * sqrt(mass).
+        A column is (position, 1) * sqrt(mass), in the joint's frame.
         """
         return self.factors @ body_factor(torch.unflatten(self.raw @ self.triangle, -1, (4, 4)))

@@ -59,9 +59,11 @@ class LinearMass(nn.Module):
 
 
 class ConstantMass(LinearMass):
-    """A mass matrix that does not depend on q: M = ``entries(*constants)`` + armature, (..., n, n).
+    """A mass matrix M that does not depend on q, (..., n, n).
 
-    The absolute values of the trained constants are used, so that M is positive definite.
+    M is ``entries(*constants)`` plus the armature; ``entries`` is a function in the emitted module.
+
+    The absolute values of the trained constants are used: a negative constant could make M indefinite.
     """
 
     def constants(self) -> Tensor:
@@ -73,9 +75,9 @@ class ConstantMass(LinearMass):
         return self.entries(*self.constants().unbind()) + torch.diag(self.armature())
 
     def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return M, (..., n, n), and the encoding, (..., 2 n).
+        """Return M, (..., n, n), and the encoding of q, (..., 2 n), unchanged.
 
-        The encoding is in place of intermediate values: the derivatives, which are zero, have its shape.
+        ``kinetic_vjp`` uses only the shape of the encoding, because the derivatives of M are zero.
         """
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
@@ -90,14 +92,17 @@ class ConstantMass(LinearMass):
 
 
 class DerivedMass(LinearMass):
-    """A mass matrix linear in learned functions: M(q) = ``entries(*functions, *constants)`` + armature.
+    """A mass matrix M(q) that is linear in learned functions of q.
 
-    The result is positive definite for all q and all parameters. C is the nominal mean of M. If
-    M - margin C is not positive definite, M is replaced by M' = C + t (M - C). The factor t is the
-    largest of 1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin. The norm |X| is an upper bound of the
-    spectral norm of L^-1 X L^-T, with C = L L^T. Since t is piecewise constant, the derivatives of M'
-    are t times the derivatives of M. The zeros of M and the linear relations between entries of M are
-    valid for C, and therefore for M', too.
+    M is ``entries(*functions, *constants)`` plus the armature; ``entries`` is a function in the emitted
+    module.
+
+    The result is positive definite for all q and all parameters: if M - margin C is not positive definite,
+    with C the nominal mean of M, M is replaced by M' = C + t (M - C). The factor t is the largest of 1/2,
+    1/4, 1/8, ... with t |M - C| <= 1 - margin. The norm |X| is an upper bound of the spectral norm of L^-1 X
+    L^-T, with C = L L^T. Since t is piecewise constant, the derivatives of M' are t times the derivatives of
+    M. The zeros of M and the linear relations between entries of M are valid for C, and therefore for M',
+    too.
     """
 
     def __init__(
@@ -113,21 +118,21 @@ class DerivedMass(LinearMass):
         super().__init__(joints, entries, constants=constants, functions=functions)
         self.network = network
         center = self._by_outputs()[-1].detach()
-        # `center` is C, the nominal mean of M. If M - `smallest` is not positive definite, `forward` returns
-        # a matrix between C and M.
+        # `center` is C, the nominal mean of M, and `smallest` is margin C. `forward` corrects M if M -
+        # `smallest` is not positive definite.
         self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # Entries of X = M - C are multiplied by `unit`; the Frobenius norm of the product is
-        # |X| / (1 - margin). |X| bounds the spectral norm of L^-1 X L^-T: D = diag(C)^(-1/2) scales the
-        # diagonal of C to one, and `eigenvalue` is the smallest eigenvalue of D C D.
+        # |X| is the Frobenius norm of D X D divided by the smallest eigenvalue of D C D, with D =
+        # diag(C)^(-1/2): an upper bound of the spectral norm of L^-1 X L^-T. `unit` has the factors of the
+        # entries of X, which include 1 / (1 - margin).
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
         """Return dM / d output for each network output, then M at zero outputs, (outputs + 1, n, n)."""
-        # M is linear in the outputs, so unit outputs give the derivatives; the last column has the
-        # means of the functions and the constants.
+        # M is affine in the outputs. All but the last column of `functions` are derivatives with respect to
+        # one output each; the last column is at zero outputs: the means of the functions.
         functions = torch.cat([torch.diag(self.function_scale), self.function_mean.unsqueeze(-1)], dim=1)
         constants = F.pad(self.constants().unsqueeze(-1), (len(functions), 0))
         return self.entries(*functions.unbind(), *constants.unbind())
@@ -135,30 +140,35 @@ class DerivedMass(LinearMass):
     def prepare(self) -> Layers:
         """Return the layers of a network whose outputs are the entries of M."""
         rows = self._by_outputs()
-        # The linear map from functions to entries of M is included in the weights of the last layer.
+        # The linear map from the learned functions to the entries of M is multiplied into the weights of the
+        # last layer, which saves an operation per evaluation.
         offset = rows[-1] + torch.diag(self.armature())
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
-        """Return M'(q), (..., n, n), and for derivatives the intermediate values of the network and t."""
+        """Return M'(q), (..., n, n), and the values that its derivatives need.
+
+        The values are the intermediate values of the network, and the factor t (see the class).
+        """
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
         fraction = self.fraction(mass.detach())
         return torch.lerp(self.center, mass, fraction[..., None, None]), (intermediates, fraction)
 
     def fraction(self, mass: Tensor) -> Tensor:
-        """Return the factor t, (...), for matrices M, (..., n, n); 1 if M needs no change."""
-        # cholesky_ex reports which matrices of a batch are not positive definite; cholesky would raise
-        # an error.
+        """Return the factor t of M' = C + t (M - C), (...), for matrices M, (..., n, n); 1 if M is valid."""
+        # For a batch with an indefinite matrix, cholesky would raise an error; cholesky_ex reports which
+        # matrices are indefinite.
         indefinite = torch.linalg.cholesky_ex(mass - self.smallest).info != 0
-        # The Frobenius norm of the scaled difference is an upper bound of the spectral norm.
+        # `norm` is |M - C| / (1 - margin).
         norm = torch.linalg.vector_norm(self.unit * (mass - self.center), dim=(-2, -1))
         return torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(norm)).clamp(min=1.0)), 1.0)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
         network, fraction = intermediates
-        # The network's outputs are M. d(1/2 qd^T M' qd) / dM' = 1/2 qd qd^T, and dM' = t dM.
+        # The gradient of 1/2 qd^T M' qd with respect to the entries of M is t/2 qd qd^T, since dM' = t dM;
+        # the network's outputs are the entries of M.
         half = 0.5 * fraction.unsqueeze(-1) * qd
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
@@ -177,16 +187,16 @@ class DenseIntermediates(NamedTuple):
     """
 
     network: Intermediates
-    factor: Tensor  # U without its diagonal of ones, (..., 3 n, 3 n)
-    moved: Tensor  # U^-1 A, (..., 3 n, n)
-    scale: Tensor  # e, (..., 3 n)
+    factor: Tensor  # U of this formula without its diagonal of ones, (..., 3 n, 3 n)
+    moved: Tensor  # U^-1 A of this formula, (..., 3 n, n)
+    scale: Tensor  # e of this formula, (..., 3 n)
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
     """Return lower triangular C, (3 n, 3 n), with C C^T the nominal inverse mass matrix of ``DenseMass``.
 
-    ``mean`` is the lower triangle of the nominal mean of M without armature, for the z axes of the
-    joints. For the x and y axes of a joint, the diagonal entry of its z axis is used.
+    ``mean`` is the lower triangle of the nominal mean of M without armature. It has the z axes of the joints;
+    the diagonal entries of the x and y axes of a joint are set to the entry of its z axis.
     """
     n = len(joints)
     mass = torch.zeros(n, n, dtype=torch.float64)
@@ -216,7 +226,7 @@ class DenseMass(nn.Module):
         self.nominal = nn.Buffer(factor)
         self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])
         row, column = torch.tril_indices(self.size, self.size, -1)
-        # Indices of the entries below the diagonal in the flattened matrix U, rows in sequence.
+        # Indices of the entries below the diagonal in the flattened matrix U, in row-major order.
         self.below = nn.Buffer(row * self.size + column)
         # At zero outputs of the network U is the identity, and e = softplus(log(exp(1) - 1)) = 1.
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
@@ -234,15 +244,18 @@ class DenseMass(nn.Module):
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return U and e, see ``DenseMass``, from the outputs of the network.
+        """Return U without its diagonal of ones, (..., 3 n, 3 n), and e, (..., 3 n); see ``DenseMass``.
 
-        U, (..., 3 n, 3 n), is returned without its diagonal of ones; e is (..., 3 n).
+        raw: outputs of the network, (..., outputs).
         """
         entries, scale = raw.tensor_split((len(self.below),), dim=-1)
         return self._lower(entries), F.softplus(scale)
 
     def _lower(self, entries: Tensor) -> Tensor:
-        """Return the strictly lower triangular matrix, (..., 3 n, 3 n), of entries, rows in sequence."""
+        """Return the strictly lower triangular matrix, (..., 3 n, 3 n), with these entries.
+
+        entries: in row-major order, (..., 3 n (3 n - 1) / 2).
+        """
         rows = entries.new_zeros(*entries.shape[:-1], self.size * self.size)
         rows = rows.index_copy(-1, self.below, entries)
         return rows.reshape(*entries.shape[:-1], self.size, self.size)
@@ -256,8 +269,8 @@ class DenseMass(nn.Module):
         """Return M(q), (..., n, n), and the intermediates of its derivatives."""
         raw, intermediates = self.network.forward(encoded, layers)
         factor, scale = self._factor(raw)
-        # Triangular systems with U are solved, and the larger matrix is not inverted: its condition
-        # number is the square of the condition number of its factor.
+        # U^-1 A is solved from a triangular system. An inversion of the larger matrix C U diag(e) U^T C^T
+        # would lose twice as many digits, since its condition number is squared.
         moved = self._unit_solved(factor, self.moving)
         mass = moved.mT @ (moved / scale.unsqueeze(-1))
         return mass, DenseIntermediates(intermediates, factor, moved, scale)

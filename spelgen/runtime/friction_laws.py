@@ -9,41 +9,41 @@ from torch import Tensor, nn
 from spelgen.runtime.parts import Row
 from spelgen.runtime.rows import Joint, vector
 
-# Initial width of the velocity range in which dry friction changes its sign, divided by the typical
-# speed.
+# Initial value of `coulomb_smoothing_velocity`, at which the smooth sign of dry friction reaches
+# 0.7, divided by the typical speed.
 SMOOTHING_VELOCITY = 0.006
 
 
 class FrictionConstants(NamedTuple):
     """The friction constants of all joints, (n,). All are >= 0; torques are 0 at joints without friction."""
 
-    viscous: Tensor  # [Nm s/rad, N s/m]
+    viscous: Tensor  # viscous friction coefficient [Nm s/rad, N s/m]
     saturation: Tensor  # limit of the saturating viscous friction [Nm, N]
-    saturation_velocity: Tensor  # [rad/s, m/s]
-    coulomb: Tensor  # [Nm, N]
+    saturation_velocity: Tensor  # velocity scale of the saturating viscous friction [rad/s, m/s]
+    coulomb: Tensor  # Coulomb friction [Nm, N]
     stribeck: Tensor  # additional dry friction at low velocity [Nm, N]
-    stribeck_velocity: Tensor  # [rad/s, m/s]
+    stribeck_velocity: Tensor  # velocity scale of the Stribeck curve [rad/s, m/s]
     load_dependence: Tensor  # dry friction per magnitude of the gravity torque [1]
-    stribeck_rounding: Tensor  # rounding of the Stribeck curve at rest, per Stribeck velocity [1]
-    coulomb_smoothing_velocity: Tensor  # width of the sign change of dry friction [rad/s, m/s]
-    min_load: Tensor  # load at zero gravity torque, so that |gravity torque| is smoothed at zero [Nm, N]
+    stribeck_rounding: Tensor  # speed of the rounding of the Stribeck curve, in Stribeck velocities [1]
+    coulomb_smoothing_velocity: Tensor  # speed at which the smooth sign of velocity is 0.7 [rad/s, m/s]
+    min_load: Tensor  # torque below which |gravity torque| is smoothed [Nm, N]
     bristle_fractions: Tensor  # fraction of dry friction per bristle, (n, K); sum 1, or 0 without bristles
     bristle_reach: Tensor  # break-away displacements, (n, K) [rad, m]
-    memoryless: Tensor  # 1: dry friction depends on velocity only, 0: on bristles
+    memoryless: Tensor  # 1 for a joint without bristles, else 0
 
     def viscosity(self, qd: Tensor) -> Tensor:
         """Return the viscous friction torque divided by qd, (..., n) [Nm s/rad, N s/m]."""
         return self.viscous + self.saturation * turning(qd, self.saturation_velocity)
 
     def dry(self, qd: Tensor, gravity: Tensor) -> Tensor:
-        """Return the magnitude of dry friction, (..., n) [Nm, N], under a gravity torque (..., n)."""
+        """Return the magnitude of dry friction, (..., n) [Nm, N], at gravity torques (..., n)."""
         speed = qd.abs() / self.stribeck_velocity
         rounding = self.stribeck_rounding
-        # (1 + x / 8)^-8 approximates exp(-x). With v = |qd| / stribeck_velocity and the rounding r,
-        # x = (1 + r) v^2 / (v + r) is approximately v^2 for large r and v for small r.
+        # Stribeck curve (1 + x / 8)^-8, an approximation of exp(-x), at v = |qd| / stribeck_velocity. With
+        # the rounding r, x = (1 + r) v^2 / (v + r) is close to v^2 for large r and to v for small r.
         slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
         slow = slow.square().square().square()  # Squaring three times takes half the time of ** 8.
-        # The load is a smooth approximation of |gravity torque|.
+        # smooth approximation of |gravity torque|
         load = (gravity.square() + self.min_load**2).sqrt()
         return self.coulomb + self.stribeck * slow + self.load_dependence * load
 
@@ -55,43 +55,45 @@ class FrictionConstants(NamedTuple):
         Args:
             qd: velocities, (..., n) [rad/s, m/s].
             gravity: gravity torques, (..., n) [Nm, N].
-            z: bristle displacements, (..., n, K) [rad, m]; None: unknown, and dry friction depends on
-                velocity.
-            direction: direction of dry friction at joints without bristles, (..., n); None: smooth sign
-                of qd.
+            z: bristle displacements, (..., n, K) [rad, m]; None if unknown: the dry friction of all joints
+                then depends on velocity.
+            direction: factor of dry friction, from -1 to 1, at joints without bristles, (..., n); None:
+                smooth sign of qd.
         """
         if direction is None:
             direction = qd * turning(qd, self.coulomb_smoothing_velocity)
         if z is not None:
-            # The torque of a bristle is proportional to its displacement; at the break-away
-            # displacement it is the bristle's fraction of dry friction.
+            # The torque of a bristle is proportional to its displacement. At the break-away displacement
+            # it is a fraction of dry friction.
             deflection = (self.bristle_fractions / self.bristle_reach * z).sum(dim=-1)
             direction = deflection + self.memoryless * direction
         return self.viscosity(qd) * qd + self.dry(qd, gravity) * direction
 
     def stored_energy(self, z: Tensor) -> Tensor:
-        """Return the elastic energy of the bristles of Coulomb friction, (...) [J]."""
-        # Each bristle is a spring of stiffness coulomb * fraction / breakaway. Dry friction in excess
-        # of Coulomb friction is regarded as dissipation.
+        """Return the elastic energy of all bristles, (...) [J]; z: displacements, (..., n, K) [rad, m]."""
+        # Each bristle is a spring of stiffness coulomb * fraction / breakaway. The Stribeck and load
+        # terms of dry friction vary with velocity and load, and are counted as dissipation.
         stored = self.bristle_fractions * z.square() / self.bristle_reach
         return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
 
 class FrictionLaws(nn.Module):
-    """Friction with trained constants, which dissipates energy for any parameters. The friction torque is
+    """Friction with trained constants, which dissipates energy for any parameters.
 
-    viscous qd + saturation s(qd, saturation_velocity)
-    + (coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + load_dependence load) direction, with
-    v = |qd| / stribeck_velocity, r the rounding, load = sqrt(gravity torque^2 + min_load^2) and
+    The friction torque is
+
+        viscous qd + saturation s(qd, saturation_velocity) + dry direction,
+        dry = coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + load_dependence load,
+
+    with v = |qd| / stribeck_velocity, r = stribeck_rounding, load = sqrt(gravity torque^2 + min_load^2) and
     s(x, width) = x / sqrt(x^2 + width^2).
 
-    The parameters are logarithms of the constants, and logits of the bristle fractions. The direction,
-    from -1 to 1, is sum_k fraction_k z_k / breakaway_k over the bristles of a joint, which may return
-    elastic energy; at joints without bristles, or if z is unknown, the direction is s(qd,
-    coulomb_smoothing_velocity). No exponential depends on the state, which reduces the time of a
-    control loop to a third. For large r the Stribeck term is close to the Gaussian of
-    Armstrong-Helouvry (Control of Machines with Friction, 1991); for small r, to the exponential of Bo
-    and Pavelescu (Wear 82:277, 1982), but without a corner at rest.
+    The parameters are logarithms of the constants, and logits of the bristle fractions. The direction is from
+    -1 to 1: sum_k fraction_k z_k / breakaway_k over the bristles of a joint, which may return elastic energy;
+    s(qd, coulomb_smoothing_velocity) for a joint without bristles, or if z is unknown. For large r the
+    Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of Machines with Friction, 1991);
+    for small r, to the exponential of Bo and Pavelescu (Wear 82:277, 1982), but without a corner at rest.
+    Powers replace exponentials, so that a control loop takes a third of the time.
 
     A joint has K bristles: elements that are elastic up to a break-away displacement and slide beyond
     it, with displacements z, (..., n, K) [rad, m] (Maxwell-slip elements: Lampaert, Al-Bender and
@@ -100,8 +102,8 @@ class FrictionLaws(nn.Module):
     an oscillating load.
     """
 
-    # For each parameter: its name, group and unit, and the initial value of its constant, for which the
-    # parameter is zero. The initial value is in units of typical friction and typical speed.
+    # (name, group, unit of the constant, initial value of the constant) of each parameter. The initial
+    # values are in units of typical friction and typical speed; the parameters are then zero.
     parameter_groups: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "effects", "Nm, N", 1.0),
@@ -116,7 +118,7 @@ class FrictionLaws(nn.Module):
     def __init__(
         self, joints: Sequence[Joint], *, breakaway: Mapping[str, Row], stribeck_rounding: float = 10.0
     ) -> None:
-        """Create the friction of these joints, with all parameters zero.
+        """Create the friction of the joints, with all constants at their initial values.
 
         breakaway: break-away displacements per joint type, (K,) [rad, m], shortest first.
         """
@@ -134,7 +136,7 @@ class FrictionLaws(nn.Module):
         self.raw_bristle_fractions = nn.Parameter(torch.zeros_like(self.reach))
 
     def prepare(self) -> FrictionConstants:
-        """Return the constants in SI units."""
+        """Return the friction constants of all joints in SI units."""
         friction, speed, constants = self.nominal, self.speed, []
         units = {
             "Nm s/rad, N s/m": friction / speed, "Nm, N": friction, "rad/s, m/s": speed, "1": friction.sign()
@@ -146,7 +148,7 @@ class FrictionLaws(nn.Module):
         # |gravity torque| has no derivative at zero, so it is smoothed below 1 % of typical friction.
         load = 0.01 * torch.where(friction > 0, friction, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
-        # Without bristles, dry friction changes its sign within 0.1 % of the typical speed: a wider
+        # At joints without bristles the smooth sign has a width of 0.1 % of the typical speed: a wider
         # transition would be confounded with hysteresis.
         rounding, sharp = self.stribeck_rounding, 0.001 * speed
         return FrictionConstants._make(
@@ -160,7 +162,7 @@ def turning(velocity: Tensor, width: Tensor) -> Tensor:
 
 
 class SlidingFriction(FrictionLaws):
-    """Friction without state: dry friction depends on velocity, with a trained width of the sign change."""
+    """Friction without state: dry friction depends on velocity; the width of its sign change is trained."""
 
     parameter_groups = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", SMOOTHING_VELOCITY),)
 
@@ -173,6 +175,6 @@ class SlidingFriction(FrictionLaws):
         self.register_buffer("raw_bristle_fractions", self.reach)
 
     def prepare(self) -> FrictionConstants:
-        """Return the constants in SI units."""
+        """Return the friction constants of all joints in SI units."""
         velocity = SMOOTHING_VELOCITY * self.speed * self.raw_coulomb_smoothing_velocity.exp()
         return super().prepare()._replace(coulomb_smoothing_velocity=velocity)

@@ -15,8 +15,11 @@ from spelgen.runtime.rows import vector
 class MotorInputs(nn.Module):
     """A constant input matrix G, (n, n): entry (i, j) is the torque of joint i per input of motor j.
 
-    A joint without a motor is passive. gains: rows of G. trained: rows of a mask, True for entries of G
-    that are trained; None: all entries are constant. The sign of an entry is never trained.
+    A joint without a motor is passive. The sign of an entry is never trained.
+
+    Args:
+        gains: rows of G.
+        trained: rows of a mask, True for entries of G that are trained; None: all entries are constant.
     """
 
     parameter_groups = (("raw_gains", "gains", "1"),)
@@ -32,7 +35,7 @@ class MotorInputs(nn.Module):
             nn.Buffer(is_trained * matrix),
         )
         self.passive = nn.Buffer(1.0 - matrix.any(dim=1).double())  # 1 for a joint without a motor, (n,)
-        self.gain_rows = nn.Buffer(is_trained.nonzero()[:, 0])  # row in G per trained gain
+        self.gain_rows = nn.Buffer(is_trained.nonzero()[:, 0])  # row of G of each trained gain, (trained,)
         raw = (
             nn.Parameter(torch.zeros(len(self.gain_rows), dtype=torch.float64))
             if len(self.gain_rows)
@@ -54,9 +57,9 @@ class MotorInputs(nn.Module):
         return applied(self.gains(), tau)
 
     def torque(self, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), for which G tau is this force, (..., n) [Nm, N].
+        """Return the inputs tau, (..., n), that solve G tau = force, with force (..., n) [Nm, N].
 
-        The result for a passive joint is the force at this joint.
+        A passive joint has no input: the result for it is the element of ``force``.
         """
         matrix = self.gains() + torch.diag(self.passive)
         tau: Tensor = torch.linalg.solve(matrix, force.unsqueeze(-1))
@@ -64,21 +67,21 @@ class MotorInputs(nn.Module):
 
 
 class ServoConstants(NamedTuple):
-    """The constants of all servos, (n,), positive."""
+    """The constants of all servos, (n,); all are positive, and the dead zone may be zero."""
 
-    kp: Tensor  # [Nm/rad, N/m]
-    kd: Tensor  # [Nm s/rad, N s/m]
-    limit: Tensor  # [Nm, N]
-    dead_zone: Tensor  # half the width [rad, m]; may be 0
+    kp: Tensor  # torque per position error [Nm/rad, N/m]
+    kd: Tensor  # torque per velocity [Nm s/rad, N s/m]
+    limit: Tensor  # largest torque [Nm, N]
+    dead_zone: Tensor  # half the width of the dead zone [rad, m]
 
 
 class PositionServo(nn.Module):
     """Position servos: tau = clip(kp d(u - q) - kd qd, -limit, limit), u commanded ``delay`` seconds earlier.
 
-    d(x) reduces |x| by half the width of a dead zone and is zero within the zone, which is due to play
-    of gears or to the controller. A servo is a spring and a damper. The spring
-    stores 1/2 kp d(q - u)^2, so that the arm with the input u is port-Hamiltonian. The trained
-    parameters are logarithms of the constants; a known kp is not trained.
+    q and qd are the position and velocity of a joint. d(x) is x reduced in magnitude by half the width of a
+    dead zone, and 0 within the zone, which is due to gear backlash or to the controller. A servo is a spring
+    and a damper: the spring stores the energy 1/2 kp d(q - u)^2, so that the arm with the input u is
+    port-Hamiltonian. The trained parameters are logarithms of kp and kd; a known kp is not trained.
     """
 
     parameter_groups = (
@@ -101,8 +104,8 @@ class PositionServo(nn.Module):
         self.nominal_kd = nn.Buffer(vector(kd))
         self.trained = nn.Buffer(vector(float(not x) for x in known))
         self.limit = nn.Buffer(vector(math.inf if x is None else x for x in limit))
-        self.delay = nn.Buffer(torch.zeros((), dtype=torch.float64))  # [s]
-        # This is a buffer, not a parameter, because only a fit to commands may set it.
+        self.delay = nn.Buffer(torch.zeros((), dtype=torch.float64))  # delay of commands [s]
+        # The dead zone is a buffer, not a parameter: training must not change it; a fit to commands sets it.
         self.dead_zone = nn.Buffer(torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kp = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kd = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))
@@ -116,7 +119,7 @@ class PositionServo(nn.Module):
         return self.nominal_kd * self.raw_kd.exp()
 
     def prepare(self) -> ServoConstants:
-        """Return the constants in SI units."""
+        """Return the constants of all servos in SI units."""
         return ServoConstants(self.kp(), self.kd(), self.limit, self.dead_zone.clamp(min=0))
 
     def forward(self, u: Tensor, q: Tensor, qd: Tensor) -> Tensor:
@@ -125,7 +128,7 @@ class PositionServo(nn.Module):
         return (kp * beyond(u - q, dead_zone) - kd * qd).clamp(-limit, limit)
 
     def stored_energy(self, u: Tensor, q: Tensor) -> Tensor:
-        """Return the elastic energy of the springs, (...) [J]."""
+        """Return the elastic energy of all servos, (...) [J], at commands u and positions q, (..., n)."""
         return 0.5 * (self.kp() * beyond(q - u, self.dead_zone.clamp(min=0)) ** 2).sum(dim=-1)
 
 

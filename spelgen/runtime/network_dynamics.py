@@ -16,9 +16,9 @@ from spelgen.runtime.rows import Joint, vector
 
 
 class NetworkConfiguration(NamedTuple):
-    """Configuration cache: all quantities that depend on q, but not on qd or the input."""
+    """Configuration cache of ``NetworkDynamics``: the quantities that depend on q and not on qd."""
 
-    encoded: Tensor  # encoded positions, the inputs of networks, see ``JointEncoding``
+    encoded: Tensor  # encoding of q, (..., 2 n), input of the networks
     mass: Tensor  # M(q), (..., n, n)
     intermediates: Intermediates  # intermediate values for the derivatives of M
     parameters: dict[str, Parameters]
@@ -43,14 +43,14 @@ class NetworkDynamics(PortHamiltonian):
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
 
     def prepare(self) -> dict[str, Parameters]:
-        """Return the parameter caches of mass matrix, potential and friction by name."""
-        # V has no offset, since a constant of V has no effect on the motion. The product 0 * scale has
-        # the right dtype and device.
+        """Return {"mass", "potential", "friction": parameter cache}."""
+        # The offset of V is zero, since a constant in V has no effect on the motion. It is computed as 0 *
+        # scale, which has the right dtype and device.
         potential = self.potential.prepare(self.scale, 0 * self.scale[0])
         return {"mass": self.mass.prepare(), "potential": potential, "friction": self.friction.prepare()}
 
     def configuration(self, q: Tensor, parameters: dict[str, Parameters]) -> NetworkConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m]."""
+        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m]."""
         encoded = self.encoding.forward(q)
         mass, intermediates = self.mass.forward(encoded, parameters["mass"])
         return NetworkConfiguration(encoded, mass, intermediates, parameters)
@@ -70,16 +70,15 @@ class NetworkDynamics(PortHamiltonian):
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         cache: NetworkConfiguration = self.at(q, qd)
         intermediates = self.potential.forward(cache.encoded, cache.parameters["potential"])[1]
-        # Each network takes one reverse sweep, the network of M with the cotangent 1/2 qd qd^T. The
-        # results are multiplied by the Jacobian of the encoding.
+        # Reverse mode: one sweep through the network of M for 1/2 qd^T M qd, one through the network of V.
+        # Both are gradients with respect to the encoding, which `encoding.vjp` converts to d/dq.
         kinetic = self.mass.kinetic_vjp(qd, cache.intermediates)
         return self.encoding.vjp(cache.encoded, kinetic - self.potential.vjp(intermediates, qd.new_ones(1)))
 
     def nonlinear_effects(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
         cache: NetworkConfiguration = self.at(q, qd)
-        # dM/dt is a single directional derivative along qd, so the n^3 Christoffel symbols are not
-        # computed.
+        # dM/dt is one directional derivative along qd. This takes less time than the n^3 Christoffel symbols.
         mass_rate = self.mass.jvp(self.encoding.jvp(cache.encoded, qd), cache.intermediates)
         return applied(mass_rate, qd) - self.lagrangian_gradient(cache, qd)
 
@@ -98,10 +97,10 @@ class NetworkDynamics(PortHamiltonian):
 
 
 class DenseInputDynamics(NetworkDynamics):
-    """A model of networks with a diagonal input matrix G(q).
+    """A model whose M, V and D are networks, as is its diagonal input matrix G(q).
 
-    The network of G has three outputs per joint, one per axis. Only the output of the z axis, about
-    or along which the joint moves, is used.
+    The network of G has three outputs per joint, one for each axis of the joint's frame. Only the output of
+    the z axis, about or along which the joint moves, is used.
     """
 
     def __init__(self, *, input_network: MaskedNetwork, **parts: Any) -> None:
@@ -110,7 +109,7 @@ class DenseInputDynamics(NetworkDynamics):
         self.input_network = input_network
 
     def prepare(self) -> dict[str, Parameters]:
-        """Return the parameter caches of all networks by name, including the network of G."""
+        """Return {"mass", "potential", "friction", "input": parameter cache}; "input" is the network of G."""
         return super().prepare() | {"input": self.input_network.prepare(self.moving, self.moving.sum(dim=1))}
 
     def _gains(self, cache: NetworkConfiguration) -> Tensor:
@@ -126,14 +125,17 @@ class DenseInputDynamics(NetworkDynamics):
         return self._gains(cache) * tau
 
     def input_torque(self, cache: NetworkConfiguration, force: Tensor) -> Tensor:
-        """Return the inputs, (..., n), for which G(q) tau is this force, (..., n) [Nm, N]."""
+        """Return the inputs tau, (..., n), that solve G(q) tau = force, with force (..., n) [Nm, N]."""
         return force / self._gains(cache)
 
 
 class NetworkFriction(nn.Module):
-    """Base class of dissipation matrices D(q, qd) from a network, in units of typical friction and speed."""
+    """Base class of dissipation matrices D(q, qd) that a network computes.
 
-    prepare: Callable[[], Parameters]  # returns the parameter cache
+    The network's outputs are in units of the joint's typical friction and typical speed.
+    """
+
+    prepare: Callable[[], Parameters]  # returns the quantities that depend on parameters only
     # Returns the product of D(q, qd) and a matrix, (..., n, k). The arguments are the encoded positions,
     # qd, the parameter cache, and the matrix, (..., n, k).
     forward: Callable[[Tensor, Tensor, Parameters, Tensor], Tensor]
@@ -171,9 +173,9 @@ class JointFriction(NetworkFriction):
         return self.nominal * F.softplus(self.raw_viscous) / self.speed
 
     def prepare(self) -> JointFrictionParameters:
-        """Return the parameter cache."""
-        # Dry friction decreases to zero below the smoothing velocity, whose initial value is 3 % of the
-        # typical speed.
+        """Return the quantities that depend on trained parameters only (parameter cache)."""
+        # Dry friction is multiplied by qd / sqrt(qd^2 + smoothing). The root of `smoothing` is initially 3 %
+        # of the typical speed and at least 0.1 %, so that the quotient is always smooth.
         smoothing = self.speed**2 * (0.001**2 + (0.03 * self.raw_smoothing.exp()) ** 2)
         start = torch.full_like(self.speed, -2.0)
         layers = self.network.prepare(torch.diag(0 * start + 1), start)
@@ -193,25 +195,25 @@ class JointFriction(NetworkFriction):
 
 
 class DenseFriction(NetworkFriction):
-    """A dense, positive semi-definite D(q, qd) = L L^T, where L has a row for each axis of a joint.
+    """A dense, positive semi-definite D(q, qd) = L L^T, where L has ``axes`` rows per joint, one per axis.
 
-    ``axes`` is the number of axes per joint. A joint rotates about or moves along its last axis only, so
-    only the rows of the last axes are computed.
+    A joint rotates about or moves along its last axis only, so only the row of the last axis of each joint is
+    computed.
     """
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:
         super().__init__(joints, network)
         rows = axes * len(joints)
         row, column = torch.tril_indices(rows, rows)
-        # Linear map, (rows, rows, entries), from the entries of a lower triangle, rows in sequence, to
-        # the matrix.
+        # Linear map, (rows, rows, entries), from the entries of a lower triangle, in row-major order, to the
+        # matrix.
         spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
         # The initial L is diagonal, in units of the square root of typical friction / typical speed.
         self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
 
     def prepare(self) -> Layers:
-        """Return the layers of a network whose outputs are the computed rows of L, flattened."""
+        """Return the layers of a network whose outputs are the rows of L for the last axes, flattened."""
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
         output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)
         return self.network.prepare(output_map, (size * self.initial).flatten())

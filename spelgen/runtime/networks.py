@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from spelgen.runtime.parts import Intermediates, Layers, Rows
 from spelgen.runtime.rows import Joint, vector
 
-GRID = 4  # Gaussian bumps per edge of a Kolmogorov-Arnold network
+GRID = 4  # number of Gaussians in the function of one edge of a Kolmogorov-Arnold network
 SPACING = 2 / (GRID - 1)
 
 
@@ -39,25 +39,29 @@ class JointEncoding(nn.Module):
         return torch.cat([(self.slope - second) * qd, self.revolute * first * qd], dim=-1)
 
     def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
-        """Return a gradient with respect to q, (..., n), from the gradient with respect to the encoding."""
+        """Return the gradient of a scalar with respect to q, (..., n).
+
+        cotangent: gradient of this scalar with respect to the encoding of q, (..., 2 n).
+        """
         first, second = encoded.chunk(2, dim=-1)
         by_first, by_second = cotangent.chunk(2, dim=-1)
         return by_first * (self.slope - second) + by_second * self.revolute * first
 
 
 def hidden_units(outputs: Sequence[tuple[int, ...]], width: int, min_units: int) -> list[tuple[int, ...]]:
-    """Return for each unit of a hidden layer the joints that the unit may depend on.
+    """Return a tuple of joints for each unit of a hidden layer: the joints that the unit may depend on.
 
-    Outputs that depend on the same joints form a group. Each group gets units in proportion to its
-    number of outputs, ``width`` units in total, but at least ``min_units`` per group.
+    outputs: the joints that each output of the network depends on. Outputs that depend on the same joints
+    form a group. The ``width`` units are divided among the groups in proportion to their numbers of outputs,
+    but each group has at least ``min_units``.
     """
     counts = Counter(outputs)
     groups = sorted(counts, key=lambda joints: (len(joints), joints))
     ideal = [width * counts[group] / len(outputs) for group in groups]
     units = [max(min_units, round(share)) for share in ideal]
     index = range(len(groups))
-    # Rounding may change the total number of units: groups with the largest rounding errors are
-    # corrected first.
+    # The sum of the rounded numbers of units may differ from `width`. The groups with the largest rounding
+    # errors are corrected first.
     while sum(units) > width and max(units) > min_units:
         units[max(index, key=lambda k: units[k] - ideal[k] if units[k] > min_units else -width)] -= 1
     while sum(units) < width:
@@ -73,10 +77,10 @@ def joint_masks(
     depth: int,
     min_units: int,
 ) -> Iterator[Tensor]:
-    """Yield for each layer the factors that multiply the weights, (units, inputs).
+    """Yield one mask for each layer, (units, inputs): the factors by which the weights are multiplied.
 
-    A factor is 0 if the input depends on a joint that the unit must not depend on. Other factors are 1,
-    but in the first layer they are the scales of the inputs.
+    A factor is 0 if the input depends on a joint that the unit must not depend on. All other factors are 1;
+    in the first layer, they are the scales of the inputs.
 
     Args:
         joints: joints of the arm.
@@ -110,13 +114,13 @@ class MaskedNetwork(nn.Module):
         min_units: smallest number of hidden units per group of outputs that depend on the same joints.
     """
 
-    points = 0  # number of bumps of an edge's function; 0: each edge has one weight
+    points = 0  # number of Gaussians in the function of an edge; 0: an edge is a single weight
 
-    # Returns offset + output_map y, (..., rows), for the outputs y of the network before this linear map
-    # (see ``prepare``), and intermediate values for derivatives.
+    # Returns the outputs, (..., rows), of the layers that ``prepare`` returned, and the intermediate values
+    # that ``vjp`` and ``jvp`` need.
     forward: Callable[[Tensor, Layers], tuple[Tensor, Intermediates]]
-    vjp: Callable[[Intermediates, Tensor], Tensor]  # cotangent (..., rows) times the Jacobian: (..., inputs)
-    jvp: Callable[[Intermediates, Tensor], Tensor]  # Jacobian times a tangent: (..., rows)
+    vjp: Callable[[Intermediates, Tensor], Tensor]  # see ``MaskedMLP.vjp``
+    jvp: Callable[[Intermediates, Tensor], Tensor]  # see ``MaskedMLP.jvp``
 
     def __init__(
         self,
@@ -130,8 +134,9 @@ class MaskedNetwork(nn.Module):
         min_units: int = 1,
     ) -> None:
         super().__init__()
-        # The initial weights of an edge are a random number times `slopes`: 1 for a single weight, or
-        # heights of bumps that increase linearly over the grid, so that the function is nearly linear.
+        # The initial weights of an edge are one random number times `slopes`: 1 for a single weight, or
+        # numbers that increase linearly over the grid of Gaussians, so that the edge's function is nearly
+        # linear.
         slopes = torch.ones((), dtype=torch.float64)
         if self.points:
             slopes = torch.linspace(-1, 1, self.points, dtype=torch.float64)
@@ -148,10 +153,10 @@ class MaskedNetwork(nn.Module):
         nn.init.zeros_(self.weights[-1])  # The initial outputs are zero.
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return masked layers that compute offset + output_map y from the outputs y of this network.
+        """Return masked layers that compute offset + output_map y, with y the outputs of this network.
 
-        y: (..., outputs). output_map: (rows, outputs). offset: (rows,). The linear map is included in the
-        last layer.
+        y: (..., outputs). output_map: (rows, outputs). offset: (rows,). The weights of the last layer are
+        multiplied by output_map, which saves an operation per evaluation.
         """
         weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
         biases = list(self.biases)
@@ -163,7 +168,7 @@ class MaskedMLP(MaskedNetwork):
     """A multilayer perceptron with tanh units; arguments: see ``MaskedNetwork``."""
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
-        """Return offset + output_map y, (..., rows), and the intermediates of ``vjp`` and ``jvp``."""
+        """Return the outputs of the layers, (..., rows), and intermediate values for ``vjp`` and ``jvp``."""
         layer, hidden = encoded, []
         for weight, bias in layers[:-1]:
             layer = torch.tanh(F.linear(layer, weight, bias))
@@ -171,16 +176,16 @@ class MaskedMLP(MaskedNetwork):
         return F.linear(layer, *layers[-1]), (hidden, layers)
 
     def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
-        """Return a cotangent, (..., rows), times the network's Jacobian, (..., inputs), in reverse mode."""
+        """Return cotangent^T J, (..., inputs), with the network's Jacobian J; cotangent: (..., rows)."""
         hidden, layers = intermediates
         layer: Tensor = cotangent @ layers[-1][0]
         for (weight, _), value in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
-            # tanh_backward(x, y) = x (1 - y^2) in one operation
+            # tanh_backward(x, y) is x (1 - y^2).
             layer = torch.ops.aten.tanh_backward(layer, value) @ weight
         return layer
 
     def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
-        """Return the network's Jacobian times a tangent, (..., inputs): (..., rows), in forward mode."""
+        """Return J tangent, (..., rows), with the network's Jacobian J; tangent: (..., inputs)."""
         hidden, layers = intermediates
         for (weight, _), value in zip(layers[:-1], hidden, strict=True):
             tangent = torch.ops.aten.tanh_backward(F.linear(tangent, weight), value)
@@ -188,7 +193,7 @@ class MaskedMLP(MaskedNetwork):
 
 
 class Bumps(NamedTuple):
-    """The bumps at the inputs of a layer of ``MaskedKAN``, (..., inputs, GRID) each."""
+    """Arguments and values of the Gaussians of a layer of ``MaskedKAN``, (..., inputs, GRID) each."""
 
     distance: Tensor  # distance of the input from each grid point, in grid spacings
     height: Tensor
@@ -210,7 +215,7 @@ class MaskedKAN(MaskedNetwork):
         return Bumps(distance, torch.exp(-distance * distance))
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
-        """Return offset + output_map y, (..., rows), and the intermediates of ``vjp`` and ``jvp``."""
+        """Return the outputs of the layers, (..., rows), and intermediate values for ``vjp`` and ``jvp``."""
         bumps, hidden = [self._bumps(encoded)], []
         for weight, bias in layers[:-1]:
             hidden.append(torch.tanh(F.linear(bumps[-1].height.flatten(-2), weight, bias)))
@@ -218,7 +223,7 @@ class MaskedKAN(MaskedNetwork):
         return F.linear(bumps[-1].height.flatten(-2), *layers[-1]), (bumps, hidden, layers)
 
     def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
-        """Return a cotangent, (..., rows), times the network's Jacobian, (..., inputs), in reverse mode."""
+        """Return cotangent^T J, (..., inputs), with the network's Jacobian J; cotangent: (..., rows)."""
         bumps, hidden, layers = intermediates
         layer = self._bumps_vjp(bumps[-1], cotangent @ layers[-1][0])
         for index in reversed(range(len(hidden))):
@@ -231,7 +236,7 @@ class MaskedKAN(MaskedNetwork):
         return (-2 / SPACING) * (bumps.distance * bumps.height * cotangent).sum(dim=-1)
 
     def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
-        """Return the network's Jacobian times a tangent, (..., inputs): (..., rows), in forward mode."""
+        """Return J tangent, (..., rows), with the network's Jacobian J; tangent: (..., inputs)."""
         bumps, hidden, layers = intermediates
         for index, (weight, _) in enumerate(layers):
             slopes = bumps[index].distance * bumps[index].height

@@ -1,4 +1,4 @@
-"""Interfaces between a model and its mass matrix and inputs, and symmetric matrices from lower triangles."""
+"""Interfaces of the mass matrix and the input matrix of a model, and the function ``symmetric``."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -8,10 +8,9 @@ from torch import Tensor
 
 Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
-Entries = Callable[..., Tensor]  # returns M, (..., n, n), for its functions and constants, (...) each
+Entries = Callable[..., Tensor]  # returns M, (..., n, n), from functions and constants, (...) each
 Layers = tuple[tuple[Tensor, Tensor], ...]  # masked weights, and biases, of each layer of a network
-# The following types are Any, because each model and each part of a model has named tuples of its own
-# for these quantities.
+# The following types are Any, because each class of models defines its own named tuples for them.
 Intermediates = Any  # values of a forward pass that its derivatives need
 Parameters = Any  # parameter cache: quantities that depend on trained parameters only
 Configuration = Any  # configuration cache: quantities that depend on q, for given parameters
@@ -44,7 +43,7 @@ class Inputs(Protocol):
         """Return G tau, (..., n) [Nm, N]."""
 
     def torque(self, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), for which G tau is this force, (..., n) [Nm, N]."""
+        """Return the inputs tau, (..., n), that solve G tau = force, with force (..., n) [Nm, N]."""
 
 
 def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:

@@ -12,7 +12,7 @@ from spelgen.runtime.rows import Joint
 
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     """Return the product of a matrix, (..., n, m), and a vector, (..., m)."""
-    # A single state needs one operation in place of three: the number of operations determines the time.
+    # For one state (a vector) the product is a single operation; for a batch, two reshapes are added.
     if vector.dim() == 1:
         return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
@@ -96,7 +96,7 @@ class PortHamiltonian(nn.Module):
         return tau if self.inputs is None else self.inputs.force(tau)
 
     def input_torque(self, cache: Configuration, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), for which G tau is this force, (..., n) [Nm, N]."""
+        """Return the inputs tau, (..., n), that solve G tau = force, with force (..., n) [Nm, N]."""
         return force if self.inputs is None else self.inputs.torque(force)
 
     def momentum(self, q: Position, qd: Tensor) -> Tensor:
@@ -105,8 +105,8 @@ class PortHamiltonian(nn.Module):
 
     def velocity(self, q: Position, p: Tensor) -> Tensor:
         """Return qd = M(q)^-1 p, (..., n)."""
-        # A Cholesky factor would be slower: its derivative takes several times the time of a linear
-        # solve.
+        # `solve` ignores that M is positive definite. A Cholesky factorisation is not used, because its
+        # derivative takes several times as long as the derivative of `solve`.
         qd: Tensor = torch.linalg.solve(self.at(q, p).mass, p.unsqueeze(-1))
         return qd.squeeze(-1)
 
@@ -121,14 +121,15 @@ class PortHamiltonian(nn.Module):
         cache = self.at(q, qd, tau)
         force = self.input_force(cache, qd, tau) - self.nonlinear_effects(cache, qd)
         force = force - self.friction_torque(cache, qd, *state)
-        return self.velocity(cache, force)  # M^-1 force
+        return self.velocity(cache, force)  # `velocity` multiplies by M^-1
 
     def inverse_dynamics(self, q: Position, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the input tau, (..., n), that gives qdd; state: friction state, if the model has one."""
         cache = self.at(q, qd, qdd)
         force = applied(cache.mass, qdd) + self.nonlinear_effects(cache, qd)
         force = force + self.friction_torque(cache, qd, *state)
-        # ``input_force`` may have an offset, the force at tau = 0, which is subtracted.
+        # ``input_force`` may be nonzero at tau = 0, for example due to a torque offset of the sensors: it is
+        # subtracted, so that the remaining force is linear in tau.
         return self.input_torque(cache, force - self.input_force(cache, qd, 0 * qd))
 
     def port_hamiltonian_rhs(
@@ -143,13 +144,13 @@ class PortHamiltonian(nn.Module):
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """Return d/dt of the state (q, p, z), (..., 2 n + n K), or of (q, p, z, tau) with constant tau.
 
-        A state without z, (..., 2 n), gives friction that depends on velocity.
+        For a state (q, p), (..., 2 n), without the friction state z, friction depends on velocity only.
         """
         n, size = self.n, self.n * self.elements
         if state.shape[-1] < 2 * n + size:
             size = 0
-        # ODE solvers integrate one vector, so a constant input is appended to the state, with rate
-        # zero.
+        # ODE solvers integrate one vector: a constant input is appended to the state, and its time derivative
+        # is zero.
         q, p, flat, tau = state.tensor_split((n, 2 * n, 2 * n + size), dim=-1)
         z = [flat.reshape(*flat.shape[:-1], n, -1)] if size else []
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), *z)

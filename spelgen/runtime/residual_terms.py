@@ -19,20 +19,20 @@ from spelgen.runtime.rows import Joint, vector
 
 # Number of cubic B-splines over the range of a joint.
 SPLINES = 34
-# Number of ripple harmonics per revolution of the joint. Two more harmonics are per revolution of the
-# motor: they represent gear teeth and motor poles.
+# Number of ripple harmonics per revolution of the joint. For a gear ratio above this number, there are also
+# the first two harmonics of the motor's revolution, which represent gear teeth and motor poles.
 HARMONICS = 64
-# Bound of the magnitude of the friction factor's logarithm: the factor is between 0.1 and 10.
+# Largest magnitude of the logarithm of the friction factor: the factor is between 0.1 and 10.
 LARGEST = math.log(10.0)
 
 
 class ResidualParameters(NamedTuple):
     """Parameter cache of ``ResidualTerms``: quantities that depend on trained parameters only."""
 
-    splines: Tensor  # coefficients of the torque [Nm, N] and of the friction factor, (n, SPLINES, 2)
+    splines: Tensor  # coefficients of torque [Nm, N] and of log friction factor, (n, SPLINES, 2)
     ripple: Tensor  # amplitudes of cosines, then sines [Nm], (n, 2 HARMONICS + 4)
-    constant: Tensor  # sum of the constants' contributions to M, (n n,)
-    functions: Tensor  # largest contribution of each function to M, (functions, n n)
+    constant: Tensor  # part of R that does not depend on q, flattened, (n n,)
+    functions: Tensor  # matrix by which each tanh output is multiplied in R, (functions, n n)
     mass: Layers | None
     potential: Layers | None
 
@@ -51,19 +51,19 @@ class ResidualConfiguration(NamedTuple):
 
 
 class ResidualTerms(nn.Module):
-    """Residual terms: R(q) is added to M, terms are added to V, and a factor multiplies friction.
+    """Residual terms: R(q) is added to M, terms are added to V, and friction is multiplied by a factor.
 
-    Each joint has a torque dV/dq that is a function of its position, in units of typical friction. It is
-    a sum of cubic B-splines over the joint's range. A revolute joint has in addition harmonics of its
-    rotation and of the rotation of its motor. The friction factor of a joint is the exponential of
-    another sum of splines, between 0.1 and 10. Sums of splines fall to zero within three knot
-    spacings beyond the ends of the range.
+    Torque: dV/dq of each joint has a term that depends on the joint's position only, a sum of cubic B-splines
+    over the range of the joint. A revolute joint has in addition harmonics of its rotation, and of its
+    motor's rotation. Friction: the factor of a joint is the exponential of another sum of splines, between
+    0.1 and 10. The splines fall to zero within three knot spacings beyond the range.
 
-    R is ``entries(*functions, *constants)``. Each function is a bound times the tanh of an output of
-    ``network``, each constant a bound times the tanh of a parameter; the ``bounds`` make armature + R
-    positive definite for all q and all parameters. ``potential_scale`` [J] times the output of the
-    network ``potential`` is added to V. If all parameters are zero, R and the terms of V are zero, and
-    the factor is one.
+    Mass: R is ``entries(*functions, *constants)``, with ``entries`` a function in the emitted module. A
+    function is a bound times the tanh of an output of ``network``; a constant is a bound times the tanh of a
+    parameter. The ``bounds`` make armature + R positive definite for all q and all parameters. Potential:
+    ``potential_scale`` [J] times the output of the network ``potential`` is added to V.
+
+    If all parameters are zero, R and the terms of V are zero, and the factor of friction is one.
     """
 
     parameter_groups = (
@@ -88,8 +88,8 @@ class ResidualTerms(nn.Module):
         n = len(joints)
         zeros = torch.zeros(n, SPLINES, dtype=torch.float64)
         self.encoding = JointEncoding(joints)
-        # The range is divided into SPLINES - 3 intervals; the first and the last spline have their
-        # middles one interval beyond the ends.
+        # The range is divided into SPLINES - 3 intervals of length `spacing`. A spline has its middle at each
+        # end of an interval, and one interval beyond each end of the range.
         spacing = 2 * vector(joint.half_range for joint in joints).unsqueeze(-1) / (SPLINES - 3)
         knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2
         self.spacing = nn.Buffer(spacing)
@@ -111,10 +111,10 @@ class ResidualTerms(nn.Module):
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
         # 1 / |coefficient| of each function and constant in each entry of M, (functions + constants, n, n).
-        # For the coefficient zero it is a very large number, which limits no function or constant.
+        # It is 1e30 for a zero coefficient, so that the minimum in `bounds` ignores this entry.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
-        # R may reduce the armature by at most 90 %. Each term in a row of M gets an equal share: 0.9
-        # divided by the largest number of terms in a row.
+        # R may reduce the armature by at most 90 %. The bound of each term is an equal share of this: 0.9
+        # divided by the largest number of functions and constants in one row of M.
         self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
@@ -127,11 +127,12 @@ class ResidualTerms(nn.Module):
         return self.entries(*rows)
 
     def bounds(self, armature: Tensor) -> Tensor:
-        """Return bounds of the functions and constants, (functions + constants,), for an armature (n, n).
+        """Return the largest magnitudes of the functions and constants in R, (functions + constants,).
 
-        For d = 1 / (row sums of |armature^-1|), armature - diag(d) is positive semi-definite. If the
-        row sums of |R| / sqrt(d d^T) are less than one, diag(d) + R is positive definite. Both follow
-        from diagonal dominance. The sum of both matrices, armature + R, is then positive definite.
+        armature: matrix A, (n, n). With these bounds, A + R is positive definite, since it is the sum of A -
+        diag(d) and diag(d) + R, with d = 1 / (row sums of |A^-1|). The first is positive semi-definite. The
+        second is positive definite if all row sums of |R| / sqrt(d d^T) are less than one. Both statements
+        follow from diagonal dominance.
         """
         root = torch.linalg.inv(armature).abs().sum(dim=-1).rsqrt()
         smallest: Tensor = (root.unsqueeze(-1) * root * self.inverse).amin(dim=(-2, -1))
@@ -142,7 +143,7 @@ class ResidualTerms(nn.Module):
         return LARGEST * (self.raw_friction_splines / LARGEST).tanh()
 
     def prepare(self, armature: Tensor) -> ResidualParameters:
-        """Return the parameter cache; armature: armature matrix, (n, n)."""
+        """Return the parameter cache: quantities that depend on parameters only; armature: matrix, (n, n)."""
         splines = [self.unit * self.raw_torque_splines, self.friction_logarithms()]
         rows = self._by_entry(self.bounds(armature)).flatten(1)
         functions, constants = rows.tensor_split((self.functions,))
@@ -162,16 +163,16 @@ class ResidualTerms(nn.Module):
         )
 
     def at(self, q: Tensor, parameters: ResidualParameters) -> ResidualConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m]."""
+        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m]."""
         encoded = self.encoding.forward(q)
         splines = torch.einsum("...ik,ikm->...im", self.splines(q), parameters.splines)
-        # The splines of torque and friction factor have the same basis, so one product gives both.
+        # Torque and friction factor have the same splines: both sums are one product.
         smooth, friction = splines.unbind(-1)
         torque = smooth + (self.waves(q) * parameters.ripple).sum(dim=-1)
         mass, slope, intermediates = parameters.constant.expand(*q.shape[:-1], -1), None, None
         if self.mass is not None and parameters.mass is not None:
             y, intermediates = self.mass.forward(encoded, parameters.mass)
-            # tanh bounds the outputs, so that M + R is positive definite, see ``bounds``.
+            # tanh bounds the outputs, so that armature + R is positive definite, see ``bounds``.
             output = y.tanh()
             mass = F.linear(output, parameters.functions.mT, parameters.constant)
             slope = 1 - output * output
@@ -180,7 +181,10 @@ class ResidualTerms(nn.Module):
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, cache: ResidualConfiguration) -> Tensor:
-        """Return the residual terms of V, (...) [J]; the energy of a B-spline is zero at its middle."""
+        """Return the residual terms of V, (...) [J].
+
+        The energy of a B-spline is the integral of its torque from the middle of the spline to q.
+        """
         distance = self._distances(cache.q)
         size = distance.abs()
         # Integral of a B-spline of unit spacing from its middle to the distance `size`.
@@ -198,8 +202,8 @@ class ResidualTerms(nn.Module):
         """Return d/dq of the residual terms of 1/2 qd^T M(q) qd - V(q), (..., n) [Nm, N]."""
         by_encoded = torch.zeros_like(cache.encoded)
         if self.mass is not None and cache.slope is not None:
-            # The cotangent of R is 1/2 qd qd^T. It is propagated back through the linear map, tanh and
-            # the network.
+            # Reverse mode for 1/2 qd^T R qd: its gradient with respect to R is 1/2 qd qd^T, which is
+            # multiplied by the Jacobians of the linear map, of tanh and of the network.
             kinetic = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2) @ cache.parameters.functions.mT
             by_encoded = self.mass.vjp(cache.intermediates, cache.slope * kinetic)
         if self.potential is not None and cache.parameters.potential is not None:
@@ -217,8 +221,8 @@ class ResidualTerms(nn.Module):
 
     def splines(self, q: Tensor) -> Tensor:
         """Return the values of the cubic B-splines at q, (..., n, SPLINES); their maximum is 2/3."""
-        # A cubic B-spline of unit spacing is ((2 - d)^3 - 4 (1 - d)^3) / 6 at the distance d from its
-        # middle, where negative brackets are replaced by zero.
+        # At the distance d from its middle, a cubic B-spline of unit spacing is (max(2 - d, 0)^3 - 4 max(1 -
+        # d, 0)^3) / 6.
         wide = (2 - self._distances(q).abs()).relu()
         return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4) / 6
 
@@ -242,7 +246,7 @@ class ResidualDynamics(RigidBodyDynamics):
         self.residuals = residuals
 
     def prepare(self) -> RigidParameters:
-        """Return the parameter cache; valid until a parameter changes."""
+        """Return the parameter cache, which is valid until a parameter changes."""
         prepared = super().prepare()
         if self.residuals is None:
             return prepared

@@ -37,10 +37,13 @@ class RigidConfiguration(NamedTuple):
 class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction and a torque offset.
 
-    The friction state z, (..., n, K) [rad, m], has the displacements of the bristles, whose energy is
-    part of H. Without z, dry friction depends on velocity. motor_speeds: rows of the matrix C, (n, n),
-    for which C qd are the motor speeds; friction, z and armature then belong to the motors. None: every
-    motor drives its own joint. servo: position servos; None: inputs are torques.
+    The friction state z, (..., n, K) [rad, m], has the displacements of the bristles, whose energy is part of
+    H. Without z, dry friction depends on velocity.
+
+    Args:
+        motor_speeds: rows of the matrix C, (n, n), for which C qd are the motor speeds; friction, z and
+            armature then belong to the motors. None: every motor drives its own joint.
+        servo: position servos; None: inputs are torques.
     """
 
     parameter_groups = (
@@ -68,14 +71,14 @@ class RigidBodyDynamics(PortHamiltonian):
         self.friction, self.servo = friction, servo
         self.elements = friction.reach.shape[1]
         self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
-        # 1 for an input that drives a joint, 0 for the input of a passive joint, (n,).
+        # 1 for an input that drives a joint, else 0 (passive joints have no motor), (n,).
         self.actuated = nn.Buffer(self.input_matrix(self.nominal_armature).any(dim=0).double())
         # Logarithm of armature / nominal armature.
         self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))
-        # The offset of the measured torque is in units of typical friction.
+        # Offset of the measured torque, in units of typical friction.
         self.raw_offset = nn.Parameter(torch.zeros_like(self.actuated))
-        # Friction compensation is in units of typical friction / typical speed. This is a buffer, not a
-        # parameter, because only a fit to torques sets it.
+        # Friction compensation, in units of typical friction / typical speed. It is a buffer, not a
+        # parameter: training must not change it; a fit to torques sets it.
         self.raw_friction_compensation = nn.Buffer(torch.zeros_like(self.actuated))
         motors = None if motor_speeds is None else torch.stack([vector(row) for row in motor_speeds])
         # `motors` is C, (n, n), which maps joint speeds to motor speeds. `loads` is C^-1, whose transpose
@@ -113,16 +116,16 @@ class RigidBodyDynamics(PortHamiltonian):
 
     @property
     def torque_offset(self) -> Tensor:
-        """Torque that the sensors measure if the true torque is zero, (n,) [Nm, N]."""
+        """Torque offset of the sensors, (n,) [Nm, N]: the measured torque if the true torque is zero."""
         return self.raw_offset * self.friction.nominal * self.actuated
 
     @property
     def friction_compensation(self) -> Tensor:
-        """Torque per velocity that drives add, not part of measured torque, (n,) [Nm s/rad, N s/m]."""
+        """Coefficient k of a torque k qd that drives add to the measured torque, (n,) [Nm s/rad, N s/m]."""
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self) -> RigidParameters:
-        """Return the parameter cache; valid until a parameter changes."""
+        """Return the parameter cache, which is valid until a parameter changes."""
         points = torch.ops.aten.block_diag([*self.bodies.forward()])
         armature = torch.diag_embed(self.armature)
         if self.motors is not None:
@@ -130,7 +133,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return RigidParameters(points, armature, self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m]."""
+        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m]."""
         chain, ratios = self.chain.forward(q, prepared.points), self.chain.ratios
         mass = ratios.mT @ (chain.jacobian @ chain.jacobian.mT) @ ratios + prepared.armature
         return RigidConfiguration(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
@@ -175,7 +178,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return torque if self.motors is None else torque @ self.motors
 
     def dissipation(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
-        """Return D(q, qd) of friction without bristles, (..., n, n) [Nm s/rad, N s/m]."""
+        """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m], if the friction state is unknown."""
         cache: RigidConfiguration = self.at(q, qd)
         friction = cache.prepared.friction
         qd, gravity = self._at_motors(cache, qd)
@@ -190,16 +193,20 @@ class RigidBodyDynamics(PortHamiltonian):
     def memory(self, qd: Tensor) -> Tensor:
         """Return the friction state z, (..., n, K), after a long motion at constant qd, (..., n).
 
-        Friction with this z is up to 7.4 % larger than friction without z near the smoothing velocity,
-        and equal far above it.
+        Friction with this z exceeds friction that depends on velocity only, by at most 7.4 % of dry friction.
+        The difference is largest near the smoothing velocity, and vanishes at high velocities.
         """
-        # tanh reaches one within a few widths. The smooth sign of friction without z does so slowly,
-        # and the initial z would cause a stiff transient.
+        # tanh reaches 1 at a few times the smoothing velocity. The smooth sign of
+        # ``FrictionConstants.torque`` reaches 1 slowly: with it, z would start slightly off the break-away
+        # displacement, which causes a stiff transient.
         direction = (self._motor(qd) / self.friction.prepare().coulomb_smoothing_velocity).tanh()
         return direction.unsqueeze(-1) * self.friction.reach
 
     def memory_rate(self, z: Tensor, qd: Tensor) -> Tensor:
-        """Return dz/dt, (..., n, K): the motor velocity, or zero for a bristle that slides."""
+        """Return dz/dt, (..., n, K): the motor velocity, or 0 if the bristle slides.
+
+        A bristle slides at its break-away displacement if the velocity would increase the displacement.
+        """
         qd = self._motor(qd).unsqueeze(-1)
         return qd * (qd.sign() * z < self.friction.reach)
 

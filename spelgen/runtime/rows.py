@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 Triple = tuple[float, float, float]
-Tensor6 = tuple[float, float, float, float, float, float]  # (xx, xy, xz, yy, yz, zz)
+Tensor6 = tuple[float, float, float, float, float, float]  # inertia tensor (xx, xy, xz, yy, yz, zz)
 
 
 def _rounded(value: float) -> float:
@@ -30,19 +30,22 @@ class Joint(NamedTuple):
     friction: float  # typical magnitude of the friction torque [Nm, N]
     armature: float  # nominal rotor inertia times gear^2 [kg m^2, kg]
     gear: float = 1.0  # motor revolutions per revolution of the joint
-    # Center and half range of the working range [rad, m]; None: computed from the limits.
+    # (center, half range) of the typical motion [rad, m]; None: computed from the limits.
     typical_range: tuple[float, float] | None = None
 
     @property
     def center(self) -> float:
-        """Middle of the range of motion [rad, m]."""
+        """Middle of the typical motion, or of the limits [rad, m]."""
         if self.typical_range is not None:
             return self.typical_range[0]
         return 0.0 if self.lower is None or self.upper is None else _rounded((self.lower + self.upper) / 2)
 
     @property
     def half_range(self) -> float:
-        """Half the range of motion [rad, m]; scaled q of a prismatic joint: (q - center) / half_range."""
+        """Half the range of the typical motion, or of the limits [rad, m].
+
+        Encoding of the position of a prismatic joint: (q - center) / half_range.
+        """
         if self.typical_range is not None:
             return self.typical_range[1]
         return (

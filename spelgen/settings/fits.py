@@ -18,14 +18,16 @@ Optimizer = Literal["adamw", "lbfgs"]
 Adaptation = Literal["load", "friction", "unit"]
 Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
-Substeps = Annotated[Count, Field(le=1000)]  # a bound, because the time of a fit is proportional to it
+# The number of integrator steps is bounded, because the duration of a fit is proportional to it.
+Substeps = Annotated[Count, Field(le=1000)]
 
 
 @dataclass(frozen=True)
 class WindowFitDefaults:
-    """Defaults of the optimizers of fits on windows of a log, chosen on the arms of `benchmarks/arms.py`."""
+    """Default options of the optimizers of fits to windows of logs, chosen with the arms of `benchmarks/arms.py`."""
 
-    # [1] Up to this number of windows the default optimizer is L-BFGS, with all windows in each step; above, AdamW.
+    # [1] Largest number of windows for which L-BFGS with all windows in each step is the default optimizer. For more
+    # windows the default is AdamW.
     few_windows: int = 1024
     # [1] Weight decay of L-BFGS: factor of half the sum of squared weights that is added to the loss.
     lbfgs_decay: float = 2e-5
@@ -38,8 +40,8 @@ class WindowFitDefaults:
 
 
 DEFAULTS = WindowFitDefaults()
-# Options that apply only with certain values of another option: name -> (other option, value that it must have, value
-# that it must not have).
+# Options that apply only with a certain value of another option:
+# {name: (other option, value with which the option applies, value with which it does not apply)}.
 UNLESS = {
     "batch": ("optimizer", "adamw", "lbfgs"),
     "learning_rate": ("optimizer", "adamw", "lbfgs"),
@@ -91,8 +93,8 @@ class GaussianPrior(Group):
 class FitConfig(Group):
     """Base class of the options of one objective.
 
-    of_rigid_bodies, of_networks: names of the options that apply only to models of rigid bodies, or only to models of
-    networks.
+    of_rigid_bodies: names of the options that apply only to models of rigid bodies. of_networks: names of the options
+    that apply only to models of networks.
     """
 
     objective: ClassVar[Objective]
@@ -103,7 +105,7 @@ class FitConfig(Group):
     @classmethod
     def _refuse_foreign(cls, options: object) -> object:
         for name in options if isinstance(options, Mapping) else ():
-            # An unknown name may be an option of another objective: the message then names the objectives that have it.
+            # An option that this objective does not have may be an option of other objectives, which the message names.
             if name not in cls.model_fields:
                 owners = OWNERS.get(name)
                 if owners is None:
@@ -121,9 +123,9 @@ class FitConfig(Group):
         return self
 
     def require(self, *, rigid_bodies: bool) -> None:
-        """Raise OptionError if the objective, or an option that was set, does not apply to this type of model.
+        """Raise OptionError if the objective, or an option with a value, does not apply to a type of model.
 
-        rigid_bodies: whether the model consists of rigid bodies, not of networks.
+        rigid_bodies: True for a model of rigid bodies, False for a model of networks.
         """
         # Models of rigid bodies are fitted to torques directly: the momentum objective is not needed for them.
         if rigid_bodies and self.objective == "momentum":
@@ -136,14 +138,20 @@ class FitConfig(Group):
                 raise OptionError(name, f"with the objective {self.objective} belongs to {models}")
 
     def record(self, *, rigid_bodies: bool) -> dict[str, object]:
-        """Return the options that apply to this type of model and are not None, for config.json."""
+        """Return {name: value} of the options that apply to a type of model and are not None, for config.json.
+
+        rigid_bodies: True for a model of rigid bodies, False for a model of networks.
+        """
         return self.model_dump(
             mode="json", exclude_none=True, exclude=set(self.unused(rigid_bodies=rigid_bodies))
         )
 
     @classmethod
     def unused(cls, *, rigid_bodies: bool) -> tuple[str, ...]:
-        """Return the names of the options that do not apply to this type of model."""
+        """Return the names of the options that do not apply to a type of model.
+
+        rigid_bodies: True for a model of rigid bodies, False for a model of networks.
+        """
         return cls.of_networks if rigid_bodies else cls.of_rigid_bodies
 
 
@@ -174,7 +182,7 @@ class TorqueFit(FitConfig):
 
 
 class OnWindows(FitConfig):
-    """Options of fits that minimize a loss of windows.
+    """Options of fits that minimize a loss over windows of logs.
 
     Attributes:
         window: Samples per window.
@@ -183,8 +191,8 @@ class OnWindows(FitConfig):
         optimizer: AdamW on batches, or L-BFGS on all windows; default: lbfgs for at most 1,024 windows, else adamw.
         batch: Windows per step of AdamW; default: 256.
         learning_rate: Largest learning rate of AdamW; default: 0.001.
-        weight_decay: Weight decay of AdamW, default: 0.2; or factor of half the sum of squared weights in the loss of
-            L-BFGS, default: 2e-05.
+        weight_decay: With AdamW: its weight decay, default: 0.2. With L-BFGS: factor of half the sum of squared weights
+            in the loss, default: 2e-05.
         urdf_weight: Factor of the squared difference from the URDF's M and gravity; 0: no regularization.
         max_minutes: Time limit, within which the learning rate is annealed [min].
     """
@@ -217,20 +225,21 @@ class OnWindows(FitConfig):
 
 
 class MomentumFit(OnWindows):
-    """Fit of the weak form of the equations only: change of momentum and impulse along measured windows.
+    """Fit of the weak form of the equations of motion to measured windows.
 
-    Neither accelerations nor an ODE solver are needed. The result is kept only if it predicts the validation windows
-    better than the initial model.
+    The loss compares the change of momentum between samples with the impulse of the torques. It needs neither
+    accelerations nor an ODE solver. The result is used only if it predicts the validation windows better than the
+    initial model.
     """
 
     objective: ClassVar[Objective] = "momentum"
 
 
 class Rollout(OnWindows):
-    """Fit of simulated to measured states in windows of logs (SPEL, Algorithm 1, without the PD penalty).
+    """Fit that minimizes the difference between simulated and measured states in windows of logs.
 
-    It has up to three stages: a torque fit of rigid bodies (see `TorqueFit`), a momentum fit (see `MomentumFit`), and
-    the fit of rollouts, which are simulated windows.
+    The method is Algorithm 1 of SPEL without the PD penalty. There are up to three stages: a torque fit of rigid
+    bodies (see `TorqueFit`), a momentum fit (see `MomentumFit`), and the fit of rollouts, which are simulated windows.
 
     Attributes:
         torque_first: Whether the torque fit is made.
@@ -285,7 +294,8 @@ def fit_config(
     for name, (condition, _, excluded) in UNLESS.items():
         if options.get(condition, settings.get(condition)) == excluded:
             settings.pop(name, None)
-        # An option of the caller overrides a setting that excludes it: `batch` overrides `optimizer: lbfgs`.
+        # An option of the caller overrides a setting with which it would not apply: `batch` overrides
+        # `optimizer: lbfgs`.
         elif name in options and condition not in options and settings.get(condition) == excluded:
             settings.pop(condition)
     config = validated(config_type, settings | options)

@@ -2,7 +2,7 @@
 
 With `value` the logged number and `unit` the factor to SI units: q = sign * unit * value + offset,
 qd = sign * unit * value, tau = sign * gain * unit * value + torque_offset. A commanded position u is converted like q.
-Words of motor registers are first decoded by `sign_bit` and `period`.
+Register values of motors, such as signed magnitudes, are first decoded by `sign_bit` and `period`.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from spelgen.settings.values import Group, Number, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
-# Factors from units to SI units, for units other than SI units.
+# {unit: factor to the SI unit}, for units that are not SI units.
 LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mrad": _MILLI, "mm": _MILLI}
 SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
 # Units of `tau` that need a gain: currents, and fractions of a rated torque that the log does not contain.
 CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
-# Positions from -100 to 100 over the calibrated range of a motor, which LeRobot stores by default.
+# Unit of positions in LeRobot's default format: the ends of the calibrated range of a motor are -100 and 100.
 NORMALISED = "normalised"
-ONLY = {  # joint type: units that such a joint cannot have
+ONLY = {  # {joint type: units that joints of this type cannot have}
     "revolute": {"m", "mm", "m/s", "mm/s", "N"},
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", *LENGTHS, *SPEEDS} - {"mm", "mm/s"},
 }
 
-LONGEST_DELAY = 1.0  # [s] largest magnitude of a delay
+LONGEST_DELAY = 1.0  # [s] Largest magnitude of a delay in the settings.
 Delay = Annotated[Number, Field(ge=-LONGEST_DELAY, le=LONGEST_DELAY)]
 
 Accepted = Literal[
@@ -117,9 +117,9 @@ class LogUnits(JointUnits):
 
 
 class JointWords(Group):
-    """Decoding of register values of one joint, in logged units; default: values are plain numbers.
+    """Periods or sign bits of the logged values of one joint, in logged units; default: values are plain numbers.
 
-    The value is the period after which logged values wrap around, or the value of the sign bit.
+    A period is the interval after which logged values wrap around.
 
     Attributes:
         q: Position.
@@ -135,7 +135,7 @@ class JointWords(Group):
 
 
 class JointDelays(Group):
-    """Delays of the logged values of one joint relative to the other signals [s]; negative if they are early.
+    """Delays of the logged values of one joint relative to the other signals [s]; negative for early values.
 
     Attributes:
         q: Position.
@@ -167,7 +167,7 @@ class MotorCalibration(Group):
 
     @model_validator(mode="after")
     def _has_range(self) -> MotorCalibration:
-        # Positions are normalised to -100..100 over the range, which must not be empty.
+        # An empty range is an error, because normalised positions are fractions of the range.
         if not self.range_min < self.range_max:
             raise ValueError("a range_max above range_min")
         return self
@@ -259,7 +259,7 @@ class LogMapping(Group):
         return ("q", "qd", "tau")
 
     def signals(self, joints: Sequence[str]) -> list[tuple[str, str]]:
-        """Return (quantity, joint) of each column: all joints of the first quantity, then of the next."""
+        """Return (quantity, joint) of each column, sorted by quantity: first the positions of all joints."""
         return list(product(self.quantities, joints))
 
     def joint(self, name: str) -> JointLog:
@@ -267,7 +267,7 @@ class LogMapping(Group):
         return self.joints.get(name, JointLog())
 
     def log_name(self, joint: str) -> str:
-        """Return the name in the log of a joint, which is given by its name in the URDF."""
+        """Return the name that a joint has in the log. joint: name of the joint in the URDF."""
         return self.joint(joint).name or joint
 
     def column(self, quantity: str, joint: str) -> str:
@@ -281,13 +281,16 @@ class LogMapping(Group):
         return name
 
     def of_trajectory(self, text: str) -> LogMapping:
-        """Return the mapping for one recording of a file: `{trajectory}` in names of columns is replaced by `text`."""
+        """Return the mapping for one recording of a file with several recordings.
+
+        The placeholder `{trajectory}` in names of columns is replaced by `text`.
+        """
         # A name without `{trajectory}` is unchanged: its column belongs to all recordings.
         named = {key: name.replace("{trajectory}", text) for key, name in self.columns}
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
-        """Return the mapping with other names of columns. columns: joint -> quantity -> name of the column."""
+        """Return the mapping with other names of columns. columns: {joint: {quantity: name of the column}}."""
         joints = dict(self.joints)
         for joint, names in columns.items():
             logged = self.joint(joint)
@@ -295,11 +298,14 @@ class LogMapping(Group):
         return self.model_copy(update={"joints": joints})
 
     def with_turns(self, joints: Sequence[str]) -> LogMapping:
-        """Return the mapping with a period of one turn for the positions of these joints that have no period."""
+        """Return the mapping with a period of one turn for the positions of the given joints.
+
+        A period in the mapping is unchanged.
+        """
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
-            # A period in the mapping is kept, because it may be the range of a register, which is larger than a turn.
+            # A period in the mapping may be longer than a turn: the range of a register with several turns.
             unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
             turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
             period = logged.period.model_copy(update=turns)
@@ -307,34 +313,36 @@ class LogMapping(Group):
         return self.model_copy(update={"joints": changed})
 
     def in_si(self) -> LogMapping:
-        """Return the mapping for a file in SI units with default names of columns.
+        """Return the mapping for the same signals in a file with SI units and default names of columns.
 
-        `input` and `accept` are copied. The positions of a joint with a period get the period of one turn.
+        `input` and `accept` are unchanged. The positions of a joint with a period have the period of one turn.
         """
-        # Positions of joints without limits may be in any interval of one turn, also in files that spelgen writes.
+        # A file that spelgen writes may also contain positions that wrap around after one turn. Joints with a period of
+        # positions therefore have a period in the new mapping.
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
     def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
-        """Return the period or the sign bit of a quantity of a joint, in logged units; None without a setting."""
+        """Return the period or the sign bit of a quantity of a joint, in logged units; None if it is not set."""
         size: float | None = getattr(getattr(self.joint(joint), key), quantity)
         return size
 
     def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit of "q", "qd", "tau" or "u" of a joint, None without a setting; u has the unit of q."""
+        """Return the unit of "q", "qd", "tau" or "u" of a joint; None if it is not set."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
-        # The default unit of commanded positions is the unit of measured ones: both come from one controller.
+        # The default unit of commanded positions is the unit of measured positions, because one controller logs both.
         if unit is None and quantity == "u":
             return self.unit("q", joint)
         return unit
 
     def scale(self, quantity: str, joint: str) -> float:
-        """Return the factor from a logged value of a quantity of a joint to SI units, including `sign`."""
+        """Return the factor by which a logged value is multiplied to get SI units; the factor includes `sign`."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain
-        # The 200 units from -100 to 100 are the calibrated range in counts; drive_mode 1 reverses the direction.
+        # A normalised position of -100 is the lower end and 100 the upper end of the calibrated range, which is given
+        # in counts. drive_mode 1 reverses the direction.
         elif unit == NORMALISED:
             motor = self.calibration[self.log_name(joint)]
             counts = (motor.range_max - motor.range_min) / 200
@@ -358,7 +366,10 @@ class LogMapping(Group):
         return delay + self.torque_delay * (quantity == "tau")
 
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
-        """Return the errors of the mapping for these joints: absent keys, and units that the joint type excludes."""
+        """Return the errors in the units of the mapping for these joints.
+
+        An error is a unit that a joint type cannot have, or a unit whose conversion needs a key that is absent.
+        """
         errors = []
         kinds: dict[str, str | None] = dict.fromkeys(joints)
         kinds.update(zip(joints, joint_types or (), strict=joint_types is not None))

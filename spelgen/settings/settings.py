@@ -52,13 +52,14 @@ class JointSettings(Group):
     @property
     def armature(self) -> float:
         """Rotor inertia on the joint side of the gear [kg m^2]."""
-        # The rotor turns `gear` times as fast as the joint, and the gear multiplies its torque by `gear` once more.
+        # The rotor accelerates `gear` times as fast as the joint, and the gear multiplies the torque for this by
+        # `gear`.
         return self.rotor_inertia * self.gear**2
 
     @field_validator("coulomb")
     @classmethod
     def _resists(cls, value: tuple[float, float]) -> tuple[float, float]:
-        # Friction in the direction of motion would drive the joint.
+        # A coefficient of the wrong sign is an error, because such friction would drive the joint.
         if value[0] < 0 or value[1] > 0:
             raise ValueError("the torque for qd > 0 (not negative), then for qd < 0 (not positive)")
         return value
@@ -88,7 +89,7 @@ class MotorCoupling(Group):
 
 
 class Unusable:
-    """Placeholder for a group of settings that has errors: reading an attribute raises the errors."""
+    """Placeholder for a group of settings with errors. The errors are raised if an attribute of the group is read."""
 
     def __init__(self, errors: Sequence[SpelgenError]) -> None:
         self.errors = tuple(errors)
@@ -137,7 +138,7 @@ class Settings(Group):
     @field_validator("joints", mode="before")
     @classmethod
     def _by_name(cls, joints: object) -> object:
-        # A list in `joints` is often meant for `moving_joints`, which the message of pydantic would not name.
+        # A list in `joints` is often meant for `moving_joints`. The message of pydantic would not name `moving_joints`.
         if isinstance(joints, list):
             raise ValueError("settings by the name of a joint; `moving_joints` lists the joints that move")
         return joints
@@ -147,7 +148,7 @@ class Settings(Group):
         # `tip` and `moving_joints` both determine the last joint, and could contradict each other.
         if self.tip is not None and self.moving_joints is not None:
             raise ValueError("'tip' or 'moving_joints', not both")
-        # These keys are defined for logged torques, which logs of position servos do not have.
+        # Motor torques and couplings are settings of logged torques, and logs of position servos have no torques.
         if self.input == "position" and (self.torque == "motor" or self.couplings):
             raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
         # A joint in two couplings would be driven by two different sets of motors.
@@ -161,7 +162,7 @@ class Settings(Group):
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """One warning per error in a group that a single command uses, such as `training`; it raises the error."""
+        """Warnings: one per error in a group of keys that only one step uses, such as `training`."""
         unusable = [group for _, group in self if isinstance(group, Unusable)]
         errors = [error for group in unusable for error in group.errors]
         return tuple(Diagnostic("warning", "unusable-settings", "settings", None, str(x)) for x in errors)
@@ -209,7 +210,7 @@ def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) 
             # The content is checked again without the group, whose errors may have hidden errors of other groups.
             content.pop(group, None)
     update: dict[str, object] = {group: Unusable(group_errors) for group, group_errors in unusable.items()}
-    # `input` of the arm applies to the logs too, so that a settings file states it only once.
+    # `input` of the arm also applies to the logs, so that a settings file states it only once.
     if settings.input == "position" and "logs" not in unusable:
         update["logs"] = settings.logs.model_copy(update={"input": "position"})
     return settings.model_copy(update=update)
@@ -237,9 +238,9 @@ def load_mapping(path: Path | str, joints: Collection[str]) -> LogMapping:
 def _require_joints(
     found: Iterable[tuple[Location, str]], names: Collection[str], document: YamlDocument
 ) -> None:
-    """Raise SettingsError, or SpelgenErrors, for joints in a file that are not among `names`.
+    """Raise SettingsError, or SpelgenErrors for several errors, if a joint in a file is not among `names`.
 
-    found: location and name of each joint in the file.
+    found: (location, name) of each joint in the file.
     """
     collect(
         [unknown_name(place, "joint", name, names, document) for place, name in found if name not in names]
@@ -247,7 +248,7 @@ def _require_joints(
 
 
 def _joint_names(settings: Settings) -> Iterator[tuple[Location, str]]:
-    """Yield location and name of each joint that the settings mention."""
+    """Yield (location in the file, name) of each joint that the settings mention."""
     for name in settings.joints:
         yield ("joints", name), name
     for name in settings.simulation.positions or ():

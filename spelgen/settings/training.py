@@ -55,7 +55,7 @@ class TrainingSettings(Group):
     @field_validator("*")
     @classmethod
     def _belongs(cls, value: object, info: ValidationInfo) -> object:
-        # `objective` is the first field and is validated first, so that its value is available for all other fields.
+        # `info.data` contains the values of the preceding fields: `objective`, the first field, is in it.
         objective, owners = info.data.get("objective"), OWNERS.get(str(info.field_name))
         if objective and owners and objective not in owners:
             raise ValueError(
@@ -65,12 +65,12 @@ class TrainingSettings(Group):
 
     @property
     def options(self) -> dict[str, object]:
-        """The fit options that are not None, of all objectives: name -> value."""
+        """{name: value} of the options of a fit that are not None, of all objectives."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property
     def preprocessing(self) -> dict[str, Any]:
-        """The options of `Preprocessing` that are not None."""
+        """{name: value} of the options of `Preprocessing` that are not None."""
         return self.model_dump(include=PREPROCESSING, exclude_none=True)
 
 

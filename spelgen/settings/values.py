@@ -4,12 +4,14 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-MAX_MAGNITUDE = 1e12  # largest magnitude of a number in settings: products of several numbers do not overflow
+# Largest magnitude of a number in settings. With this bound, products of several numbers do not overflow.
+MAX_MAGNITUDE = 1e12
 
 
 def no_bool(value: object) -> object:
     """Return the value unchanged. Raises ValueError if it is a bool."""
-    if isinstance(value, bool):  # float(True) is 1.0: without this test `yes` would be accepted as a number
+    # YAML reads `yes` as True, and float(True) is 1.0: without this check `yes` would be accepted as a number.
+    if isinstance(value, bool):
         raise ValueError("a number")
     return value
 

@@ -1,6 +1,6 @@
 """Read YAML files, validate each key, and report errors with their lines.
 
-Unsafe or ambiguous constructs are errors, too.
+Unsafe or ambiguous constructs of YAML are errors.
 """
 
 from collections.abc import Iterable, Mapping
@@ -39,11 +39,12 @@ class YamlDocument:
             return yaml.SafeLoader("").construct_document(self.root)
         except yaml.YAMLError as error:
             raise _yaml_error(error, self.path) from error
-        except ValueError as error:  # e.g. the date 2025-99-99
+        # The loader raises ValueError for some values, for example for the date 2025-99-99.
+        except ValueError as error:
             raise SettingsError(f"not plain YAML: {error}", file=self.path) from error
 
     def line(self, location: Location) -> int | None:
-        """Return the line of a key or list item, or of the innermost existing group that would contain it."""
+        """Return the line of a key or list item; if it is absent, the line of the group that would contain it."""
         if self.root is None:
             return None
         node, line = self.root, int(self.root.start_mark.line) + 1
@@ -57,9 +58,10 @@ class YamlDocument:
 
 
 def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | None:
-    """Return (key node, value node) for a key of a mapping, or (item node, item node) for an item of a list.
+    """Return the node whose line is reported for an entry of `node`, and the node of the entry's value.
 
-    The result is None if the key or the item does not exist. key: key, or index of a list item from 0.
+    key: key of a mapping, for which both nodes are returned, or index of a list item, whose node is returned twice. The
+    result is None if the entry does not exist.
     """
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:
@@ -82,7 +84,8 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         if self.check_event(yaml.AliasEvent):
             raise ComposerError(None, None, "an alias", mark)
         is_tagged = isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag is not None
-        if is_tagged:  # a tag may contradict its value, as in "!!bool maybe"
+        # Tags are errors, because a tag may contradict its value, as in "!!bool maybe".
+        if is_tagged:
             raise ComposerError(None, None, f"the tag {event.tag}", mark)
         # The depth is bounded, because the parser is recursive. Settings have at most six levels.
         if self.depth == 16:
@@ -107,7 +110,8 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
 
 def read_document(path: Path) -> YamlDocument:
     """Return a YAML file of at most 256 KiB with one document. Raises SettingsError for any other file."""
-    # Settings of 300 joints with all keys have 60 kB.
+    # The size is bounded, because larger files could exhaust the memory. Settings of 300 joints with all keys have
+    # 60 kB.
     content = read_bytes(path, SettingsError, "a YAML file", 256 * 1024)
     try:
         return YamlDocument(path, _Loader(content.decode("utf-8")).get_single_node())
@@ -120,7 +124,7 @@ def read_document(path: Path) -> YamlDocument:
 def _yaml_error(error: yaml.YAMLError, path: Path) -> SettingsError:
     problem, mark = "characters that YAML does not allow", None
     if isinstance(error, yaml.MarkedYAMLError) and error.problem:
-        # Some messages of PyYAML are the second half of a sentence and begin with "but".
+        # Some messages of PyYAML begin with "but", since they are the second half of a sentence. The word is removed.
         problem, mark = error.problem.removeprefix("but "), error.problem_mark
     return SettingsError(f"not plain YAML: {problem}", file=path, line=mark.line + 1 if mark else None)
 
@@ -143,8 +147,9 @@ def validated(group: type[Checked], content: object, document: YamlDocument | No
 
 
 def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[BaseModel]) -> SettingsError:
-    """Return a `SettingsError` with line and expected value for one item of pydantic's `ValidationError.errors`.
+    """Return one of pydantic's errors as a `SettingsError` with line and expected value.
 
+    detail: an item of `ValidationError.errors`.
     document: the YAML file; None for values of the command line, which have no lines. group: the validated class.
     """
     location, error_type = detail["loc"], detail["type"]
@@ -154,7 +159,7 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
         return unknown_name(location, "key", str(location[-1]), names, document)
     message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     expected = EXPECTED.get(error_type, message)
-    # pydantic marks an invalid key of a dict by "[key]" at the end of the location.
+    # The location of an invalid key of a dict ends with "[key]", which pydantic adds.
     if location[-1:] == ("[key]",):
         location, expected = location[:-1], "a name; write it in quotes"
         if error_type == "string_pattern_mismatch":
@@ -197,7 +202,7 @@ def _error_at(location: Location, document: YamlDocument | None, got: str) -> Se
 def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
     """Return the pydantic model of the settings at a location, from the model `group` of the document's root.
 
-    Elements of the location that are no fields (keys of dicts, indices of lists) are skipped.
+    Elements of the location that are keys of dicts or indices of lists are skipped.
     """
     for key in map(str, location):
         if key in group.model_fields:

@@ -1,1 +1,1 @@
-"""Simulated logs of an arm: motion, drives, friction, encoders; and simulated arms that differ from their URDF."""
+"""Simulation of logs of an arm, with drives, friction and encoders, also for arms that differ from their URDF."""

@@ -23,10 +23,10 @@ ABOUT = "The arm as built, from seed {}: the ground truth of simulated logs. `sp
 
 
 def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
-    """Write the URDF and the settings of an arm as it may have been built, and return that arm.
+    """Write the URDF and the settings of a random arm with realistic differences from a nominal arm; return the arm.
 
     The arm can be simulated, and `evaluate` compares mass matrices with it. Raises ArmError if a moving link has no
-    inertial, or if a joint has no room between its limits.
+    inertial, or if the limits of a joint are too close together for a motion.
 
     Args:
         arm: Nominal arm, as specified by its URDF.
@@ -38,11 +38,13 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
         raise SpelgenError(
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
-    # Links without inertials are an error before files are written, so that it names the user's URDF.
+    # The dynamics are computed only to raise the error for links without inertials: here it names the user's URDF, and
+    # no file is written.
     arm_dynamics(arm.chain, arm.settings)
     settings = _settings(arm, seed)
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
-    # Friction and armature are scaled by the torques and M of the perturbed bodies, computed without drives.
+    # The scales of friction and armature are computed from the torques and M of the perturbed bodies. Therefore the
+    # arm is first written and read without drives.
     bodies = _with_settings(path, settings, arm)
     settings["joints"] = _drives(arm, bodies, np.random.default_rng([seed, 1]))
     return _with_settings(path, settings, arm)
@@ -55,7 +57,7 @@ def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
 
 
 def _settings(arm: Arm, seed: int) -> dict[str, object]:
-    """Return the settings of the arm as built except the drives: gravity, inputs, couplings and simulated motion."""
+    """Return the settings of the random arm (gravity, inputs, couplings, simulated motion) without its drives."""
     nominal = arm.settings
     carried = nominal.model_dump(
         mode="json",
@@ -64,7 +66,8 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
     )
     names = list(arm.chain.joint_names)
     settings: dict[str, object] = {"about": ABOUT.format(seed), "moving_joints": names} | carried
-    # Position servos and passive joints cannot be moved along a given path: such arms keep their own protocol.
+    # Other arms are simulated along prescribed paths. This is not possible with position servos and passive joints, so
+    # such arms keep the protocol of their settings.
     if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
         settings["simulation"] = carried.get("simulation", {}) | {"seed": seed}
         return settings
@@ -87,14 +90,14 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
 
 
 def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[str, object]]:
-    """Return random friction and armature of each joint, as settings.
+    """Return {name of a joint: settings} with random friction and armature.
 
-    Coulomb friction is a fraction of the rigid-body torque of moderate motion (at most half the effort limit), armature
-    a fraction of the mean diagonal entry of M.
+    Coulomb friction is a random fraction of the typical rigid-body torque of the joint, at most half the effort limit.
+    Armature is a random fraction of the mean diagonal entry of M.
 
     Args:
         arm: Nominal arm, whose gear ratios and servo gains are kept.
-        bodies: Arm as built, without drives.
+        bodies: Random arm without drives.
         rng: Source of the random numbers.
     """
     joints = bodies.chain.coordinates
@@ -103,7 +106,8 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
     dynamics = arm_dynamics(bodies.chain, bodies.settings)
     inertia = np.einsum("tii->i", dynamics.mass_matrix(q)) / len(q)
     speed = np.array([min(joint.velocity or np.inf, SPEEDS[joint.joint_type]) for joint in joints])
-    # The mean squares of gravity and inertia torques are added, since the two are independent.
+    # The typical rigid-body torque is the RMS of gravity torque plus inertia torque. Both are assumed to be
+    # uncorrelated, so their mean squares are added.
     torque = np.hypot(
         np.sqrt(np.square(dynamics.gravity(q)).mean(axis=0)), AS_BUILT.acceleration * speed * inertia
     )
@@ -157,8 +161,8 @@ def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np
 
     Args:
         inertial: The element, changed in place.
-        log_factors: (2,) logarithms of the factors of the mass and of the inertia per mass.
-        displacement: (3,) shift of the centre of mass, relative to the radius of gyration.
+        log_factors: Logarithms of two factors, (2,): of the mass, and of the inertia divided by the mass.
+        displacement: Shift of the centre of mass divided by the radius of gyration, (3,) [1].
     """
     mass, tensor = inertial.find("mass"), inertial.find("inertia")
     if mass is None or float(mass.get("value", "0")) <= AS_BUILT.massless:
@@ -171,7 +175,7 @@ def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np
         trace = sum(float(tensor.get(name, "0")) for name in ("ixx", "iyy", "izz"))
         for name, value in tensor.attrib.items():
             tensor.set(name, repr(mass_factor * inertia_factor * float(value)))
-    # The radius of gyration r satisfies m r^2 = trace(I) / 2, the second moment of mass about the centre.
+    # The radius of gyration r is the RMS distance of the mass from its centre: m r^2 = trace(I) / 2.
     gyration_radius = np.sqrt(max(trace, 0.0) / 2 / kilograms)
     origin = inertial.find("origin")
     if origin is None:
@@ -181,10 +185,10 @@ def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np
 
 
 def _make_consistent(tensor: etree._Element) -> None:
-    """Make an inertia tensor satisfy the triangle inequality: clip its negative second moments of mass.
+    """Replace an inertia tensor I that no body can have by a physically consistent tensor.
 
-    The second moments are S = trace(I) / 2 * identity - I; a body has S >= 0 (Wensing, Kim, Slotine, IEEE RA-L 3:60,
-    2018).
+    A body has a positive semidefinite matrix of second moments of mass, S = trace(I) / 2 * identity - I (Wensing, Kim,
+    Slotine, IEEE RA-L 3:60, 2018). Negative eigenvalues of S are replaced by small positive values.
     """
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     pseudo = pseudo_inertia(np.array([1.0, 0, 0, 0, *(float(tensor.get(name, "0")) for name in names)]))

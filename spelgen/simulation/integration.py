@@ -23,7 +23,7 @@ def rollout(
     tau: np.ndarray,
     tolerance_factor: float = 1.0,
 ) -> np.ndarray:
-    """Return the states (q, qd), (T, 2n) [rad, rad/s; m, m/s].
+    """Return the states (q, qd) of a simulated motion at times t, (T, 2n) [rad, rad/s; m, m/s].
 
     Method: LSODA (Petzold, SIAM J. Sci. Stat. Comput. 4, 1983), restarted at each change of tau. It switches to an
     implicit method for stiff friction, so a joint that stops within microseconds does not force short steps. Raises
@@ -33,14 +33,15 @@ def rollout(
         dynamics: The arm, with friction.
         initial: State (2n,) at t[0].
         t: Times (T,) [s].
-        tau: Inputs (T, n) [Nm; N]; tau[k] acts from t[k] to t[k+1].
-        tolerance_factor: Factor of the relative and the absolute tolerance.
+        tau: Joint torques (T, n) [Nm; N]; tau[k] acts from t[k] to t[k+1].
+        tolerance_factor: Factor of the default relative and absolute tolerances.
     """
     n = tau.shape[1]
     tolerances = {"rtol": TUNING.rtol * tolerance_factor, "atol": TUNING.atol * tolerance_factor}
     states = np.empty((t.size, 2 * n))
     states[0] = initial
-    # LSODA is a multistep method, whose history of derivatives is invalid after a jump of tau: it is restarted.
+    # LSODA is a multistep method: it extrapolates from past derivatives, which are invalid after a jump of tau.
+    # Therefore it is restarted at each jump.
     changes = np.flatnonzero((tau[1:-1] != tau[:-2]).any(axis=1)) + 1
     for first, last in pairwise([0, *changes.tolist(), t.size - 1]):
         torque = tau[first]

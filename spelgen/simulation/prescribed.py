@@ -79,7 +79,7 @@ def prescribed(
         settings: `simulation` and `tracking` are used.
         drives: Input matrix and couplings of motors; None: each motor moves its own joint.
         motions: Positions with two derivatives, (T, n) each; if empty, the motions of `tracking.paths`.
-        progress: Called with (recordings done, all) after each recording.
+        progress: Function called after each recording with the number of finished and the number of all recordings.
     """
     protocol = settings.simulation
     passive = [joint.name for joint in arm.coordinates if joint.passive]
@@ -100,7 +100,8 @@ def prescribed(
         torque = dynamics.inverse_dynamics(motion.q, motion.qd, motion.qdd)
         torque = torque + friction_along(friction, arm, motion, protocol.presliding)
         tau = torque @ to_motors.T
-        # The noise is relative to the standard deviation of each motor's torque: sensors are chosen for their motors.
+        # The noise of a motor's torque is proportional to the standard deviation of this torque, because large motors
+        # have sensors with large ranges.
         tau = tau + protocol.torque_noise * tau.std(axis=0) * rng.standard_normal(tau.shape)
         states = np.concatenate([motion.q, motion.qd], axis=1)
         recording = Recording(motion.t, states, quantized(motion.q, settings.tracking), tau)
@@ -126,6 +127,6 @@ def friction_along(friction: DriveFriction, arm: Chain, motion: Motion, preslidi
         return friction(motion.qd)
     scale = np.array([1.0 if kind == "revolute" else 0.1 for kind in arm.joint_types])
     elements = np.geomspace(presliding / AS_BUILT.presliding_span, presliding, AS_BUILT.elements)
-    breakaway = scale[:, None] * elements  # (n, K), for K friction elements per joint
-    deflection = bristles_along(motion.q, BristleReach(breakaway, friction.speeds))  # (T, n, K)
+    breakaway = scale[:, None] * elements  # (n, K) [rad, m], for K friction elements per joint
+    deflection = bristles_along(motion.q, BristleReach(breakaway, friction.speeds))  # (T, n, K) [rad, m]
     return friction.torque(motion.qd, (deflection / breakaway).mean(axis=-1))

@@ -1,4 +1,4 @@
-"""Parts that all simulation protocols share: friction, initial positions, desired motions, and the resulting logs."""
+"""Functions and classes for all simulation protocols: friction, initial positions, desired motions, and logs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ Progress = Callable[[int, int], None]
 
 
 def silent(done: int, total: int) -> None:
-    """Do nothing: the default if no progress is shown."""
+    """Do nothing. Default of the argument `progress`."""
 
 
 class SimulatedLogs(list[Trajectory]):
-    """Simulated trajectories: those for training (`train`), followed by those for testing (`test`)."""
+    """List of simulated trajectories: the training trajectories `train`, then the test trajectories `test`."""
 
     def __init__(self, train: Sequence[Trajectory], test: Sequence[Trajectory]) -> None:
         super().__init__([*train, *test])
@@ -34,7 +34,7 @@ class SimulatedLogs(list[Trajectory]):
 
     @classmethod
     def split(cls, logs: Sequence[Trajectory], test_fraction: float) -> SimulatedLogs:
-        """Return the logs with the last `test_fraction` of them for testing; at least one remains for training."""
+        """Return the logs, of which the last `test_fraction` are test trajectories and at least one is for training."""
         trained = len(logs) - min(round(test_fraction * len(logs)), len(logs) - 1)
         return cls(logs[:trained], logs[trained:])
 
@@ -51,25 +51,30 @@ def sample_times(simulation: SimulationSettings) -> np.ndarray:
 
 
 def make_friction(arm: Chain, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
-    """Return the friction of the drives, from the settings of a joint if present, else from <dynamics> in its URDF.
+    """Return the friction of the drives.
+
+    The friction of a joint is specified by its settings or, if the settings have none, by <dynamics> in the URDF.
 
     Args:
         arm: The arm.
         settings: `joints` and the smoothing velocity of `simulation` are used.
-        speeds: C (n, n), which gives the speeds C qd of the drives. None: each drive moves its own joint. Friction
-            acts on the drives, as in the models.
+        speeds: Matrix C (n, n) of coupled drives, whose speeds are C qd: friction acts on the drives. None: each drive
+            moves its own joint.
     """
     width = settings.simulation.coulomb_smoothing_velocity
     return joint_friction(arm.coordinates, settings.joints, width, speeds)
 
 
 def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest initial position, (n,) each [rad; m]; SettingsError if a joint has no range."""
+    """Return the lowest and the highest initial positions, (n,) each [rad; m].
+
+    Raises SettingsError if neither the settings nor the URDF specify a range for a joint.
+    """
     positions = settings.simulation.positions or {}
     ranges, errors = [], []
     for joint in arm.coordinates:
         limits = (-np.pi, np.pi) if joint.continuous else joint.limits
-        # Exporters of URDFs write the limits 0 and 0 for an unknown range.
+        # Limits of 0 and 0 are treated as unknown, because exporters of URDFs write them for an unknown range.
         if joint.name not in positions and (limits is None or limits[0] >= limits[1]):
             message = "the joint has no range: give its lowest and highest initial position"
             errors.append(SettingsError(message, element=f"simulation.positions.{joint.name}"))
@@ -95,7 +100,7 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
     randoms = np.random.default_rng(settings.simulation.seed).spawn(count)
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
-        # Default motion: the middle part of each range at moderate speed, as for the first motion of an unknown arm.
+        # The motion uses only the middle part of each range and a moderate speed, as one does with an unknown arm.
         middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
         speeds = [
             min(SIMULATION.used_range * (x.velocity or np.inf), SPEEDS[x.joint_type]) for x in arm.coordinates
@@ -106,7 +111,8 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
     middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
     drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]
     if settings.tracking.paths == "same":
-        # All trajectories follow the path of the first one, with equally spaced phases.
+        # The phases of all joints differ by a constant from the phases of the first trajectory, so all trajectories
+        # follow the same path from different starting points.
         drawn = [drawn[0] + 2 * np.pi * number / count for number in range(count)]
     return [sines(middle, amplitude, settings.tracking.frequency, phase, t) for phase in drawn]
 
@@ -130,7 +136,11 @@ def sines(
 
 
 def _amplitude(arm: Chain, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the amplitudes (n,) [rad; m] of sines within low..high, (n,) each. Raises SettingsError beyond these."""
+    """Return the amplitudes of the sines, (n,) [rad; m].
+
+    low, high: ranges of the joints, (n,) each [rad; m]. Raises SettingsError if the amplitude in the settings is larger
+    than half the range of a joint.
+    """
     amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()
     if "amplitude" not in settings.tracking.model_fields_set:
         amplitude = np.minimum(amplitude, SIMULATION.used_range * (high - low) / 2)

@@ -21,13 +21,15 @@ from spelgen.simulation.tuning import TUNING
 def servo_motions(
     arm: Chain, settings: Settings, drives: Drives | None = None, *, progress: Progress = silent
 ) -> SimulatedLogs:
-    """Return trajectories under random commands; the same settings give the same logs.
+    """Return trajectories of an arm under position servos, whose commands are random sines and steps.
+
+    The same settings give the same logs.
 
     Args:
         arm: The arm.
         settings: `simulation` and `joints` are used.
         drives: Not used: each servo moves its own joint.
-        progress: Called with (trajectories done, all) after each trajectory.
+        progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     protocol = settings.simulation
     lowest, highest = initial_range(arm, settings)
@@ -35,7 +37,7 @@ def servo_motions(
     t = sample_times(protocol)
     resolution = 2 * np.pi / TUNING.encoder_counts
     is_revolute = np.array([x.joint_type == "revolute" for x in arm.coordinates])
-    encoder = np.where(is_revolute, resolution, resolution / 10)  # [rad], [m]
+    encoder = np.where(is_revolute, resolution, resolution / 10)  # (n,) [rad, m]
     logs: list[Trajectory] = []
     for number, random in enumerate(np.random.default_rng(protocol.seed).spawn(protocol.trajectories)):
         u = middle + width * _commands(random, t, len(middle))
@@ -62,11 +64,12 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
 
     Method: semi-implicit Euler with dry friction as impulses. The impulse of a joint's dry friction stops it, within
     the bounds of Coulomb friction (projected Gauss-Seidel, as in physics engines: Catto, Iterative Dynamics with
-    Temporal Coherence, 2005). Servos without kp get kp = 2 limit, kd = `servo_lag` kp.
+    Temporal Coherence, 2005).
 
     Args:
         arm: The arm.
-        settings: `joints` and `simulation.delay` are used.
+        settings: `joints` and `simulation.delay` are used. The default of a servo's gain kp is twice its torque limit
+            per rad or m. The gain kd is always `TUNING.servo_lag` times kp.
         t: Times (T,) [s], at equal steps.
         u: Commanded positions (T, n) [rad; m].
     """
@@ -78,7 +81,9 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
     interval = t[1] - t[0]
     steps = int(np.ceil(interval / TUNING.servo_step))
     h, delay = interval / steps, round(settings.simulation.delay * steps / interval)
-    damping = np.diag(h / 2 * (kd + friction.viscous))  # implicit midpoint rule of the damping torques
+    # The damping torque is taken at the mean of the velocities before and after the step (implicit midpoint rule). Its
+    # unknown half is added to the mass matrix.
+    damping = np.diag(h / 2 * (kd + friction.viscous))
     impulses = -h * np.stack([friction.forward, friction.backward])
     q, qd, positions = u[0].copy(), np.zeros(u.shape[1]), np.empty_like(u)
     for step in range(steps * len(t)):
@@ -101,8 +106,8 @@ def _after_dry_friction(
     Args:
         qd: Velocity (n,) without dry friction.
         inverse: Inverse of the mass matrix, (n, n).
-        lower: Smallest impulses (n,) [Nm s; N s].
-        upper: Largest impulses (n,) [Nm s; N s].
+        lower: Lower bounds of the impulses, given by Coulomb friction, (n,) [Nm s; N s].
+        upper: Upper bounds of the impulses, given by Coulomb friction, (n,) [Nm s; N s].
     """
     impulse = np.zeros_like(qd)
     for _ in range(TUNING.friction_sweeps):

@@ -44,7 +44,7 @@ def random_inputs(
         settings: `simulation` and `joints` are used.
         drives: Matrices of coupled motors: inputs are motor torques tau, the joint torques are G tau, and friction acts
             on the motors. None: each motor moves its own joint.
-        progress: Called with (trajectories done, all) after each trajectory.
+        progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     protocol = settings.simulation
     dynamics = arm_dynamics(arm, settings, make_friction(arm, settings, drives and drives.speeds))
@@ -66,7 +66,7 @@ def random_inputs(
         q, qd = np.split(states, 2, axis=1)
         trajectories.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}"))
         progress(number + 1, protocol.trajectories)
-    # At least one trajectory remains for training.
+    # The number of test trajectories is bounded, so that at least one trajectory remains for training.
     count = protocol.trajectories
     order = split.permutation(count)
     tests = min(round(protocol.test_fraction * count), count - 1)
@@ -89,19 +89,20 @@ def simulate(
 ) -> SimulatedLogs:
     """Return simulated logs of the arm: all trajectories, and their split into `train` and `test`.
 
-    Default values are in `simulation` of the arm's settings. The same arguments give the
-    same logs. Mimic joints move as the URDF specifies. Raises ArmError without inertials, SettingsError for an invalid
-    value or a joint without a range of initial positions, and RunError if the motion cannot be integrated.
+    Default values are in `simulation` of the arm's settings. The same arguments give the same logs. Mimic joints move
+    as the URDF specifies. Raises ArmError without inertials, SettingsError for an invalid value or a joint without a
+    range of initial positions, and RunError if the motion cannot be integrated.
 
     Args:
         arm: The arm, from `load_arm` or `as_built`.
         trajectories: Number of trajectories.
         duration: Duration of each trajectory [s].
         sample_rate: Sample rate [Hz].
-        test_fraction: Fraction of the trajectories, or of each one, for testing.
+        test_fraction: Fraction of the trajectories for testing; with the protocol "tracking", the fraction of each
+            trajectory, at its end.
         seed: Seed of all random numbers.
         motions: Motions that the arm performs exactly, (T, n) each; they replace the protocol of the settings.
-        progress: Called with (trajectories done, all) after each trajectory.
+        progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     arguments = {
         "trajectories": trajectories, "duration": duration, "sample_rate": sample_rate,
@@ -125,9 +126,9 @@ def simulate(
 
 
 def _controlled(settings: Settings) -> Settings:
-    """Return the settings. If they set neither a protocol nor inputs, the protocol of the result is "tracking".
+    """Return the settings, with the protocol "tracking" if they specify neither a protocol nor torques.
 
-    Under random torques that are not tuned for the arm, the arm would fall.
+    Feedback control is the default, because an arm would fall under random torques that are not chosen for it.
     """
     simulation, tracking = settings.simulation, settings.tracking
     if settings.input == "position":

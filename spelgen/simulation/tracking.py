@@ -26,7 +26,11 @@ from spelgen.simulation.tuning import TUNING
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Gains of PID controllers, (n,) each: torque per position error, per integrated error and per velocity error."""
+    """Gains of the PID controllers of the joints, (n,) each.
+
+    proportional: torque per position error. integral: torque per integral of the position error. derivative: torque per
+    velocity error.
+    """
 
     proportional: np.ndarray
     integral: np.ndarray
@@ -37,8 +41,11 @@ class Gains:
 class Recording:
     """One motion of T samples: the true states, and the signals of the sensors.
 
-    t: (T,) [s]. states: (T, 2n) true positions and velocities. encoders: (T, n) positions, rounded to steps of the
-    encoders. tau: (T, n) motor torques [Nm; N], tau[k] constant from t[k] to t[k+1].
+    Attributes:
+        t: Times, (T,) [s].
+        states: True positions and velocities, (T, 2n) [rad, rad/s; m, m/s].
+        encoders: Positions rounded to steps of the encoders, (T, n) [rad; m].
+        tau: Motor torques, (T, n) [Nm; N]; tau[k] acts from t[k] to t[k+1].
     """
 
     t: np.ndarray
@@ -61,7 +68,7 @@ def track(
         arm: The arm.
         settings: `simulation`, `tracking` and `joints` are used.
         drives: Input matrix and couplings of motors; None: each motor moves its own joint.
-        progress: Called with (trajectories done, all) after each trajectory.
+        progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     protocol = settings.simulation
     friction = make_friction(arm, settings, drives and drives.speeds)
@@ -95,7 +102,8 @@ def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
         bandwidth: Bandwidth of the position loop [Hz].
     """
     omega = 2 * np.pi * bandwidth
-    # Without the integral term the poles solve s^2 + 2 omega s + omega^2 = 0: a double pole, without overshoot.
+    # Without the integral term the characteristic polynomial of the position loop is s^2 + 2 omega s + omega^2. Its
+    # double pole -omega gives no overshoot.
     return Gains(inertia * omega**2, TUNING.integral_gain * inertia * omega**3, 2 * inertia * omega)
 
 
@@ -123,7 +131,8 @@ def computed_torque(
     """
     q, qd, qdd = motion
     mass = dynamics.mass_matrix(q)
-    # With dominant viscous friction, viscous qd = k e: k = viscous omega gives the time constant 1 / omega.
+    # If viscous friction v dominates, an added stiffness k gives v de/dt = -k e for the position error e. The error
+    # then decays with the time constant v / k, which is 1 / omega for k = v omega.
     slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
     torque = mass @ (qdd + 2 * omega * velocity_error + omega**2 * error) + slow * error
     return np.asarray(torque + dynamics.nonlinear_effects(q, qd) + friction(qd))
@@ -140,12 +149,12 @@ def record(
 ) -> Recording:
     """Return the recording of a controlled motion along a path. The arm starts at rest, in equilibrium with gravity.
 
-    The controller reads the encoders at each tick; its torques are constant between ticks.
+    The controller reads the encoders at each tick of its clock, and its torques are constant between ticks.
 
     Args:
         dynamics: The arm, with friction.
         friction: Friction of the arm, as used by the controller.
-        inputs: Input matrix G (n, n): joint torques divided by motor torques.
+        inputs: Input matrix G (n, n): joint torques = G times motor torques.
         path: Desired motion at the ticks of the controller.
         gains: Gains of the PID controllers.
         settings: `simulation` and `tracking` are used.
@@ -156,7 +165,7 @@ def record(
     # Passive joints have no motor, so G is singular: the pseudo-inverse ignores the desired torque at these joints.
     to_motors = np.linalg.pinv(inputs)
     state = np.concatenate([path.q[0], np.zeros(n)])
-    # The integral term starts at the gravity torque, as when a brake is released. From zero the arm would fall.
+    # The integral term starts with the gravity torque, so that the arm does not fall at the start.
     integral = dynamics.nonlinear_effects(*np.split(state, 2))
     previous = encoders = quantized(state[:n], tracking)
     states, torques = [], []

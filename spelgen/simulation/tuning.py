@@ -13,13 +13,16 @@ class SimulationTuning:
     atol: float = 1e-14
     # [1] Smallest number of rows of a file with a motion.
     min_samples: int = 20
-    # [1] Largest number of integrator steps while the torque is constant; more would mean that it does not converge.
+    # [1] Largest number of integrator steps while the torque is constant. An integration that needs more is stopped
+    # with an error.
     most_steps: int = 100_000
-    # [1] Factor of both tolerances in simulations with encoders: errors of 1e-11 are below the encoder resolution.
+    # [1] Factor of both tolerances in the protocol "tracking". Integration errors of about 1e-11 rad are then still far
+    # below the resolution of the encoders.
     seen_loosening: float = 100.0
-    # [1] Default fraction of a joint's range and speed limit that simulated motion uses.
+    # [1] Default fraction of a joint's position range and speed limit that a simulated motion uses.
     used_range: float = 0.7
-    # [1] Integral gain of the PID, in units of inertia * omega^3; a joint without friction is unstable from 2.
+    # [1] Integral gain of the PID controllers, divided by inertia * omega^3, with the natural frequency omega. A joint
+    # without friction would be unstable with a value of 2 or more.
     integral_gain: float = 0.2
     # [Hz] Default rate of the controllers, approximate: it is rounded to a divisor of the sample rate.
     control_rate: float = 125.0
@@ -48,42 +51,43 @@ class SimulationTuning:
 
 @dataclass(frozen=True)
 class AsBuiltTuning:
-    """Differences of an arm as built from its URDF; a pair of numbers is the range of a uniform distribution."""
+    """Random differences of a simulated arm from its URDF. A pair of numbers is the range of a uniform distribution."""
 
-    # Standard deviation of masses and inertias (relative) and of centres of mass (divided by the radius of gyration).
+    # [1] Relative standard deviation of masses and inertias. Also the standard deviation of each coordinate of a centre
+    # of mass, divided by the radius of gyration.
     inertial_error: float = 0.3
-    # Links of at most this mass [kg] are placeholders and stay unchanged.
+    # [kg] Links of at most this mass are placeholders and stay unchanged.
     massless: float = 1e-9
-    # If a body has a negative principal second moment of mass, its moments are clipped to at least this fraction of
-    # the largest one.
+    # [1] In a physically inconsistent inertia tensor, principal second moments of mass below this fraction of the
+    # largest one are raised to this fraction.
     min_spread: float = 0.01
-    # Coulomb friction, divided by the rigid-body torque of moderate motion.
+    # [1] Coulomb friction, divided by the typical rigid-body torque of the joint.
     coulomb: tuple[float, float] = (0.04, 0.12)
-    # Largest relative difference of Coulomb friction in one direction from the mean of both directions.
+    # [1] Largest relative difference between the Coulomb friction in one direction and the mean of both directions.
     asymmetry: float = 0.1
-    # Viscous friction torque at moderate speed, divided by Coulomb friction.
+    # [1] Viscous friction torque at the typical speed of the joint, divided by Coulomb friction.
     viscous: tuple[float, float] = (0.3, 1.0)
-    # Armature, divided by the mean diagonal entry of M.
+    # [1] Armature, divided by the mean diagonal entry of M.
     armature: tuple[float, float] = (0.02, 0.2)
-    # Angular frequency [rad/s] of moderate motion: the acceleration is this number times the speed.
+    # [rad/s] Typical acceleration divided by typical speed, for the typical rigid-body torque.
     acceleration: float = 2.0
-    # Number of random positions at which torques and M are computed to scale friction and armature.
+    # [1] Number of random positions at which torques and M are computed to scale friction and armature.
     positions: int = 50
-    # Fraction of the joint ranges from which the random `positions` are drawn.
+    # [1] Fraction of the joint ranges that contains the random `positions`.
     range_fraction: float = 0.7
-    # Largest breakaway displacement [rad] of the friction elements of a gear.
+    # [rad] Largest break-away displacement of the friction elements of a joint.
     presliding: float = 0.03
-    # Ratio of the largest to the smallest breakaway displacement.
+    # [1] Largest break-away displacement of a joint, divided by the smallest one.
     presliding_span: float = 150.0
-    # Number of friction elements per joint.
+    # [1] Number of friction elements per joint.
     elements: int = 5
-    # White noise of the torque sensors, relative to the standard deviation of the torque.
+    # [1] Standard deviation of the white torque noise, divided by the standard deviation of the torque.
     torque_noise: float = 0.02
-    # Resolution of the encoders [rad; m]: 19 bits per revolution.
+    # [rad, m] Resolution of the encoders: 19 bits per revolution.
     resolution: float = 1.2e-5
-    # Duration of a recording [s].
+    # [s] Duration of a recording.
     duration: float = 15.0
-    # Sample rate of a recording [Hz].
+    # [Hz] Sample rate of a recording.
     sample_rate: float = 200.0
 
 

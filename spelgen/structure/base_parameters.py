@@ -1,10 +1,9 @@
-"""Base inertial parameters of an arm, in exact arithmetic: the minimal set of combinations in which M, V are linear.
+"""Base inertial parameters of an arm in exact arithmetic: the fewest combinations that determine M and V.
 
-Each entry of M(q), and V(q) - V(q0), is linear in the ten inertial parameters of each body; its coefficients are a row
-of a matrix (the energy regressor). Rows at random rational configurations span the row space of this matrix; the
-reduced row echelon form of the rows defines the base parameters.
-Gautier and Khalil, *Direct calculation of minimum set of inertial parameters of serial robots*, IEEE Trans. Robotics
-and Automation 6(3), 1990, derive the same parameters by symbolic rules.
+Each entry of M(q), and V(q) - V(q0), is linear in the ten inertial parameters of each body. The coefficients, with one
+row for each entry, are the energy regressor. Its rows are computed at random rational configurations; their reduced row
+echelon form gives the base parameters. Gautier and Khalil, *Direct calculation of minimum set of inertial parameters of
+serial robots*, IEEE Trans. Robotics and Automation 6(3), 1990, derive the same parameters by symbolic rules.
 """
 
 import random
@@ -46,7 +45,7 @@ def base_parameter_count(arm: Chain) -> int:
     while True:
         rows = regressor_rows(arm, points + 2)
         rank = field.rank(rows)
-        # The rank is complete if two more points do not raise it, except with negligible probability.
+        # If two more points do not raise the rank, it is the final rank, with negligible probability of an error.
         if field.rank(rows[: len(rows) * points // (points + 2)]) == rank:
             return rank
         points *= 2
@@ -62,7 +61,7 @@ def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     for row in _reduced_rows(arm, order):
         pairs = zip(order, row, strict=True)
         weights = tuple((index, Fraction(int(x.p), int(x.q))) for index, x in pairs if x)
-        # The first element of a row is the pivot. It is 1, so that the combination needs no normalisation.
+        # The first nonzero element of a row is its pivot, and equal to 1: the first parameter has the coefficient 1.
         first, _ = weights[0]
         name = parameter_name(first) + "R" * (len(weights) > 1)
         result.append(BaseParameter(name, first, weights, _value(arm, weights)))
@@ -100,7 +99,8 @@ def _reduced_rows(arm: Chain, order: list[int]) -> list[list[fmpq]]:
 def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
     """Return the coefficients of the inertial parameters in the entries of M, and in V, at a random configuration.
 
-    The result has m = n(n+1)/2 + 1 rows for n joints and 10 B columns for B bodies, of type fmpq.
+    The result has m = n(n+1)/2 + 1 rows for n joints, and 10 B columns for B bodies. Its elements are rational numbers
+    of FLINT (fmpq).
     """
     parameters = 10 * len(arm.bodies)
     positions = []

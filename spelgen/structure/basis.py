@@ -33,10 +33,10 @@ def row_of(weights: Weights, n: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Term:
-    """A term of M: an unknown function f(q) of the positions of ``joints``, or a constant if ``joints`` is empty.
+    """A term f(q) B of M: f is an unknown function of the positions of ``joints``, or a constant without ``joints``.
 
-    The value of the term is the sum over the lower triangle of the elements of ``functional`` times the entries of M.
-    The contribution of the term to M is this value times ``basis``.
+    ``basis``: the matrix B. ``functional``: coefficients with which f is computed from M: f is the sum over the lower
+    triangle of coefficient times entry of M.
     """
 
     joints: tuple[int, ...]
@@ -45,10 +45,10 @@ class Term:
 
 
 class _Functional(NamedTuple):
-    """A linear functional of M that depends on ``joints`` only: coefficients of the entries of M, (n(n+1)/2,).
+    """A weighted sum of the entries of M that depends on the positions of ``joints`` only.
 
-    The coefficients are elements of the prime field (``weights``) and the same numbers in double precision
-    (``values``).
+    The coefficients of the entries, (n(n+1)/2,), are available in two forms: ``weights`` has elements of the prime
+    field, ``values`` the same numbers in double precision.
     """
 
     joints: tuple[int, ...]
@@ -62,8 +62,9 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     entries = len(spans.keys)
     weights = np.array([r.weights for r in functionals], dtype=np.uint64).reshape(-1, entries)
     values = np.array([r.values for r in functionals]).reshape(-1, entries)
-    # R (m, entries): coefficients of the functionals. U (m, entries): a basis of the changes of M. The matrices B_j
-    # are the rows of B = (U R^T)^-1 U, because then R B^T = 1: f_j is 1 on B_j and 0 on all other matrices.
+    # The rows of R, (m, entries), are the coefficients of the functionals f_j; the rows of U, (m, entries), are a basis
+    # of the changes of M. The matrices B_j are the rows of B = (U R^T)^-1 U. Then R B^T is the identity: the functional
+    # f_j has the value 1 for B_j, and 0 for all other matrices.
     basis = field.product(field.inverse(field.product(spans.varying, weights.T)), spans.varying)
     changes = spans.float_changes(frozenset(range(spans.n)))
     basis_values = _solved(changes @ values.T, changes)
@@ -85,11 +86,14 @@ def _constants(
 ) -> tuple[Term, ...]:
     """Return the constant terms of M: a basis of the span of M - sum_j f_j B_j, with the varying terms f_j(q) B_j.
 
-    constant: S samples of this difference, (S, entries), in the prime field and in double precision. basis: the m
-    matrices B_j, (m, entries), in the prime field and in double precision. entries: n(n+1)/2, of the lower triangle.
+    Matrices are lower triangles with entries = n(n+1)/2 elements.
+
+    Args:
+        constant: S samples of this difference, (S, entries), in the prime field and in double precision.
+        basis: the m matrices B_j, (m, entries), in the prime field and in double precision.
     """
-    # Row reduction prefers pivots in the first columns. The entries of M that depend on the fewest joints come
-    # first, so that these entries define the constants.
+    # The entry of M at each pivot of the row reduction defines a constant. Row reduction places pivots in the first
+    # possible columns: the entries that depend on the fewest joints come first.
     order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(constant[0][:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
@@ -112,22 +116,22 @@ def _constants(
 
 
 def _functionals(spans: Spans) -> Iterator[_Functional]:
-    """Yield linearly independent functionals that together determine every change of M."""
+    """Yield linear functionals of M that are linearly independent and together determine every change of M."""
     chosen = np.zeros((0, len(spans.varying)), dtype=np.uint64)
     tried: set[int] = set()
     for joints in _joint_sets(spans):
         outside = spans.outside(joints)
         kernel = field.null_space(outside)[:, np.argsort(spans.order)]
         bound = [spans.order[pivot] for pivot in field.pivots(outside)]
-        # Number of functionals of this set of joints that are linearly independent of the functionals chosen so far.
+        # `missing`: number of functionals of these joints that are linearly independent of the chosen ones.
         on_changes = field.product(kernel, spans.varying.T)
         missing = field.rank(np.concatenate([chosen, on_changes])) - len(chosen)
         candidates = _candidates(spans, joints, kernel, bound, tried)
         while missing:
             pairs = next(candidates)
             weights = np.array([w for w, _ in pairs], dtype=np.uint64).reshape(-1, len(spans.keys))
-            # A row has the values of a functional on a basis of U, the span of all changes of M: functionals with
-            # equal rows agree on all changes of M, and count as equal.
+            # Each row of `rows` is a functional, represented by its values for a basis of U, the span of all changes of
+            # M. Functionals that differ by a constant are thus equal.
             rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
             # The pivot columns of the transposed matrix are the rows that are linearly independent of earlier rows.
             independent = field.pivots(field.row_basis(rows.T))
@@ -157,9 +161,9 @@ def _candidates(
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the functionals may depend on.
-        kernel: basis of the functionals that vanish on the changes of M caused by all other joints, (m, entries).
-        bound: indices of the entries of M at the pivots of the echelon basis of these changes. Each row of `kernel` is
-            1 at one entry without a pivot, and zero at the others.
+        kernel: basis of the functionals that do not change with the positions of all other joints, (m, entries).
+        bound: indices of the entries of M at the pivots of the echelon basis of the changes of M with these other
+            joints. Each row of `kernel` is 1 at one entry that is not in `bound`, and 0 at all others not in `bound`.
         tried: indices of the entries that were candidates for a set of joints before; they are skipped. This function
             adds its candidates.
     """
@@ -174,8 +178,7 @@ def _candidates(
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []
     for row in sorted(kernel, key=np.count_nonzero):
-        # A row of the null space is 1 at one entry without a pivot; all other nonzero elements of the row are at the
-        # entries with pivots (`bound`).
+        # `entry` is the only entry outside `bound` at which the row is not zero; the row is 1 there.
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0
@@ -201,7 +204,7 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
-    """Return the nonzero elements of a vector over the lower triangle as fractions.
+    """Return the nonzero elements of a lower triangle as fractions, with their rows and columns.
 
     exact, values: the same vector (entries,) in the prime field and in double precision.
     """
@@ -226,7 +229,8 @@ def _fraction(element: int, value: float) -> Fraction:
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         candidate = Fraction(numerator, denominator)
-        # A short fraction always exists modulo PRIME. If it differs from `value`, the number has no short fraction.
+        # A fraction with this numerator is equal to any element modulo PRIME. It is the number only if it is also close
+        # to `value`; otherwise the number has no short fraction.
         if abs(candidate - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
             return candidate
     return Fraction(value)

@@ -30,9 +30,9 @@ class Nominal:
 
     ``output_means`` and ``output_scales`` have one value per output of the structure, ``constants`` and
     ``constant_scales`` one per constant; all other tuples have one value per coordinate. ``potential_scale``: standard
-    deviation of V [J]. ``joint_torque``: root sum of squares of the root mean square gravity torque and of the root
-    mean square torque for unit acceleration [Nm, N]. ``mass_sensitivities`` and ``potential_sensitivities``: change of
-    M and of V with a coordinate, relative to the coordinate with the largest change.
+    deviation of V [J]. ``joint_torque``: typical torque [Nm, N], sqrt(g^2 + a^2) with the root mean squares g of the
+    gravity torque and a of the torque for unit acceleration. ``mass_sensitivities`` and ``potential_sensitivities``:
+    change of M and of V with a coordinate, divided by the largest such change of all coordinates.
     """
 
     output_means: tuple[float, ...]
@@ -62,13 +62,14 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
     means = mass.mean(axis=0)
     rows, columns = np.tril_indices(len(ranges))
     diagonal = rows == columns
-    # |M_ij| <= sqrt(M_ii M_jj), because M is positive definite (Cauchy-Schwarz inequality).
+    # The typical magnitude of an entry is its bound: |M_ij| <= sqrt(M_ii M_jj), because M is positive definite.
     typical = np.sqrt(means[diagonal][rows] * means[diagonal][columns])
     output_rows = _functionals(structure.outputs, len(ranges))
     constant_rows = _functionals(structure.constants, len(ranges))
     outputs = mass @ output_rows.T
     constants = constant_rows @ means
-    # Lower bounds of the scales: an output that hardly varies for the nominal parameters may vary for the true ones.
+    # Lower bounds of the scales: an output that is almost constant for the inertials of the URDF may vary for the true
+    # ones, and the scale is a divisor.
     output_floor = 0.05 * (np.abs(output_rows) @ typical)
     constant_floor = 0.05 * (np.abs(constant_rows) @ typical)
     # Friction is scaled by the torque that a joint's drive needs for gravity and for unit acceleration.
@@ -187,7 +188,9 @@ def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> n
 def _mass_changes(
     arm: Chain, q: np.ndarray, inertias: list[list[float]], mass: np.ndarray, typical: np.ndarray
 ) -> np.ndarray:
-    """Return the root mean square change, without unit, of the entries of M if one coordinate changes, (n,).
+    """Return, for each coordinate, the root mean square change of M if only this coordinate changes, (n,).
+
+    The mean is over samples and entries; changes of entries are divided by typical magnitudes and have no unit.
 
     Args:
         arm: the arm.
@@ -268,9 +271,8 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # [1] If J is inconsistent, eigenvalues of J are raised to this fraction of the largest eigenvalue. J counts as
-    # inconsistent if its smallest eigenvalue is below fraction^2 times the largest one: the bound is that low, because
-    # a slender body has a small eigenvalue, and is consistent.
+    # [1] Smallest eigenvalue of an inconsistent J after its correction, divided by the largest eigenvalue. The test of
+    # consistency has the lower bound fraction^2, because a slender body has a small eigenvalue and is consistent.
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)

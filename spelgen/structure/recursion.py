@@ -16,22 +16,22 @@ from typing import Any, NamedTuple
 from spelgen.arm.arm import Body, Chain
 
 Element = Any
-"""An element of the ring: an object that supports +, - and * with other elements and with integers."""
+"""A number of the recursion: any object that supports +, - and * with such objects and with integers."""
 
 Number = Callable[[Fraction], Element]
-"""Conversion of the exact constants of an arm to elements of the ring."""
+"""Conversion of the exact constants of an arm to the numbers of the recursion."""
 
 Vector = tuple[Element, ...]
 
 TENSOR = tuple(combinations_with_replacement(range(3), 2))
-"""Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
+"""Order of the components of an inertia tensor: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
 
 
 class Position(NamedTuple):
     """The position of a coordinate q: cosine and sine of q / d, and q itself.
 
-    d is an integer for which the angles of all joints of the coordinate, mimic joints included, are integer multiples
-    of q / d, up to a constant (see ``base_denominators``). It is 1 without mimic joints.
+    The integer d is 1 without mimic joints. With mimic joints, their angles are integer multiples of q / d plus a
+    constant, so that their cosines and sines are polynomials in cos(q / d) and sin(q / d) (see ``base_denominators``).
     """
 
     cos: Element
@@ -85,7 +85,7 @@ def energies(
         arm: the arm.
         positions: position of each coordinate.
         inertias: ten inertial parameters of each body.
-        number: conversion of the exact constants of the arm to elements of the ring.
+        number: conversion of the exact constants of the arm to the number type of `positions` and `inertias`.
 
     V is zero for a mass at the origin of the root link and increases against ``arm.gravity``.
     """
@@ -167,10 +167,10 @@ def circle_point(angle: float) -> tuple[Fraction, Fraction]:
 
 
 def base_denominators(arm: Chain) -> list[int]:
-    """Return for each coordinate q the smallest integer d for which all its joint angles are multiples of q / d.
+    """Return the smallest integer d of each coordinate q such that its joint angles are multiples of q / d.
 
-    The angle of each revolute joint with this coordinate, mimic joints included, is an integer multiple of q / d plus
-    a constant.
+    The angle of each revolute joint that q moves, including mimic joints, is an integer multiple of q / d plus a
+    constant.
     """
     denominators = [1] * len(arm.coordinates)
     for body in arm.bodies:
@@ -183,10 +183,11 @@ def base_denominators(arm: Chain) -> list[int]:
 def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Element]:
     """Return cosine and sine of ``factor`` times an angle with the cosine ``c`` and the sine ``s``."""
     result: tuple[Element, Element] = (1, 0)
-    # Exponentiation by squaring needs few products; multipliers of mimic joints reach 20.
+    # The angle is doubled for each bit of `factor`, and increased by one angle for each bit that is 1. This takes fewer
+    # products than repeated addition: factors are as large as 20.
     for bit in bin(abs(factor))[2:]:
         x, y = result
-        # The square of the complex number x + i y doubles its angle.
+        # (x + i y)^2 has twice the angle of x + i y.
         result = (x * x - y * y, 2 * (x * y))
         if bit == "1":
             x, y = result
@@ -201,13 +202,14 @@ def _column(
 ) -> Iterator[tuple[Body, Element]]:
     """Yield (ancestor, entry) for a body itself, and then for each of its ancestors.
 
-    The entry is the element of the mass matrix for the joints of the body and of the ancestor, as if all joints were
-    independent. index: of the body in `arm.bodies`. inertia: composite inertia of the body and all its descendants.
+    The entry is the element of the mass matrix in the row of the body's joint and the column of the ancestor's joint.
+    Mimic joints count as independent joints here. index: of the body in `arm.bodies`. inertia: composite inertia of the
+    body and all its descendants.
     """
     body = arm.bodies[index]
-    # The wrench that gives the composite body a unit acceleration about (or along) its z axis: force z x h and moment
-    # I z (revolute), or force m z and moment h x z (prismatic). The component of this wrench along the axis of an
-    # ancestor is the entry of M (Featherstone, table 6.2).
+    # `wrench` (force, moment) gives the composite body a unit acceleration about or along its z axis: (z x h, I z) if
+    # revolute, (m z, h x z) if prismatic. Its component along the joint axis of an ancestor is the entry of M
+    # (Featherstone, table 6.2).
     (hx, hy, _), tensor = inertia.moment, inertia.tensor
     wrench: _Wrench = (-hy, hx, 0), (tensor[2], tensor[4], tensor[5])
     if body.joint_type == "prismatic":
@@ -264,14 +266,14 @@ def _turned(pose: _Pose, vector: Vector) -> Vector:
 
 
 def _translated(offset: Vector, inertia: _Inertia) -> _Inertia:
-    """Return the inertia about an origin displaced by -p, p = ``offset``, by the parallel-axis theorem.
+    """Return the inertia about an origin that is displaced by -``offset``, by the parallel-axis theorem.
 
-    The first moment h changes to h + m p, with the mass m.
+    With the mass m and p = ``offset``, the first moment h changes to h + m p.
     """
     (x, y, z), mass, (hx, hy, hz) = offset, inertia.mass, inertia.moment
     xx, xy, xz, yy, yz, zz = inertia.tensor
     moment = (hx + x * mass, hy + y * mass, hz + z * mass)
-    # With k = h + (h + m p), the tensor I increases by (p.k) 1 - (p k^T + k p^T) / 2.
+    # The inertia tensor I becomes I + (p.k) 1 - (p k^T + k p^T) / 2, with k = 2 h + m p (see the docstring).
     dx, dy, dz = (p * (old + new) for p, old, new in zip(offset, inertia.moment, moment, strict=True))
     xy = xy - x * hy - y * hx - x * y * mass
     xz = xz - x * hz - z * hx - x * z * mass

@@ -36,14 +36,15 @@ def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray,
     n = len(arm.coordinates)
     positions = []
     for index in range(n):
-        # Cosine and sine of an angle are algebraically independent of a displacement: the displacement is another
-        # random number.
+        # Revolute joints use the cosine and sine, prismatic joints the value. The value is a further random number,
+        # independent of the angle, since sines and cosines are algebraically independent of the angle.
         c, s = field.random_circle_points(rng, 2 * samples)
         value = random_residues(rng, (2 * samples,))
         moved = [Residues(_one_moved(x, index, 1 + n)) for x in (c, s, value)]
         positions.append(Position(*moved))
     if assume == "kinematics":
-        # A rank or zero at random inertial parameters is valid for all values of the parameters.
+        # Random inertial parameters make ranks and zeros valid for all values of the parameters, except for special
+        # values (of probability 0).
         inertias: list[Ten] = [list(map(Residues, random_residues(rng, (10, samples)))) for _ in arm.bodies]
     else:
         inertias = [list(map(residue, body.inertia or (Fraction(0),) * 10)) for body in arm.bodies]
@@ -114,8 +115,8 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
     """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S).
 
-    values: (2 S,). Block ``index`` + 1, in which only this coordinate differs from block 0, gets the second half of the
-    values; all other blocks get the first half.
+    values: (2 S,). The first half is for all blocks except for block ``index`` + 1, which gets the second half: only
+    there, this coordinate differs from block 0.
     """
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
@@ -192,7 +193,8 @@ class Spans:
         The entries of M are in the order ``order``.
         """
         first, last = min(joints), max(joints)
-        # The joints before `first` and after `last` have cached echelon forms, which saves most of the time.
+        # Echelon forms for all joints before `first`, and for all after `last`, are cached: this saves most of the
+        # time.
         between = [self.change_bases[k] for k in range(first, last) if k not in joints]
         return field.row_basis(np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]]))
 

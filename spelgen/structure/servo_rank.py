@@ -20,9 +20,11 @@ PARAMETERS = ("kp", "kd", "armature", "dry")
 class ServoRank(NamedTuple):
     """Identifiable ratios of the parameters of servos.
 
-    groups: sets of joints (0-based). Within a set, all ratios of two kp are identifiable, so that one known kp, mass or
-    load determines all parameters of the set. open: pairs (parameter, joint) whose ratio to the kp of the joint is not
-    identifiable; such a parameter can be identified only together with the inertial parameters of the bodies.
+    Attributes:
+        groups: sets of joints (0-based). Within a set, all ratios of two kp are identifiable, so that one known kp,
+            mass or load determines all parameters of the set.
+        open: pairs (parameter, joint) whose ratio to the kp of the joint is not identifiable; such a parameter can be
+            identified only together with the inertial parameters of the bodies.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -37,14 +39,14 @@ def servo_rank(arm: Chain) -> ServoRank:
     q, qd, qdd = random.normal(size=(3, samples, n))
     columns = torque_rows(arm, q, qd, qdd).reshape(samples * n, -1)
     identifiable, _ = _row_and_null_space(columns)
-    # Each column is multiplied by a random true value of its unknown, so that all scaled unknowns are 1.
+    # The true parameters are random. Each column is multiplied by the true value of its parameter: the solution of the
+    # scaled equations is then 1 for all parameters.
     bodies = columns @ (identifiable * random.uniform(0.5, 2.0, identifiable.shape[1]))
     drives = np.stack([qd, qdd, np.sign(qd)], axis=-1) * random.uniform(0.5, 2.0, (n, 3))
     torque = drives.sum(axis=-1) + bodies.sum(axis=-1).reshape(samples, n)
     rows = np.zeros((samples, n, n, len(PARAMETERS)))
     for joint in range(n):
-        # The coefficient of kp is the command error u - q. Since the scaled kp is 1, the command error is equal to the
-        # torque of all other terms.
+        # The coefficient of kp is the command error u - q. With kp = 1, it is the torque of all other terms.
         rows[:, joint, joint, 0] = -torque[:, joint]
         rows[:, joint, joint, 1:] = drives[:, joint]
     system = np.concatenate([rows.reshape(samples * n, -1), bodies], axis=1)
@@ -53,13 +55,13 @@ def servo_rank(arm: Chain) -> ServoRank:
     _, null = _row_and_null_space(system / norms)
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
-    # [1] Relative changes of two parameters that differ by less are equal. Rounding errors of null vectors are about a
-    # thousand times larger than the rounding errors of the matrix.
+    # [1] Two relative changes of parameters count as equal if they differ by less than this. Null vectors have rounding
+    # errors about a thousand times larger than the matrix.
     equal, kp = 1e-6, changes[:, :1]
     # (n, n): True for two joints whose kp change by the same factor in the whole null space.
     same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal
     groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in same)
-    # (n, number of PARAMETERS): True for a parameter of a joint that does not change by the factor of the joint's kp.
+    # (n, number of PARAMETERS): False for a parameter that always changes by the same factor as kp of its joint.
     differs = np.abs(changes - kp).max(axis=-1) > equal
     undetermined = [(PARAMETERS[k], joint) for k, joint in np.argwhere(differs.T).tolist()]
     return ServoRank(tuple(groups), tuple(undetermined))

@@ -62,7 +62,7 @@ class Structure:
         return sum(not output.joints or min(output.joints) >= first for output in self.outputs)
 
 
-@lru_cache(maxsize=16)  # The same arm is often used with several settings or logs.
+@lru_cache(maxsize=16)  # cached, because one arm is used with several settings or logs
 def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
     """Return the structure of ``arm``.
 

@@ -27,8 +27,9 @@ _OTHER_FORMATS = {
 class UrdfDocument(NamedTuple):
     """The bytes of a URDF file (``data``) and its ``<robot>`` element (``root``).
 
-    ``path`` is the name of the file in errors. ``leftovers`` are the line numbers of ``<xacro:property>`` elements. For
-    a xacro file, bytes and lines refer to the expanded document, and ``warnings`` are the warnings of xacro.
+    ``path`` is the name of the file in errors. ``leftovers`` are the line numbers of ``<xacro:property>`` elements,
+    which have no effect. For a xacro file, bytes and lines refer to the expanded document, and ``warnings`` are the
+    warnings of xacro.
     """
 
     path: Path
@@ -139,8 +140,8 @@ def _check_root(path: Path, root: etree._Element) -> None:
 def _check_xacro(path: Path, root: etree._Element) -> tuple[int, ...]:
     """Return the line numbers of <xacro:property> elements, which may remain after expansion and have no effect.
 
-    Raises UrdfError for all other xacro elements, since the document is then not expanded. A number that refers to a
-    property is an error when the number is read.
+    Raises UrdfError if there are other xacro elements, since the document is then not expanded. References to a
+    property, such as ``${mass}``, are not found here: they are errors when the number is read.
     """
     errors, leftovers = [], []
     for element in root.iter(etree.Element):

@@ -39,7 +39,7 @@ def read_link(notes: Notes, xml: etree._Element) -> UrdfLink | None:
 
 def _read_inertial(inertial: Element) -> Inertial | None:
     mass_element = inertial.child("mass")
-    # Origin and tensor are read before an absent mass ends this function, so that all defects are reported.
+    # Origin and tensor are read before the mass is checked: if it is absent, their defects are reported, too.
     com, rpy = _read_origin(inertial)
     tensor = _read_tensor(inertial)
     if mass_element.xml is None:
@@ -156,7 +156,8 @@ def _read_mimic(mimic: Element) -> Mimic | None:
     if multiplier is None:
         multiplier = 1.0
     offset = mimic.number("offset") or 0.0
-    # A multiplier is an error if its inverse exceeds the bound of all numbers in a URDF.
+    # A tiny multiplier is an error like a huge one: its inverse, too, must be within the bound of all numbers in a
+    # URDF.
     if multiplier and abs(multiplier) < 1 / MAX_MAGNITUDE:
         expected = f"0, or {1 / MAX_MAGNITUDE:g} at least"
         mimic.error(repr(mimic.text("multiplier")), expected, key="multiplier")
@@ -166,11 +167,11 @@ def _read_mimic(mimic: Element) -> Mimic | None:
 def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) -> Transmission:
     """Return the transmission of a <transmission> element in the form of ROS (<type>, <joint>, <actuator>).
 
-    Unknown joints and unusable numbers are warnings. Errors of numbers are also stored in the transmission: a step that
-    needs the transmission raises them.
+    Unknown joints and unusable numbers are added to ``notes`` as warnings. The unusable numbers are also stored in the
+    field ``errors`` of the transmission, for callers that need the transmission.
 
     Args:
-        notes: the warnings are added to these notes.
+        notes: list to which the warnings are added.
         xml: the element.
         joints: names of all joints of the URDF.
     """

@@ -29,10 +29,14 @@ COUNTS = {"box": 3, "cylinder": 2, "sphere": 1, "mesh": 3}
 class LinkShape:
     """A shape of a link.
 
-    link: name of the link. kind and size: "box" with the lengths of three edges, "cylinder" with radius and length
-    along z, "sphere" with radius [m], "mesh" with the scale factors along x, y and z. pose: homogeneous transform
-    (4, 4) of the shape in the frame of the link. file: name of the file of a mesh in the URDF. mesh: scaled vertices
-    (V, 3) [m] in the frame of the shape, and vertex indices (F, 3) of triangles; None for other kinds.
+    Attributes:
+        link: name of the link.
+        kind, size: "box" with the lengths of three edges, "cylinder" with radius and length along z, "sphere" with
+            radius [m], "mesh" with the scale factors along x, y and z.
+        pose: homogeneous transform (4, 4) of the shape in the frame of the link.
+        file: name of the file of a mesh in the URDF.
+        mesh: scaled vertices (V, 3) [m] in the frame of the shape, and vertex indices (F, 3) of triangles; None for
+            other kinds.
     """
 
     link: str
@@ -46,8 +50,8 @@ class LinkShape:
 class LinkShapes(NamedTuple):
     """The shapes that were read, and the shapes that could not be read.
 
-    unread: by the name of the link, a text for each of its unread shapes: the name of the mesh file, or the reason for
-    which the shape was not read.
+    unread: {name of a link: a text for each of its unread shapes}. The text is the name of the mesh file, or the reason
+    for which the shape could not be read.
     """
 
     shapes: tuple[LinkShape, ...]
@@ -145,7 +149,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
 
 
 def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[str, tuple[float, ...]], Mesh]:
-    """Return the meshes of these shapes by (file, scale); a mesh that cannot be read is omitted.
+    """Return {(file, scale): mesh} of the shapes that are meshes; a mesh that cannot be read is omitted.
 
     faces: largest number of triangles of all meshes together.
     """

@@ -86,9 +86,9 @@ def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
 
 
 def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
-    """Yield one diagnostic: for each kind of limit, the moving joints for which it is absent.
+    """Yield one diagnostic with the moving joints that have no limit of position, velocity or effort, if there are any.
 
-    Such joints count as unlimited.
+    A joint without a limit counts as unlimited.
     """
     lacking = {
         "position": [x.name for x in joints if x.type != "continuous" and None in (x.lower, x.upper)],

@@ -1,7 +1,8 @@
 """Program that reads meshes in a process of limited time and memory.
 
 It reads {"faces": N, "meshes": [[PATH, SCALE], ...]} as JSON from stdin and writes an NPZ archive to stdout. The limits
-are needed because mesh files may contain archives, names of other files and repetition counts.
+are needed because a small mesh file can take unlimited memory or time: it may be an archive, name other files or
+contain repetition counts.
 """
 
 from __future__ import annotations
@@ -56,11 +57,11 @@ def main(faces: int, meshes: list[tuple[str, list[float]]], output: IO[bytes]) -
         resource.setrlimit(resource.RLIMIT_CPU, (30,) * 2)
     arrays: dict[str, np.ndarray] = {}
     for index, (path, scale) in enumerate(meshes):
-        # Meshes contain reference cycles, which only the garbage collector frees: without it, meshes of previous
-        # iterations would fill the memory.
+        # A mesh of trimesh contains reference cycles, which only the garbage collector frees: without it, the meshes
+        # that were read before would fill the memory.
         gc.collect()
-        # The readers of trimesh raise errors of any type. For a mesh with an error no arrays are written; the parent
-        # process recognises it by their absence.
+        # The readers of trimesh raise errors of any type. A mesh with an error has no arrays in the archive, and the
+        # parent process omits it.
         with suppress(Exception):
             mesh = _read(Path(path), scale, faces)
             arrays |= {f"v{index}": np.asarray(mesh.vertices), f"f{index}": np.asarray(mesh.faces)}

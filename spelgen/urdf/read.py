@@ -70,8 +70,8 @@ def read_urdf(path: Path) -> Robot:
 def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
     """Return the diagnostics of reading and of ``lint`` in the order of lines.
 
-    For an absent <inertia>, ``notes`` contains a diagnostic already, and the diagnostic of ``lint`` for a zero tensor
-    is omitted.
+    If <inertia> is absent, the tensor is zero: reading has added a diagnostic for this, so that the diagnostic of
+    ``lint`` is omitted.
     """
     absent = {remark.line for remark in notes.diagnostics if remark.code == "inertial-without-inertia"}
     warnings = [x for x in lint(robot) if x.code != "zero-inertia" or x.line not in absent]
@@ -95,7 +95,7 @@ def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
 
 
 def _unique(notes: Notes, elements: Sequence[Part | None]) -> list[Part]:
-    """Return the elements that are not None; two links, or two joints, of one name are reported as an error."""
+    """Return the elements that are not None. Two links or two joints with the same name are an error in ``notes``."""
     by_name: dict[str, Part] = {}
     for element in elements:
         if element is None:
@@ -161,7 +161,7 @@ def _is_circle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
 def _rooted(notes: Notes, root: etree._Element, robot: Robot) -> Robot:
     """Return the robot with its field ``root`` set to the name of the root link.
 
-    Errors are added to ``notes`` unless the links form one tree. root: the <robot> element.
+    If the links do not form a single tree, errors are added to ``notes``. root: the <robot> element.
     """
     children = {joint.child for joint in robot.joints}
     tops = [link for link in robot.links if link.name not in children]
@@ -173,7 +173,7 @@ def _rooted(notes: Notes, root: etree._Element, robot: Robot) -> Robot:
         notes.error(root.sourceline, "<robot>", got, "one link that is no joint's child", do)
         return robot
     robot = replace(robot, root=tops[0].name)
-    # `joints_from_root` ends even if some links form a cycle: each link has one parent here, so that the cycle is not
+    # `joints_from_root` always ends: each link has at most one parent here, so that a cycle of links cannot be
     # connected to the root.
     connected = {robot.root, *(joint.child for joint in robot.joints_from_root)}
     for link in robot.links:

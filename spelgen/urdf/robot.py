@@ -120,22 +120,22 @@ class Robot:
 
     @cached_property
     def link(self) -> dict[str, UrdfLink]:
-        """The links by name."""
+        """{name: link} of all links."""
         return {link.name: link for link in self.links}
 
     @cached_property
     def joint(self) -> dict[str, UrdfJoint]:
-        """The joints by name."""
+        """{name: joint} of all joints."""
         return {joint.name: joint for joint in self.joints}
 
     @cached_property
     def joint_above(self) -> dict[str, UrdfJoint]:
-        """The joint above each link except the root, by the name of the link, which is the child of the joint."""
+        """{name of a link: the joint whose child it is}, for all links except the root."""
         return {joint.child: joint for joint in self.joints}
 
     @cached_property
     def joints_below(self) -> dict[str, tuple[UrdfJoint, ...]]:
-        """The joints below each link, by the name of the link, which is the parent of these joints."""
+        """{name of a link: the joints whose parent it is}, for all links."""
         # Links without such joints have an empty entry, so that no caller needs a default.
         below: dict[str, tuple[UrdfJoint, ...]] = {link.name: () for link in self.links}
         for joint in self.joints:

@@ -2,7 +2,7 @@
 
 The package yourdfpy is not used to read the numbers of an arm: it does not report lines, replaces absent inertias by
 1.0, converts origins to matrices and drops mechanical reductions. Here each number is checked as text first (count,
-length, finiteness). Tests compare all other values with the values that yourdfpy reads.
+length, finiteness). Tests compare with yourdfpy all values that it does not change.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
 @dataclass
 class Notes:
-    """Errors and diagnostics of one file; the reader raises all errors together at its end."""
+    """Errors and diagnostics of one file. `read_urdf` raises all errors together after reading."""
 
     path: Path
     errors: list[UrdfError] = field(default_factory=list)
@@ -43,13 +43,13 @@ class Notes:
         self.errors.append(error)
 
     def warn(self, line: int | None, code: str, where: str, message: str) -> None:
-        """Add a warning with this code about ``where``, the name of an element in messages."""
+        """Add a warning. code: code of the ``Diagnostic``; where: name of the element."""
         self.diagnostics.append(Diagnostic("warning", code, where, line, message))
 
     def add_as_warnings(self, optional: Notes) -> None:
-        """Add the notes on elements that a robot can do without, such as limits of fixed joints.
+        """Add the notes on optional elements, such as limits of fixed joints, with errors as warnings.
 
-        Errors are added as warnings, which state that the value is treated as absent.
+        The warnings state that the value is treated as absent.
         """
         self.diagnostics += optional.diagnostics
         for error in optional.errors:
@@ -61,8 +61,10 @@ class Notes:
 class Element:
     """An element of a URDF with checked access to its attributes.
 
-    notes: the list to which errors and warnings about the element are added. xml: None if the element is absent; it
-    then has no attributes. where: name of the element in messages.
+    Attributes:
+        notes: the list to which errors and warnings about the element are added.
+        xml: the element of lxml; None if it is absent: all attributes are then absent, too.
+        where: name of the element in messages.
     """
 
     notes: Notes
@@ -116,7 +118,10 @@ class Element:
         return (values[0], values[1], values[2]) if values else default
 
     def number(self, key: str) -> float | None:
-        """Return the number in an attribute, or None if it is absent; for an unusable text, add an error too."""
+        """Return the number in an attribute; None if it is absent.
+
+        For an unusable text, add an error and return None.
+        """
         values = self._numbers(self.text(key), key)
         return values[0] if values else None
 
@@ -144,9 +149,9 @@ class Element:
     def _numbers(self, text: str | None, key: str, count: int = 1, bounded: bool = True) -> list[float]:
         """Return the ``count`` finite numbers in a text.
 
-        The list is empty if the text is None. If the text does not consist of such numbers, add an error and return an
-        empty list. bounded: whether magnitudes above MAX_MAGNITUDE are errors; for limits of joints they are not,
-        because a huge limit means "unlimited".
+        The list is empty if the text is None. It is also empty, and an error is added, if the text does not consist of
+        ``count`` finite numbers. bounded: if True, magnitudes above MAX_MAGNITUDE are errors; False for limits of
+        joints, because a huge limit means "unlimited".
         """
         if text is None or self._is_unexpanded(text, key):
             return []

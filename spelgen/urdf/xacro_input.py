@@ -76,7 +76,7 @@ def _failure(path: Path, code: int, lines: list[str]) -> UrdfError:
 def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path) -> None:
     """Replace xacro's function for $(find PACKAGE), so that packages are found without ROS.
 
-    Packages are searched first in each folder above the file ``path``, and in its subfolder PACKAGE.
+    A package is searched in the folders above the file ``path`` and in their subfolders PACKAGE, and then by xacro.
     """
     installed = functions["_eval_find"]
 

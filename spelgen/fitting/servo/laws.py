@@ -1,10 +1,12 @@
-"""Selection of the joints that have a dead zone, by the maximum posterior of each joint with and without one.
+"""Selection of the joints that have a dead zone: the posterior maxima with and without one are compared.
 
-At a joint without gravity load, the derivatives of the position errors do not distinguish a dead zone from dry
-friction: both cause a static position error. The motion at starts, stops and reversals distinguishes them. Therefore
-each joint is fitted twice, from initial parameters with and without a dead zone. Load, delay and likelihood are fixed
-at their values in the preceding fit, so that the joints are independent. A dead zone is kept if it lowers the joint's
-negative log posterior by more than significance^2 / 2.
+Each joint is fitted twice, from initial parameters with and without a dead zone. The dead zone is kept if it lowers the
+joint's negative log posterior by more than significance^2 / 2. Load, delay and likelihood are fixed at their values in
+the preceding fit, so that the joints are independent.
+
+A single linearized fit does not suffice at joints without gravity load. There, a dead zone and dry friction both cause
+a static position error, and the derivatives of the errors with respect to both are proportional. Only the motion at
+starts, stops and reversals distinguishes them.
 """
 
 from dataclasses import replace
@@ -46,8 +48,8 @@ def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> Servo
 def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, Tensor]:
     """Minimize the cost of each joint over its own parameters; return the parameters and the costs, (n,).
 
-    The n joints have independent Levenberg-Marquardt solvers in one batch, each with its own damping and termination:
-    with a common damping the joint with the worst initial guess would slow down all others.
+    The method is Levenberg-Marquardt. Each joint has its own damping and termination, since a joint with a poor initial
+    guess would slow down all others otherwise. The rollouts of all joints form one batch.
     """
     errors = problem.residual(x)
     costs = problem.joint_costs(x, errors)
@@ -55,7 +57,8 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
     p, n = x.joints.shape
     for _ in range(TUNING.joint_steps):
         normal = problem.normal_equations(x, errors)
-        # Hessian and negative gradient with respect to the p parameters of each joint, (n, p, p) and (n, p)
+        # Only the blocks of the Hessian with respect to the p parameters of one joint are used, (n, p, p), with the
+        # negative gradients (n, p).
         blocks = normal.curvature[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)
         joints = NormalEquations(blocks.permute(2, 0, 1), normal.descent[: p * n].view(p, n).mT)
         steps = joints.step(damping).clamp(-TUNING.max_step, TUNING.max_step)
@@ -63,7 +66,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         candidate_errors = problem.residual(candidate)
         candidate_costs = problem.joint_costs(candidate, candidate_errors)
         better = active & (candidate_costs < costs)
-        # the fit of a joint ends after a small decrease, or if a step with damping >= 1 does not lower the joint's cost
+        # The fit of a joint ends if a step lowers the joint's cost only by little, or not at all with a damping >= 1.
         active &= torch.where(better, costs - candidate_costs >= TUNING.min_decrease, damping < 1.0)
         x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
         errors = torch.where(better, candidate_errors, errors)
@@ -77,8 +80,9 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
 def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
     """Return the parameters with a dead zone at every joint, and with all parameters marked as fitted (`active`).
 
-    Half the dead zone is set to ``fraction`` times the static error, dry friction / kp. Coulomb friction is reduced by
-    the same fraction, so that the static error remains about the same (exactly, if there is only Coulomb friction).
+    The static position error is (dry friction) / kp + half the dead zone. Half the dead zone is set to ``fraction``
+    times (dry friction) / kp, and Coulomb friction is reduced by the same fraction. The static error then remains about
+    the same, or exactly the same if Coulomb friction is the only dry friction.
     """
     rollouts, row, joints = problem.rollouts, problem.parameters.row, x.joints.clone()
     model = rollouts.model
@@ -92,7 +96,7 @@ def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) 
 
 
 def sliding_friction(friction: FrictionLaws, qd: Tensor, gravity: Tensor) -> Tensor:
-    """Return the magnitude of each joint's dry friction, averaged over the distance traveled, (n,) [Nm, N].
+    """Return the magnitude of each joint's dry friction, (n,) [Nm, N], averaged with the weight |qd|.
 
     Args:
         friction: friction model.

@@ -36,8 +36,8 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
     with torch.no_grad():
         is_known = servo.trained == 0
         factor = 1 / (compliance * servo.nominal_kp).clamp(min=1e-12)
-        # Gravity determines kp only at joints that carry a gravity load. At other joints, the nominal kp is multiplied
-        # by the median of the factors at joints with a gravity load.
+        # The coefficient of the gravity load, 1 / kp, determines kp / nominal kp only at joints that carry such a load.
+        # The other joints have the median of this factor.
         determined = ~is_known & (significance[:, 3] > TUNING.kp_significance)
         determined &= factor.log().abs() < np.log(TUNING.kp_range)
         common = factor[determined].median() if determined.any() else 1.0
@@ -48,8 +48,9 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
         armature = torch.maximum(kp * inertia - load.inertia.mean(dim=(0, 1)), smallest**3 * kp)
         model.raw_armature.copy_((armature / model.nominal_armature).log())
         friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=smallest).log())
-        # Logs of positions determine only the sum of viscous friction and kd, which is fitted as kd. The friction
-        # parameters are logarithms of ratios to nominal friction: -6 is negligible friction, -2 is small friction.
+        # Logs of positions determine only the sum of viscous friction and kd. The sum is fitted as kd, and viscous
+        # friction is negligible: exp(-6) times nominal friction. The Stribeck effect starts from exp(-2) times nominal
+        # friction.
         friction.raw_viscous.fill_(-6.0)
         friction.raw_saturation.fill_(-6.0)
         friction.raw_stribeck.fill_(-2.0)
@@ -57,13 +58,14 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
 
 
 def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the least-squares coefficients of each joint, and coefficients / standard deviations, (n, 5) each.
+    """Return the least-squares coefficients of each joint, and their t values, (n, 5) each.
 
-    Errors within a window are correlated: the standard deviations count its K samples as one independent error.
+    A t value is a coefficient divided by its standard deviation. The errors within a window are correlated: the K
+    samples of a window count as one independent error.
 
     Args:
-        columns: (W, K, n, 5), regressors of each joint: velocity, acceleration, direction of friction in [-1, 1],
-            torque of the bodies, and 1.
+        columns: (W, K, n, 5), regressors of each joint: velocity, acceleration, dry friction divided by its magnitude
+            (-1 to 1), torque of the bodies, and 1.
         errors: (W, K, n), command errors [rad, m] at the K intervals of each of W windows.
     """
     matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, W K, 5)
@@ -78,16 +80,16 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def fit_linear_servos(windows: ServoWindows) -> LinearServos:
-    """Return the two baselines of a servo fit: linear second-order servos, and a pure command delay.
+    """Return the parameters of both baselines: linear second-order servos, and a pure delay of the commands.
 
-    The servos of single joints are fitted to the samples after the burn-in. The delay, common to all joints, is fitted
-    to all samples. It is for the baseline `DelayedCommand`, which predicts the delayed command as the position.
+    The servo of each joint is fitted separately, to the samples after the burn-in. The baseline `DelayedCommand`
+    predicts the delayed command as the position; its delay is common to all joints and is fitted to all samples.
     """
     q, qd = windows.q.numpy(), windows.qd.numpy()
     measured, dt = q[:, 1:], float(windows.dt.mean())
 
-    # Cached, because the commands depend only on the delay: finite differences with respect to the other three unknowns
-    # have the same delay.
+    # The result is cached: most evaluations of the residual have the same delay, since finite differences change one of
+    # the four unknowns at a time.
     @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
         """Return the mean command of each interval, (W, K-1, n)."""
@@ -96,9 +98,9 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     def delayed_error(delay: float) -> float:
         return float(np.square(commands(delay) - measured).mean())
 
-    # a bounded scalar search suffices: commands change little within the bounds, so the error has one minimum
+    # A bounded scalar search suffices: commands change little within the bounds, so the error has one minimum.
     late = minimize_scalar(delayed_error, bounds=(0, TUNING.max_delay), method="bounded").x
-    # unknowns: log of the natural frequency [rad/s], log of the damping ratio, delay [s], offset [rad, m]
+    # The unknowns x: log of the natural frequency [rad/s], log of the damping ratio, delay [s], offset [rad, m].
     initial = (np.log(TUNING.frequency), 0.0, TUNING.initial_delay, 0.0)
     bounds = ((-np.inf, -np.inf, 0.0, -np.inf), (np.inf, np.inf, TUNING.max_delay, np.inf))
     fits = []
@@ -106,7 +108,7 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
         column = slice(joint, joint + 1)
 
         def residual(x: np.ndarray, column: slice = column) -> np.ndarray:
-            """Return the position errors of one joint after the burn-in, flattened, for the unknowns x (4,)."""
+            """Return the position errors of one joint after the burn-in, as a vector, for its unknowns x (4,)."""
             u = commands(x[2])[..., column] + x[3]
             predicted = linear_response(
                 q[:, 0, column], qd[:, 0, column], u, dt, np.exp(x[:1]), np.exp(x[1:2])

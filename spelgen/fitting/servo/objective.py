@@ -1,9 +1,9 @@
 """The objective servo: fit the position servos, friction and gravity load of an arm to commands and measured positions.
 
 The initial guess is the least-squares solution for the command error (`least_squares`). Three outer iterations then
-minimize the error of predicted windows (`problem`). Each iteration first computes the scale of the errors and the load
-of the bodies, along the measured motion in the first iteration and along the predicted motion in the others. Dead zones
-are selected after the first iteration (`laws`). The last iteration uses all windows.
+minimize the error of predicted windows (`problem`). At its start, each iteration fixes the scale of the errors, and the
+load of the bodies along a motion: the measured motion in the first iteration, the predicted motion in the others. Dead
+zones are selected after the first outer iteration (`laws`). The last outer iteration uses all windows.
 """
 
 import copy
@@ -36,16 +36,16 @@ from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
-# The first iteration uses few windows with half the integration steps; the second, few windows with the selected dead
-# zones; the third, all windows.
+# The first iteration uses few windows and half the integration steps, the second few windows and all integration steps,
+# the third all windows.
 OUTER_ITERATIONS = 3
 
 
 class ServoObjective(Objective):
-    """A fit to all logs, without validation logs; it can be resumed at the start of each outer iteration.
+    """The servo fit. It uses all logs, without validation, and can be resumed at the start of each outer iteration.
 
-    The load and the scale of the errors in an outer iteration are functions of the parameters at the start of this and
-    of all earlier outer iterations. A checkpoint therefore contains only these parameters and the initial weights.
+    A checkpoint contains the initial weights and the parameters at the start of each outer iteration. The load and the
+    scale of the errors are recomputed from them.
     """
 
     name: ClassVar[str] = "servo"
@@ -74,7 +74,7 @@ class ServoObjective(Objective):
         )
 
     def begin(self) -> list[Diagnostic]:
-        """Set the model to the initial guess, and begin the first outer iteration."""
+        """Set the model to the initial guess, and prepare the first outer iteration; return no diagnostics."""
         self._since = time.monotonic()
         set_initial_guess(self.model, self._windows)
         self._set_up(copy.deepcopy(self.model.state_dict()))
@@ -95,7 +95,8 @@ class ServoObjective(Objective):
         """Run the remaining outer iterations; ``save``, which writes a checkpoint, is called after each of them."""
         while len(self._iterates) < OUTER_ITERATIONS:
             x = self._minimized(progress)
-            # Dead zones are selected after the first iteration: with the initial gains, gain errors would dominate.
+            # Dead zones are selected after the first iteration: before it, errors of the initial gains would dominate
+            # the position errors.
             select = select_dead_zones if len(self._iterates) == 1 else without_small_dead_zones
             self._begin_iteration(select(self._problem, x))
             save()
@@ -104,7 +105,7 @@ class ServoObjective(Objective):
         return "finished"
 
     def _minimized(self, progress: TrainingProgress) -> ServoParameters:
-        """Return the parameters that minimize the cost of the current outer iteration."""
+        """Minimize the cost of the current outer iteration; return the parameters."""
         problem, number = self._problem, len(self._iterates)
         show = partial(_show_progress, progress, number)
         # The damping is smaller in the second and third outer iteration, which start near the minimum.
@@ -122,7 +123,7 @@ class ServoObjective(Objective):
         return result.state.x
 
     def _finish(self, x: ServoParameters) -> None:
-        """Correct the integration error by one solver step with half the integration step size; record the result."""
+        """Reduce the integration error by one solver step with half the integration step size; record the results."""
         problem = self._problem.refined(2 * self._windows.steps, TUNING.last_difference_step)
         end, solved = solution(problem, x)
         problem.parameters.write(end)
@@ -133,10 +134,10 @@ class ServoObjective(Objective):
         self._checkpoint["posterior"] = posterior_content(problem, solved)
 
     def _set_up(self, weights: Content) -> None:
-        """Create the rollouts of the first outer iteration; weights: state_dict of the model, the mean of the prior."""
+        """Create the rollouts of the first outer iteration. weights: initial state_dict, which is the prior mean."""
         self._initial_weights = weights
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
-        # standard deviation of the rounding error of encoders: step / sqrt(12), with a step of at least 1e-5 rad
+        # The standard deviation of the rounding error of an encoder is step / sqrt(12). The step is at least 1e-5 rad.
         self._noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
         self._rollouts = ServoRollouts.of(self.model, self._windows.subsampled(TUNING.sparse_windows))
 
@@ -146,23 +147,23 @@ class ServoObjective(Objective):
         if len(self._iterates) == OUTER_ITERATIONS - 1:
             rollouts = replace(rollouts, windows=self._windows)
             rollouts = rollouts.linearized(x, self._windows.motion())
-        # All integration steps are used from the second iteration on: half of them are accurate enough for the first
-        # iteration only.
+        # The first iteration uses half the integration steps, which is accurate enough there; the others use all of
+        # them.
         elif self._iterates:
             rollouts = replace(rollouts, windows=replace(rollouts.windows, steps=self._windows.steps))
         if self._iterates:
             rollouts = rollouts.linearized(x, rollouts.predicted_motion(x))
         errors = rollouts.residual(x)
         self._rollouts, self._problem = rollouts, ServoProblem.of(rollouts, self._noise, errors)
-        # The checkpoint contains the weights of the model. They are set to x here, so that the checkpoint of an
-        # interrupted fit has a usable model.
+        # The model's weights are set to x, since the checkpoint contains them: an interrupted fit then has a usable
+        # model.
         rollouts.parameters.write(x)
         self._iterates.append(x)
         self._first_steps = self._steps
         self._update_checkpoint(float(errors.square().mean().sqrt()))
 
     def _update_checkpoint(self, rms: float) -> None:
-        """Set the content of checkpoint.pt; rms: RMS position error [rad, m]."""
+        """Set the content of checkpoint.pt. rms: RMS position error of all joints [rad, m]."""
         self._make_checkpoint(rms, time.monotonic() - self._since, self._windows.steps, self._steps)
         self._checkpoint["servo"] = {
             "start": self._initial_weights,

@@ -23,11 +23,14 @@ STRIBECK_VELOCITY = "friction.raw_stribeck_velocity"
 
 @dataclass(frozen=True, eq=False)
 class ServoParameters:
-    """Values of the fitted parameters, k = p n + r + 1 numbers.
+    """Values of the k = p n + r + 1 parameters of a servo fit.
 
-    joints: (p, n), p parameters of each joint. bodies: (r,), coordinates along `ParameterMap.directions`, in prior
-    standard deviations. delay: delay of the commands [s]. active: (p, n), mask of the joint parameters that are fitted;
-    dead zones are fitted only at joints with a dead zone.
+    Attributes:
+        joints: (p, n), p parameters of each joint.
+        bodies: (r,), r coordinates of the body parameters along `ParameterMap.directions`, in prior standard
+            deviations.
+        delay: delay of the commands [s].
+        active: (p, n), True for joint parameters that are fitted; a dead zone is fitted only at joints that have one.
     """
 
     joints: Tensor
@@ -55,9 +58,13 @@ class ServoParameters:
 class ParameterMap:
     """The map between `ServoParameters` and the tensors of a model, and the prior.
 
-    names: names of the p rows of `ServoParameters.joints`; a parameter with K numbers per joint has K rows. tensors:
-    joint parameters of the model, by name. directions: (10 B, r), the directions in the space of the log-Cholesky
-    parameters of B bodies that are fitted. prior_mean: parameters of the model when the map is made.
+    Attributes:
+        names: names of the p rows of `ServoParameters.joints`; a parameter with K values per joint has K rows of the
+            same name.
+        tensors: {name: joint parameter of the model}.
+        directions: (10 B, r), r directions in the space of the log-Cholesky parameters of B bodies; only steps along
+            these directions are fitted.
+        prior_mean: parameters of the model when the map is made.
 
     Args:
         model: the model, which `write` changes.
@@ -67,8 +74,8 @@ class ParameterMap:
     def __init__(self, model: ArmModel, q: Tensor) -> None:
         self._model, self._n = model, model.n
         tensors = dict(model.named_parameters()) | dict(model.named_buffers())
-        # raw_viscous is not fitted: logs of positions determine only the sum of viscous friction and kd, which is
-        # fitted as kd
+        # friction.raw_viscous is absent: logs of positions determine only the sum of viscous friction and kd, which is
+        # fitted as kd.
         rows = [
             *(parameters_of_kind(model, group) for group in ("stiffness", "damping", "armature", "offset")),
             (COULOMB, "friction.raw_stribeck", STRIBECK_VELOCITY),
@@ -90,11 +97,14 @@ class ParameterMap:
         self.prior_mean = ServoParameters(joints, bodies, float(model.servo.delay), active)
 
     def row(self, name: str) -> int:
-        """Return the index of the first row of `ServoParameters.joints` that belongs to the parameter ``name``."""
+        """Return the index of the row of `ServoParameters.joints` with this name; of several rows, the first."""
         return self.names.index(name)
 
     def named(self, joints: Tensor) -> dict[str, Tensor]:
-        """Return P sets of joint parameters (P, p, n) as tensors by name, each (P, 1, n) or (P, 1, n, K)."""
+        """Return {name: tensor} for P sets of joint parameters (P, p, n).
+
+        The tensors are (P, 1, n), or (P, 1, n, K) for a parameter with K values per joint.
+        """
         columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)  # (P, 1, n, K) per parameter
         named = {}
         for (name, tensor), column in zip(self.tensors.items(), columns, strict=True):
@@ -110,7 +120,7 @@ class ParameterMap:
             self._model.servo.delay.fill_(x.delay)
 
     def precision(self, x: ServoParameters) -> Tensor:
-        """Return the precision of the prior, (k,): the inverse variances of the parameters, which are independent."""
+        """Return the inverse variances of all parameters in the prior, (k,); in the prior, they are independent."""
         joints = torch.where(x.active, self._deviations, TUNING.fixed)
         shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
         return torch.cat([joints.flatten(), shared]) ** -2
@@ -131,13 +141,13 @@ class ParameterMap:
         return parameters
 
     def _body_directions(self, q: Tensor) -> Tensor:
-        """Return the r directions of log-Cholesky parameters with the largest effect on gravity at q (M, n), (10 B, r).
+        """Return the r directions of log-Cholesky parameters with the largest effect on gravity, (10 B, r).
 
-        The directions are right singular vectors of d gravity / d log-Cholesky parameters. The length of a direction is
-        the prior standard deviation along the direction.
+        The directions are right singular vectors of the derivative of the gravity torques at q (M, n) with respect to
+        the log-Cholesky parameters, times the prior standard deviation.
         """
         zero = torch.zeros_like(q)
-        # torch.func is not used: its Jacobians import torch's compiler, which takes more than a second
+        # torch.func is not used, since its Jacobians import torch's compiler, which takes more than a second.
         slopes = jacobian(self._inertial, self._mean_bodies)
         with torch.no_grad():
             gravity = regressor_of(self._model.chain, q, zero, zero) @ slopes.reshape(

@@ -1,8 +1,8 @@
-"""Result of a servo fit: ratios to kp with confidence intervals, and the ratios that the logs do not determine.
+"""Result of a servo fit: ratios of the parameters to kp, with 95 % intervals.
 
-Errors are correlated within a motion. Errors due to the form of the model are correlated even over a whole log, so each
-log is one block of a jackknife (see `jackknife_covariance`). The interval of a parameter that the logs do not determine
-is the interval of its prior.
+The covariance is a jackknife over logs (see `jackknife_covariance`): errors that the model cannot represent are
+correlated over a whole log, so a log is one independent block. The interval of a parameter that the logs do not
+determine is the interval of its prior.
 """
 
 import math
@@ -31,8 +31,9 @@ RATIOS = {
     "static_error": ("static error", "rad, m"),
     "dead_zone": ("half dead zone", "rad, m"),
 }
-"""Label and unit of each ratio to kp. lag: kd / kp plus the delay. dry: ratio of mean dry friction in motion to kp.
-static_error: the sum of dry and half the dead zone."""
+"""Label and unit of each ratio to kp.
+
+lag: kd / kp plus the delay. dry: mean dry friction in motion / kp. static_error: dry plus half the dead zone."""
 ABOUT = (
     "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "
     "sum of kd and viscous friction, which such logs do not distinguish. lag: the sum of kd/kp and the delay, one "
@@ -45,8 +46,10 @@ ABOUT = (
 class FitSummary:
     """Summary of a fit for the user.
 
-    text: summary for a terminal. listing: table of the parameters with intervals. headline: value and name of the most
-    important result, which is the delay of the commands.
+    Attributes:
+        text: summary for a terminal.
+        listing: table of the parameters with intervals.
+        headline: (value, name) of the delay of the commands, the most important result.
     """
 
     text: str
@@ -56,10 +59,14 @@ class FitSummary:
 
 @dataclass(frozen=True, eq=False)
 class ServoSolution:
-    """Normal equations and covariance at the end of a fit, with the dead zones of all joints as free parameters.
+    """Normal equations and covariance of the k parameters at the end of a fit.
 
-    blocks: normal equations of the B blocks of the jackknife, (B, k, k) and (B, k); a block is a log, or a segment of a
-    log. precision: (k,), precision of the prior. covariance: (k, k), covariance of the parameters.
+    The dead zones of all joints are free parameters here.
+
+    Attributes:
+        blocks: normal equations of B blocks of windows, (B, k, k) and (B, k); a block is a log or a segment of a log.
+        precision: (k,), precision of the prior.
+        covariance: (k, k), jackknife covariance of the parameters.
     """
 
     blocks: NormalEquations
@@ -68,48 +75,50 @@ class ServoSolution:
 
     @property
     def quantile(self) -> float:
-        """Half the width of a 95 % interval, in standard deviations."""
-        # The 97.5 % quantile is of Student's t distribution and not of the Gaussian, since there are few blocks.
+        """Half the width of a 95 % interval, divided by the standard deviation."""
+        # With few blocks, the quantile of Student's t distribution is larger than the Gaussian's 1.96.
         return float(stdtrit(max(1, len(self.blocks.curvature) - 1), 0.975))
 
 
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
-    """Return the parameters after one more solver step from x, with their normal equations and covariance.
+    """Take one more solver step from x; return the parameters, their normal equations and their covariance.
 
-    x is the result of a fit with longer integration steps than the steps of ``problem``. The step from x shows the
-    effect of the integration error: its outer product is added to the covariance. If the step raises the cost, the
-    parameters remain x.
+    x is the result of a fit with longer integration steps than ``problem`` has. The step is therefore an estimate of
+    the integration error of x, and its outer product is added to the covariance. If the step raises the cost, x is
+    returned.
     """
-    # The dead zones of all joints are free parameters here. With dead zones fixed at zero, dry friction would seem
-    # better determined than it is.
+    # The dead zones of all joints are free parameters here: if they were fixed at zero, the covariance of dry friction
+    # would be too small.
     free, errors = replace(x, active=torch.ones_like(x.active)), problem.residual(x)
     numbers = problem.rollouts.windows.blocks(TUNING.min_logs, TUNING.min_blocks)
     blocks = NormalEquations(*(_sums(x, numbers) for x in problem.window_equations(free, errors)))
     precision = problem.parameters.precision(free)
     step = problem.with_prior(blocks, x).step()
-    # The gradients are updated to the parameters after the step, so that the gradients of all blocks and of the prior
-    # add up to zero.
+    # The gradients are linearly extrapolated to the parameters after the step. There, the gradients of all blocks and
+    # of the prior add up to zero, as the jackknife requires.
     blocks = blocks._replace(descent=blocks.descent - blocks.curvature @ step)
     end = x.after(step)
-    # The step may raise the cost if a joint is at its break-away torque: errors are then not linear in the parameters.
+    # The step may raise the cost if a joint is near its break-away torque, where errors are not linear in the
+    # parameters.
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # The step is the effect of the integration error. It is added to the covariance as one standard deviation.
+    # The step is an estimate of the integration error. It is added to the covariance as an error of one standard
+    # deviation.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
 def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
-    """Return the sums of terms (W, ...) over the windows of each block, (B, ...); numbers: (W,), block of a window."""
+    """Return the sums (B, ...) of terms (W, ...) over the windows of each block; numbers: (W,), block of a window."""
     return terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:]).index_add(0, numbers, terms)
 
 
 def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
-    """Return booleans (m,): whether the logs distinguish each of m parameters from all other parameters.
+    """Return a mask (m,), True for parameters that the logs distinguish from all other parameters.
 
-    A parameter is distinguished if an upper bound of its variance inflation factor is small. For example, a linear
-    approximation cannot distinguish a dead zone from dry friction at joints without gravity load, since the derivatives
-    of the errors with respect to both are proportional.
+    A parameter is distinguished if an upper bound of its variance inflation factor is below
+    `ServoTuning.variance_inflation`. Example: dead zone and dry friction of a joint without gravity load are not
+    distinguished, since the derivatives of the errors with respect to both are proportional.
 
     Args:
         blocks: normal equations of B blocks, (B, k, k) and (B, k).
@@ -123,7 +132,7 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
 
 
 def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
-    """Return the ratios of servo and friction parameters to kp, a dict with the keys of `RATIOS` and values (n,).
+    """Return {key of `RATIOS`: (n,)}, the ratios of servo and friction parameters to kp for all joints.
 
     Args:
         model: model with position servos.
@@ -145,24 +154,23 @@ def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
 def ratios_with_deviations(
     problem: ServoProblem, solution: ServoSolution
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return the ratios to kp with the standard deviations of their logarithms.
+    """Return {key of `RATIOS`: (ratios, deviations)}, (n,) each.
 
-    The result is a dict with the keys of `RATIOS`. A value is a pair of the ratios of all joints and the standard
-    deviations, (n,) each.
+    The deviations are the standard deviations of the logarithms of the ratios.
     """
     rollouts, parameters = problem.rollouts, problem.parameters
     tensors = {name: x.detach().clone().requires_grad_() for name, x in parameters.tensors.items()}
     qd, gravity = rollouts.motion.qd, rollouts.load.gravity
     values = evaluate_with(rollouts.model, tensors, lambda model: ratios(model, qd, gravity))
     p, n = parameters.prior_mean.joints.shape
-    # `blocks` (p + 1, p + 1, n) is, for each joint, the covariance of its p parameters and of the delay, which is the
-    # last of all parameters.
+    # `blocks` (p + 1, p + 1, n): for each joint, the covariance of its p parameters and the delay, the last parameter
+    # of all.
     index = torch.cat([torch.arange(p * n).view(p, n), torch.full((1, n), len(solution.covariance) - 1)])
     blocks = solution.covariance[index.unsqueeze(1), index.unsqueeze(0)]
     result = {}
     for name, value in values.items():
-        # The ratio of a joint depends only on this joint's parameters and the delay, so one gradient of the sum over
-        # joints contains the derivatives of all joints.
+        # The ratio of a joint depends only on this joint's parameters and on the delay. The gradient of the sum of all
+        # ratios therefore contains the derivatives of each ratio.
         derivatives = torch.autograd.grad(
             value.sum(), list(tensors.values()), retain_graph=True, materialize_grads=True
         )
@@ -176,8 +184,9 @@ def ratios_with_deviations(
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
     """Return the content for config.json: delay [s], RMS errors [rad, m], and per joint kp and the ratios to kp.
 
-    The intervals are 95 % intervals. The key "determined" states whether the logs determine a ratio: its interval is
-    within a factor of `ServoTuning.max_factor`, and a dead zone is distinguished from dry friction.
+    The intervals are 95 % intervals. The key "determined" is True if the upper end of the interval is below
+    `ServoTuning.max_factor` times the ratio. For dry friction and the dead zone, the logs must also distinguish one
+    from the other (see `identifiable`).
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},
@@ -197,13 +206,13 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
         record: Content = {"joint": name, "kp": {"value": kp[joint], "known": not trained[joint]}}
         for ratio, (of_joints, deviations) in values.items():
             value = float(of_joints[joint])
-            # A dead zone of zero was not selected at this joint.
+            # A dead zone of zero was not selected at this joint, so it has no interval.
             if ratio == "dead_zone" and not value:
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
             # The bound 50 avoids an overflow of exp.
             factor = math.exp(min(half, 50.0))
-            # The static error, the sum of dry friction and dead zone, may be determined even if its two terms are not.
+            # The static error, a sum of dry friction and dead zone, may be determined even if its two terms are not.
             determined = factor < TUNING.max_factor and (distinct[joint] or ratio not in ("dry", "dead_zone"))
             record[ratio] = {
                 "unit": RATIOS[ratio][1],
@@ -238,7 +247,7 @@ def servo_summary(record: Content | None) -> FitSummary | None:
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
     listing = Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
-    # An undetermined dead zone is omitted: dry friction of the same joint is then undetermined, too, and is named.
+    # An undetermined dead zone is not named, since dry friction of the same joint is then undetermined and named.
     names = [f"{RATIOS[column][0]} of {joint}" for column, joint in open_ratios if column != "dead_zone"]
     end = f"Not determined by these logs: {', '.join(names)}" if names else "All ratios are determined"
     delay = f"{1000 * record['delay']['value']:.1f} ms, +- {1000 * record['delay']['half']:.1f} ms"

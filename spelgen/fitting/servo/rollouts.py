@@ -17,15 +17,21 @@ from spelgen.fitting.servo.windows import BodyLoad, MidpointMotion, ServoWindows
 
 @dataclass(frozen=True, eq=False)
 class ServoRollouts:
-    """Rollouts of windows; each joint is integrated independently, under the load of the bodies along a fixed motion.
+    """Rollouts of windows, in which each joint is integrated independently of the other joints.
 
-    The load is computed once, for parameters x0. For parameters x, regressor (phi(x) - phi(x0)) is added to the load,
-    where phi(x) are the inertial parameters (10 B,) of B bodies. Since joints are independent, one rollout in which a
-    parameter is changed at all joints gives the derivatives of all joints. Each parameter that joints share (body
-    parameters, delay) needs a separate rollout. All rollouts form one batch.
+    The joints are coupled only by the load of the bodies (gravity, inertia, Coriolis forces). Here, this load is
+    computed along a fixed motion instead of the predicted motion: once for parameters x0, and for other parameters x
+    with the term regressor (phi(x) - phi(x0)), where phi(x) (10 B,) are the inertial parameters of B bodies.
 
-    motion: the fixed motion. load: load along this motion for x0. inertial: phi(x0), (10 B,). difference_step: step of
-    the finite differences.
+    Since the joints are independent, one rollout with a parameter changed at all joints gives the derivatives of all
+    joints. A parameter that joints share (body parameters, delay) needs a rollout of its own. All these rollouts form
+    one batch.
+
+    Attributes:
+        motion: the fixed motion.
+        load: load along this motion for x0.
+        inertial: phi(x0), (10 B,).
+        difference_step: step of the finite differences.
     """
 
     model: ArmModel
@@ -38,7 +44,7 @@ class ServoRollouts:
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
-        """Return the rollouts under the load that the model has along the measured motion."""
+        """Return the rollouts whose load is computed along the measured motion with the model's present parameters."""
         q = windows.q.flatten(0, 1)
         parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()
@@ -46,7 +52,7 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Return the rollouts under the load for parameters x along a motion. The model's parameters are set to x."""
+        """Return the rollouts whose load is computed for parameters x along ``motion``; set the model to x."""
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
         return replace(self, motion=motion, load=load, inertial=inertial)
@@ -56,10 +62,10 @@ class ServoRollouts:
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
-        """Return the motion of the windows: measured positions, with velocities and accelerations from the rollouts.
+        """Return measured positions, and velocities and accelerations from the rollouts with parameters x.
 
-        Velocities and accelerations are derivatives of the positions predicted with parameters x, plus smoothed
-        derivatives of measured minus predicted positions.
+        The velocities and accelerations are the predicted ones, plus smoothed derivatives of measured minus predicted
+        positions (see `ServoWindows.motion`).
         """
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])
@@ -68,13 +74,13 @@ class ServoRollouts:
         """Return the derivatives of the residual with respect to joint parameters and to shared parameters.
 
         Returns:
-            (p, W, K', n), with respect to the p parameters of the same joint; zero for parameters that are not fitted.
+            (p, W, K', n), with respect to the p parameters of the same joint; zero for parameters that no joint fits.
             (r + 1, W, K', n), with respect to the r coordinates of the bodies and to the delay.
         """
         rows = x.active.any(dim=1).nonzero().squeeze(-1)  # parameters that are fitted at one joint or more
         p, r, step = len(rows), len(x.bodies), self.difference_step
-        # The batch has one rollout without a change, and one rollout for the change of each joint parameter, of each
-        # body coordinate, and of the delay.
+        # The batch has p + r + 2 rollouts: one at x, and one with each of p joint parameters, r body coordinates and
+        # the delay changed.
         joints = x.joints.expand(p + r + 2, -1, -1).clone()
         joints[torch.arange(p) + 1, rows] += step
         bodies = x.bodies.expand(p + r + 2, -1).clone()
@@ -89,23 +95,28 @@ class ServoRollouts:
         return of_joints, derivatives[p:]
 
     def _errors(self, q: Tensor) -> Tensor:
-        """Return the errors (P, W, K', n) after the burn-in of P sets of predicted positions (P, W, K, n)."""
+        """Return predicted minus measured positions after the burn-in, (P, W, K', n) [rad, m].
+
+        q: (P, W, K, n), positions predicted with P sets of parameters.
+        """
         first = self.windows.burn_in + 1
         return q[:, :, first:] - self.windows.q[:, first:]
 
     def _rollout_at(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return q and qd of the rollouts with parameters x, (1, W, K, n)."""
+        """Return q and qd of the rollouts with parameters x, (1, W, K, n) each."""
         commands = self.windows.commands(x.delay)
         return self._rollout(x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
 
     def _rollout(self, joints: Tensor, bodies: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
-        """Return q and qd, (P, W, K, n), for P sets of parameters and W windows of K samples.
+        """Return predicted q and qd, (P, W, K, n) each, for P sets of parameters and W windows of K samples.
 
-        joints: (P, p, n), joint parameters. bodies: (P, r), body coordinates. commands: (P, W, K-1, S, n) [rad, m], at
-        the S integration steps of each sample interval.
+        Args:
+            joints: (P, p, n), joint parameters.
+            bodies: (P, r), body coordinates.
+            commands: (P, W, K-1, S, n) [rad, m], commands at the S integration steps of each sample interval.
         """
         tensors = {name: tensor.detach() for name, tensor in self.parameters.named(joints).items()}
-        # inference mode saves 10 % of the time, since there are many small operations
+        # Inference mode saves 10 % of the time, since there are many small operations.
         with torch.inference_mode():
             drives, armature = evaluate_with(
                 self.model, tensors, lambda model: (servo_drives(model), model.armature)
@@ -117,10 +128,13 @@ class ServoRollouts:
     def _integrate(
         self, drives: ServoDrives, armature: Tensor, added: Tensor, commands: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Integrate all joints of W windows for P sets of parameters; return q and qd, (P, W, K, n).
+        """Integrate all joints of W windows for P sets of parameters; return q and qd, (P, W, K, n) each.
 
-        armature: (P, 1, n). added: (P, W, K-1, n), change of the load by changed body parameters [Nm, N]. commands: (P,
-        W, K-1, S, n) [rad, m], at the S integration steps of each sample interval.
+        Args:
+            drives: servos and friction of the P sets.
+            armature: (P, 1, n).
+            added: (P, W, K-1, n) [Nm, N], change of the load due to changed body parameters.
+            commands: (P, W, K-1, S, n) [rad, m], commands at the S integration steps of each sample interval.
         """
         windows, load = self.windows, self.load
         h = windows.dt.unsqueeze(-1) / commands.shape[3]
@@ -130,8 +144,8 @@ class ServoRollouts:
         positions, velocities, state = [q], [qd], None
         for k in range(windows.q.shape[1] - 1):
             current = Load(inertia[:, :, k], bias[:, :, k], load.gravity[:, k], coupled=False)
-            # The initial friction state is unknown: friction is assumed to balance the other torques. The error of
-            # this assumption decays in the burn-in.
+            # The initial friction state is unknown. Initially, friction is assumed to balance the other torques; the
+            # error of this assumption decays during the burn-in.
             if state is None:
                 state = balanced(drives, q, qd, commands[:, :, k, 0], current)
             for u in commands[:, :, k].unbind(2):

@@ -9,22 +9,24 @@ class ServoTuning:
 
     # Windows that a fit predicts (`servo.windows`).
 
-    # [s] Length of a window. Effects of gravity and friction are not visible in shorter windows; in longer windows, an
-    # error of the delay makes predictions diverge.
+    # [s] Length of a window. Shorter windows hardly show the effects of gravity and friction; in longer windows,
+    # predictions with a wrong delay diverge.
     length: float = 4.0
     # [1] Smallest number of samples of a window.
     min_samples: int = 8
     # [s] Burn-in at the beginning of a window, during which the friction state forms. Errors in the burn-in are
     # ignored.
     burn_in: float = 1.0
-    # [1] Largest number of windows, evenly spread over the logs: ten minutes of motion.
+    # [1] Largest number of windows, evenly spread over the logs. 200 windows of 4 s with 1 s of burn-in contain ten
+    # minutes of motion.
     count: int = 200
     # [1] Number of samples whose load is computed at once; it limits the memory.
     batch: int = 2**13
 
     # Standard deviations of the Gaussian prior, about the initial parameters (`servo.parameters`).
 
-    # [1] Prior standard deviation of the logarithms of a joint's gains, armature and friction: a factor of seven.
+    # [1] Prior standard deviation of the logarithms of a joint's gains, armature and friction; exp(2) is a factor of
+    # seven.
     logarithm: float = 2.0
     # [1] Prior standard deviation of the logarithm of the Stribeck velocity. With a wider prior, friction could
     # decrease over the whole range of speeds and would then absorb offsets.
@@ -33,24 +35,27 @@ class ServoTuning:
     dead_zone: float = 0.02
     # [s] Prior standard deviation of the delay of the commands.
     delay: float = 0.1
-    # [1] Prior standard deviation of the log-Cholesky parameters of the bodies: 30 % in mass.
+    # [1] Prior standard deviation of the log-Cholesky parameters of the bodies, along a direction; 0.3 is about 30 % of
+    # a mass.
     bodies: float = 0.3
     # [1] Largest number of directions of the body parameters that are fitted: the directions with the largest effect on
     # gravity. Other directions remain at the prior mean.
     body_directions: int = 6
     # [1] Smallest effect of a fitted direction on gravity, relative to the largest effect.
     min_effect: float = 1e-3
-    # [1] Prior standard deviation of a parameter that is not fitted: practically zero.
+    # [1] Prior standard deviation of a parameter that is not fitted. It is practically zero, so the parameter is
+    # constant.
     fixed: float = 1e-9
 
     # Cost and its derivatives (`servo.problem`, `servo.rollouts`).
 
     # [s] Largest correlation time of the position errors; most measured correlation times are above 0.2 s.
     correlation_time: float = 0.5
-    # [1] Finite-difference step of the parameters: far above the rounding of rollouts, which lose half of the digits of
-    # double precision.
+    # [1] Finite-difference step of the parameters. It must be far above the rounding errors of rollouts, which lose
+    # about half the digits of double precision.
     difference_step: float = 1e-4
-    # [1] Largest step of any parameter; most are logarithms.
+    # [1] Largest change of any parameter in a solver step; most parameters are logarithms, for which 1 is a factor of
+    # e.
     max_step: float = 1.0
     # [1] Number of samples from which the directions of the body parameters are computed.
     gravity_samples: int = 2000
@@ -69,10 +74,11 @@ class ServoTuning:
     # [1] An outer iteration also ends if a step decreases the cost by less than this fraction of the cost.
     # `min_decrease` is too small for the high costs of a model whose form is wrong.
     min_relative_decrease: float = 1e-4
-    # [1] Damping of the first step of the second and third outer iteration; with 1e-3, kd would have an error of 0.3 %.
+    # [1] Damping of the first step of the second and third outer iteration. With 1e-3, the few steps would end with an
+    # error of kd of 0.3 %.
     later_damping: float = 1e-5
     # [1] Finite-difference step of the derivatives from which the covariance is computed. With a shorter step, the
-    # parameters of a joint that is about to slip would seem to be determined.
+    # derivatives of a joint that is about to slip would be too large and its intervals too narrow.
     last_difference_step: float = 1e-3
 
     # Selection of the joints that have a dead zone (`servo.laws`).
@@ -81,7 +87,7 @@ class ServoTuning:
     dead_zone_fraction: float = 0.25
     # [1] Largest number of steps of the fit of a single joint.
     joint_steps: int = 6
-    # [1] Significance of a selected dead zone, in standard deviations; other friction effects need 3.
+    # [1] Smallest significance of a selected dead zone, in standard deviations.
     significance: float = 4.0
     # [rad, m] Smallest value of half a dead zone; for comparison, the step of a 12-bit encoder is 1.5e-3 rad.
     min_dead_zone: float = 1e-3
@@ -91,13 +97,13 @@ class ServoTuning:
     # [1] Smallest number of logs for which each log is one block of the jackknife. Logs are not divided then, since
     # halves of one motion are not independent.
     min_logs: int = 3
-    # [1] Smallest total number of blocks if there are fewer logs, which are divided.
+    # [1] Smallest number of blocks if there are fewer logs than `min_logs`; the logs are then divided into segments.
     min_blocks: int = 6
     # [1] Variance inflation factor above which a parameter is not distinguished from others; on SO-101 arms, the factor
     # is below 30 or above 90.
     variance_inflation: float = 50.0
-    # [1] Standard deviation of the ratios' logarithms due to the form of the friction model, from
-    # `benchmarks/servo_recovery.py`.
+    # [1] Standard deviation of the logarithms of the ratios to kp that is due to errors of the friction model, measured
+    # by `benchmarks/servo_recovery.py`. It is added to the standard deviation of the fit (root of the sum of squares).
     model_deviation: float = 0.015
     # [1] Largest ratio between the upper end of an interval and the value; with a wider interval, the value counts as
     # not determined.
@@ -105,10 +111,11 @@ class ServoTuning:
 
     # Initial guess and baseline (`servo.least_squares`).
 
-    # [1] kp is computed from the coefficient of gravity, 1 / kp, only if this coefficient is larger than this number of
-    # its standard deviations. The threshold is large, since neighbouring windows are correlated.
+    # [1] Smallest t value of the coefficient of gravity, 1 / kp, for which kp is computed from this coefficient. The
+    # threshold is large, since neighbouring windows are correlated.
     kp_significance: float = 8.0
-    # [1] Largest factor between the initial and the nominal kp (of the settings, or 2 efforts per radian).
+    # [1] Largest ratio between the initial and the nominal kp, or between the nominal and the initial kp, for which kp
+    # is computed from the coefficient of gravity.
     kp_range: float = 20.0
     # [1] Smallest initial dry friction, as a fraction of nominal friction. The square and the cube of this number are
     # the smallest initial kd/kp [s] and armature/kp [s^2]. All three are positive, since their logarithms are fitted.

@@ -1,7 +1,7 @@
-"""Windows of logs of commanded positions, and the load that the arm's bodies put on the drives along a motion.
+"""Windows of logs of commanded positions, and the load of the arm's bodies on the drives along a motion.
 
 The load is evaluated at measured instead of predicted positions, so that a fit can integrate each joint independently.
-Measured and predicted positions differ by about 0.01 rad, which changes the load by about 1 %.
+The error is small: measured and predicted positions differ by about 0.01 rad, which changes the load by about 1 %.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split
 
 
 class MidpointMotion(NamedTuple):
-    """q [rad, m], qd and qdd, (W, K-1, n) each, at the midpoints between the samples of windows."""
+    """Positions q, velocities qd and accelerations qdd, (W, K-1, n) each, at the midpoints between samples."""
 
     q: Tensor
     qd: Tensor
@@ -33,11 +33,16 @@ class MidpointMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ServoWindows:
-    """W windows of K samples.
+    """W windows of K samples, cut from logs of commanded and measured positions.
 
-    rows: log and slice of samples of each window. q, qd: (W, K, n) [rad, m, per second]; qd is smoothed. dt: (W, K-1),
-    sample intervals [s]. burn_in: number of samples at the start of each window, during which the friction state forms;
-    errors of these samples are ignored. steps: number of integration steps per sample interval.
+    Attributes:
+        rows: (log, slice of its samples) of each window.
+        q: (W, K, n) [rad, m].
+        qd: (W, K, n) [rad/s, m/s], smoothed.
+        dt: (W, K-1), sample intervals [s].
+        burn_in: number of samples at the start of each window whose errors are ignored, since the initial friction
+            state is unknown.
+        steps: number of integration steps per sample interval.
     """
 
     rows: tuple[LogRows, ...]
@@ -61,8 +66,8 @@ class ServoWindows:
     def blocks(self, min_logs: int, min_blocks: int) -> Tensor:
         """Return the block number of each window, (W,). Errors in different blocks are assumed to be independent.
 
-        Each log is one block if there are at least ``min_logs`` logs. Fewer logs are divided into equal segments; each
-        segment is one block, and there are at least ``min_blocks`` blocks in total.
+        With at least ``min_logs`` logs, each log is one block. Fewer logs are divided into equal segments, each of
+        which is one block; the total number of blocks is at least ``min_blocks`` if there are enough windows.
         """
         names, log_numbers = np.unique([log.name for log, _ in self.rows], return_inverse=True)
         segments = 1 if len(names) >= min_logs else -(-min_blocks // len(names))
@@ -76,9 +81,9 @@ class ServoWindows:
     def motion(self, q: Tensor | None = None, qd: Tensor | None = None) -> MidpointMotion:
         """Return measured positions, velocities and accelerations at the midpoints between samples.
 
-        By default, velocities and accelerations are smoothed derivatives of the measured positions. With a prediction
-        q, qd (W, K, n), they are derivatives of the prediction plus smoothed derivatives of measured minus predicted
-        positions: smoothing then does not attenuate fast motion that the prediction contains.
+        Without arguments, velocities and accelerations are smoothed derivatives of the measured positions. With a
+        predicted motion q, qd (W, K, n), they are the derivatives of the predicted motion plus smoothed derivatives of
+        measured minus predicted positions. Fast motion in the prediction is then not attenuated by smoothing.
         """
         if q is None or qd is None:
             q = qd = torch.zeros_like(self.q)
@@ -89,13 +94,16 @@ class ServoWindows:
         return MidpointMotion(_midpoints(self.q), velocity, _midpoints(slow_qdd) + acceleration)
 
     def commands(self, delay: float) -> Tensor:
-        """Return the commands delayed by ``delay`` [s] at the S steps of each interval, (W, K-1, S, n) [rad, m]."""
+        """Return the delayed commands at the S integration steps of each interval, (W, K-1, S, n) [rad, m].
+
+        delay: delay of the commands [s].
+        """
         commands = [delayed_commands(log, rows, delay, self.steps) for log, rows in self.rows]
         return torch.from_numpy(np.stack(commands))
 
 
 def _midpoints(x: Tensor) -> Tensor:
-    """Return the means of successive samples of x (W, K, n), (W, K-1, n)."""
+    """Return the means (W, K-1, n) of each two successive samples of x (W, K, n)."""
     return x[:, 1:] / 2 + x[:, :-1] / 2
 
 
@@ -104,8 +112,8 @@ def servo_windows(
 ) -> ServoWindows:
     """Return at most ``count`` windows, evenly spread over the logs.
 
-    The windows are shorter than `TUNING.length` if all segments between gaps are shorter. Raises LogError if all
-    segments are too short.
+    The windows have the length `TUNING.length` or, if all segments between gaps are shorter, the length of the longest
+    segment. Raises LogError if it has fewer than `TUNING.min_samples` samples.
     """
     segments: list[Trajectory] = []
     for log in logs:
@@ -119,7 +127,7 @@ def servo_windows(
     for segment in segments:
         starts = range(0, len(segment) - length + 1, max(1, length - burn_in))
         rows += [(segment, slice(start, start + length)) for start in starts]
-    # Evenly spread windows are selected, not the first ones, in which some joints may not move.
+    # The selected windows are spread over the logs, since some joints may not move at the beginning of the logs.
     rows = rows[:: -(-len(rows) // count)]
     smooth_velocities = {id(segment): velocities(segment) for segment in segments if len(segment) >= length}
     columns = (
@@ -128,17 +136,20 @@ def servo_windows(
         [np.diff(log.t[samples]) for log, samples in rows],
     )
     q, qd, dt = (torch.from_numpy(np.stack(column)) for column in columns)
-    # the number of integration steps is sufficient for the log with the longest sample interval
+    # The number of integration steps is sufficient for the log with the longest sample interval.
     return ServoWindows(tuple(rows), q, qd, dt, burn_in, max(steps_between(log) for log, _ in rows))
 
 
 class BodyLoad(NamedTuple):
-    """The load that the bodies put on the drives, at the midpoints between the samples of windows.
+    """The load of the bodies on the drives, at the midpoints between the samples of windows.
 
-    inertia: (W, K-1, n), diagonal of M without armature [kg m^2, kg]. bias: (W, K-1, n) [Nm, N], Coriolis, centrifugal
-    and gravity torque, plus the inertial torque of the off-diagonal entries of M. gravity: (W, K-1, n), gravity torque
-    [Nm, N]. regressor: (W, K-1, n, 10 B), derivatives of the torque with respect to the inertial parameters of B
-    bodies.
+    Attributes:
+        inertia: (W, K-1, n), diagonal of M without armature [kg m^2, kg].
+        bias: (W, K-1, n) [Nm, N], Coriolis, centrifugal and gravity torque, plus the inertial torque of the
+            off-diagonal entries of M.
+        gravity: (W, K-1, n), gravity torque [Nm, N].
+        regressor: (W, K-1, n, 10 B), derivatives of the inverse-dynamics torque with respect to the inertial parameters
+            of B bodies.
     """
 
     inertia: Tensor
@@ -148,7 +159,7 @@ class BodyLoad(NamedTuple):
 
 
 def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
-    """Return the load of the model's bodies along a motion (W, K-1, n)."""
+    """Return the load of the model's bodies along a motion, whose arrays are (W, K-1, n)."""
     batches: list[BodyLoad] = []
     with torch.no_grad():
         prepared, armature = model.prepare(), model.armature

@@ -44,9 +44,12 @@ from spelgen.settings.fits import Adaptation, GaussianPrior
 class RegressionComparison(NamedTuple):
     """Held-out errors of a torque fit and of ridge regression, see `Regression`.
 
-    fit, regression: mean squared error of held-out blocks divided by the variance of the torque, mean over joints.
-    behind: whether the regression is better by more than chance. replaced: error of the fit from the URDF's values, in
-    place of which the solution is a fit from the regression's; None: the solution is the fit from the URDF's values.
+    Attributes:
+        fit, regression: mean squared error of held-out blocks divided by the variance of the torque, averaged over
+            joints.
+        behind: True if the regression is significantly better than the fit.
+        replaced: the error of the first fit, whose initial guess was the URDF, if it was replaced by a fit whose
+            initial guess is the regression; otherwise None.
     """
 
     fit: float
@@ -59,12 +62,18 @@ class RegressionComparison(NamedTuple):
 class TorqueSolution:
     """Result of a torque fit.
 
-    rms_residual: root mean square torque residual, (n,) [Nm, N]. steps: number of steps of the solver. cost: final
-    cost. prior: prior with the estimated standard deviations. covariance: covariance of the parameters x, (K, K).
-    torque_std: root mean square torque error of held-out blocks, (n,) [Nm, N]. compensated: joints whose drives
-    compensate friction, (n,). correlation_time: correlation time of the torque errors, (n,) [s]. held_out_nmse: mean
-    squared error of held-out blocks divided by the variance of the torque, (n,). selected_terms: the selected residual
-    terms. comparison: comparison with ridge regression; None for an adapted fit.
+    Attributes:
+        rms_residual: root mean square torque residual, (n,) [Nm, N].
+        steps: number of accepted steps of the Levenberg-Marquardt solver.
+        cost: final cost.
+        prior: prior with the estimated standard deviations.
+        covariance: covariance of the parameters x, (K, K).
+        torque_std: root mean square torque error of held-out blocks, (n,) [Nm, N].
+        compensated: joints whose drives compensate friction, (n,).
+        correlation_time: correlation time of the torque errors, (n,) [s].
+        held_out_nmse: mean squared error of held-out blocks divided by the variance of the torque, (n,).
+        selected_terms: the selected residual terms.
+        comparison: comparison with ridge regression; None for an adapted fit.
     """
 
     rms_residual: np.ndarray
@@ -81,9 +90,10 @@ class TorqueSolution:
 
 
 class _StagedFit(NamedTuple):
-    """Estimate after all stages, its errors and its residual terms.
+    """Estimate after all stages, its jackknife, and the selected residual terms.
 
-    held_out: like `Regression.held_out`. parameters: state_dict of the model.
+    held_out: (blocks,), sum over joints of the squared held-out residual divided by the variance of the torque.
+    parameters: state_dict of the fitted model.
     """
 
     estimate: TorqueEstimate
@@ -99,15 +109,15 @@ def fit_torque(
     prior: GaussianPrior | None = None,
     adapt: Adaptation | None = None,
 ) -> TorqueSolution:
-    """Set the parameters of a model of rigid bodies to their MAP estimate.
+    """Set the parameters of a model of rigid bodies to their MAP estimate; return the estimate with its errors.
 
     Args:
         model: model whose current parameters are the prior mean. Before a fit of all parameters, the nominal friction
             of each drive is limited to the standard deviation of the drive's logged torque.
         samples: samples with torques as logged, (T, n) [Nm, N].
         prior: initial standard deviations of the prior; None: default.
-        adapt: group of parameters to estimate (see `TorqueFit`). The fit of a group does not change residual terms,
-            and the fit of a load keeps the given prior widths. None: estimate all parameters.
+        adapt: group of parameters to estimate (see `TorqueFit`); None: all parameters. If it is given, residual terms
+            are not changed; for "load", the prior widths are not estimated.
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.of(samples, TUNING.decimation)
@@ -124,7 +134,7 @@ def fit_torque(
     estimate, state = fitted.estimate, fitted.estimate.state
     jacobian, estimator = estimate.problem.jacobian, estimate.problem.noise_estimator
     scale = jacobian.logged_scale(state.x)
-    error = fitted.jackknife.held_out.sum(dim=0) / samples.count  # (n,)
+    error = fitted.jackknife.held_out.sum(dim=0) / samples.count  # mean squared, (n,) [Nm^2, N^2]
     return TorqueSolution(
         rms_residual=((state.residual / samples.count).sqrt() / scale).numpy(),
         steps=state.steps,
@@ -143,7 +153,7 @@ def fit_torque(
 def _staged_fit(
     model: ArmModel, samples: TorqueSamples, prior: GaussianPrior, adapt: Adaptation | None
 ) -> _StagedFit:
-    """Fit a model from its current parameters, which are the prior mean, and return the fit with its errors."""
+    """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters."""
     subset = samples.subsampled(TUNING.initial_samples)
     estimate, selected = _run_stages(TorqueProblem.of(TorqueJacobian(model, subset), prior, adapt), samples)
     problem = estimate.problem
@@ -161,13 +171,15 @@ def _not_behind_regression(
     fitted: _StagedFit,
     initial: dict[str, torch.Tensor],
 ) -> tuple[_StagedFit, RegressionComparison]:
-    """Return the given fit, or a fit from the values of ridge regression if this predicts held-out torques better.
+    """Return ``fitted``, or a second fit if ridge regression predicts held-out torques significantly better.
 
-    initial: state_dict of the model before the fit. The parameters of the returned fit are written to the model.
+    The second fit has the result of the regression as its initial guess. It is returned only if its held-out error is
+    below the error of ``fitted``. The parameters of the returned fit are written to the model. initial: state_dict of
+    the model before the fit.
     """
     blocks = contiguous_blocks(samples)
     regression = best_regression(model, blocks, joint_torque(model, samples.columns).std(dim=0).numpy())
-    # Errors below the lower bound of the noise are no difference.
+    # The lower bound of the noise is added to both errors, so that smaller differences are not significant.
     negligible = TUNING.min_noise**2 * model.n * torch.tensor([block.count for block in blocks])
     other = torch.from_numpy(regression.held_out) + negligible
 
@@ -179,7 +191,7 @@ def _not_behind_regression(
         return significant_reduction(fit.held_out + negligible, other, standard_errors) is not None
 
     def nmse(held_out: torch.Tensor) -> float:
-        """Return the nMSE, mean over joints, of the squared errors of blocks, (blocks,)."""
+        """Return the mean nMSE of all joints. held_out: (blocks,), sums of squared errors / variance."""
         return float(held_out.sum()) / samples.count / model.n
 
     best, replaced = fitted, None
@@ -201,14 +213,14 @@ def _run_stages(
         return refine(initial_fit(problem), samples), ()
     model = problem.jacobian.model
     if model.elements:
-        # The initial fit has rate-only friction. Bristles delay the reversal of friction, and this delay would be
-        # fitted to the torque errors of inertial parameters that are still wrong.
+        # The initial fit has rate-only friction. Bristles delay the reversal of friction: their parameters would absorb
+        # torque errors of inertial parameters that are still wrong.
         model.friction.memoryless.fill_(1.0)
     estimate = initial_fit(problem)
     if model.elements:
         estimate = choose_friction_state(estimate)
-    # Correlation times are estimated after the choice of the friction model, since a wrong friction model has
-    # errors that last longer.
+    # Correlation times are estimated after the choice of the friction model, since the errors of a wrong friction model
+    # have longer correlation times.
     estimate = with_correlation_time(choose_friction_effects(estimate), samples)
     selected: Sequence[SelectedTerm] = ()
     if residual_terms(model) is not None:
@@ -220,7 +232,7 @@ def _run_stages(
 def _max_samples(model: ArmModel) -> int:
     """Return the largest number of samples of a fit.
 
-    The regressors of torque and of gravity torque, which are kept in memory, have at most `TUNING.regressor_bytes`.
+    It limits the memory of two regressors, of the torque and of the gravity torque, to `TUNING.regressor_bytes`.
     """
     numbers = 2 * model.n * model.inertial_parameters.numel()
     return max(TUNING.initial_samples, int(TUNING.regressor_bytes / (8 * numbers)))

@@ -28,11 +28,14 @@ LOGARITHMIC_GROUPS = ("armature", "sizes", "effects", "load_dependence")
 
 
 class _RegressorBlock(NamedTuple):
-    """T samples with all factors of the torque that do not depend on the parameters.
+    """T samples with all factors of the modelled torque that do not depend on the parameters x.
 
-    speed, acceleration: speeds and accelerations of the drives, (T, n). regressor: regressor of the joint torque,
-    (T, n, 10 B). load_regressor: regressor of the gravity torque on the drives, (T, n, 10 B). residual_torque: torque
-    of the residual terms, (T, n) [Nm, N]. friction_factor: factor of the residual terms on friction, (T, n).
+    Attributes:
+        speed, acceleration: speeds and accelerations of the drives, (T, n).
+        regressor: of the joint torque, (T, n, 10 B).
+        load_regressor: regressor of the gravity torque on the drives, (T, n, 10 B).
+        residual_torque: torque of the residual terms, (T, n) [Nm, N].
+        friction_factor: factor of the residual terms on friction, (T, n).
     """
 
     samples: SampleBlock
@@ -57,11 +60,13 @@ class ResidualSamples(NamedTuple):
 class TorqueJacobian:
     """Torque residual of a model on samples, and its derivatives with respect to the parameters x (K,).
 
-    x contains the parameters of bodies, drives and friction (`ParameterVector`). The modelled joint torque is Y(q, qd,
-    qdd) pi + C^T (friction + armature a), plus the torque of the residual terms. Here Y is the regressor, pi are the
-    inertial parameters of B bodies, and C qd and a are the speeds and accelerations of the drives. The torque residual
-    is the measured torque, which is G (tau - offset) plus friction compensation, minus the modelled torque; G maps
-    logged torques to joint torques.
+    x contains the parameters of bodies, drives and friction (`ParameterVector`). The modelled joint torque is
+
+        Y(q, qd, qdd) pi + C^T (friction(C qd) + armature C qdd) + torque of the residual terms,
+
+    with the regressor Y, the inertial parameters pi of B bodies, and the matrix C from joint speeds to drive speeds.
+    The measured joint torque is G (tau - offset) plus friction compensation, where G maps logged torques to joint
+    torques. The torque residual is the measured minus the modelled joint torque.
 
     The residual terms of the model are evaluated once, when this object is created. `terms` are additional linear
     terms, which are eliminated by variable projection. theta (K,) is x with pi in place of the log-Cholesky parameters
@@ -77,7 +82,7 @@ class TorqueJacobian:
         inputs = model.inputs
         self._gain_rows = inputs.gain_rows if isinstance(inputs, MotorInputs) else torch.zeros(0).long()
         self._motors = motors_of(model)
-        self._affects = self._motors != 0  # (n, n), entry (i, j): whether drive i affects joint j
+        self._affects = self._motors != 0  # (n, n), entry (i, j): True if drive i acts on joint j
         self._affected = self._affected_joints()
         self._colours = _colour(self._affects.double().mT @ self._affects.double() > 0)
         # Regressors do not depend on x, so they are computed once. The samples are divided into blocks to limit the
@@ -92,14 +97,13 @@ class TorqueJacobian:
     def squared_residual(self, x: torch.Tensor) -> torch.Tensor:
         """Return the sum of the squared torque residual per joint, (n,) [Nm^2, N^2].
 
-        For a joint with eliminated terms the sum includes the penalty of their weights. If motor gains are trained, the
-        residual of the logged torque is used: the measured joint torque is proportional to the gains, so that the
-        residual of the joint torque could be reduced by gains near zero.
+        For a joint with eliminated terms, the sum includes the penalty of their weights. If motor gains are trained,
+        the residual is scaled to the initial gains (see `logged_scale`): otherwise gains near zero would make it small.
         """
         parameters = self.rigid.unflatten(x)
         with torch.no_grad():
             blocks = [self._torque_residual(parameters, block)[0] for block in self._blocks]
-        # Eliminated terms depend on all samples of a joint, so the blocks are concatenated.
+        # The weights of eliminated terms depend on all samples of a joint, so the blocks are concatenated.
         residual = torch.cat(blocks) * self.logged_scale(x)
         squared_residual = residual.square().sum(dim=0)
         for joint, terms in self.terms.items():
@@ -109,8 +113,8 @@ class TorqueJacobian:
     def logged_scale(self, x: torch.Tensor) -> torch.Tensor:
         """Return initial gain / current gain per joint, (n,) [1]; 1 for fixed gains.
 
-        The measured joint torque is proportional to the current gain. Multiplied by this factor, the torque has the
-        initial gain, and does not depend on the fitted gains.
+        The measured joint torque is proportional to the current gain. Multiplied by this factor, it no longer depends
+        on the current gain.
         """
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 
@@ -127,9 +131,9 @@ class TorqueJacobian:
         return ones
 
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return J^T W J (K, K) and J^T W r (K,) for W = 1 / noise^2, noise (n,).
+        """Return the Gauss-Newton Hessian J^T W J (K, K) and the negative gradient J^T W r (K,) at x (K,).
 
-        J is the Jacobian of the modelled torque, r the torque residual: the second result is the negative gradient.
+        J is the Jacobian of the modelled torque, r the torque residual, W = 1 / noise^2. noise: (n,) [Nm, N].
         """
         rows: Iterable[JointRows] = self.joint_rows(x)
         if self.terms:
@@ -141,11 +145,11 @@ class TorqueJacobian:
         return change.mT @ curvature @ change, change.mT @ descent
 
     def joint_rows(self, x: torch.Tensor) -> Iterator[JointRows]:
-        """Yield the Jacobian of each joint and block of samples with respect to theta (K,), at x (K,).
+        """Yield the torque Jacobian of each joint and each block of samples with respect to theta (K,), at x (K,).
 
         theta is x with inertial parameters in place of the bodies' log-Cholesky parameters. The Jacobian with respect
-        to inertial parameters is the regressor, so that no derivative need be computed. `theta_jacobian` is d theta / d
-        x.
+        to inertial parameters is the regressor, so no derivatives are computed for them. `theta_jacobian` converts from
+        theta to x.
         """
         parameters, scale = self.rigid.unflatten(x), self.logged_scale(x)
         body_columns = self._of_bodies.nonzero()[:, 0]
@@ -153,8 +157,8 @@ class TorqueJacobian:
         for block in self._blocks:
             residual, parameter_columns, load_columns = self._compressed_jacobian(parameters, block)
             for joint, colour in enumerate(self._colours):
-                # Decompression: the compressed Jacobian contains the sum of the rows of all joints of one colour. The
-                # row of this joint has the columns of the parameters that affect its torque.
+                # Decompression: the compressed Jacobian contains one sum of the rows of all joints of a colour. The row
+                # of this joint is the part of the sum in the columns of the parameters that affect its torque.
                 affecting, drives = self._affected[:, joint], self._affects[:, joint]
                 loads = load_columns[colour][:, drives].unsqueeze(-1) * block.load_regressor[:, drives]
                 bodies = scale[joint] * block.regressor[:, joint] + loads.sum(dim=1)
@@ -178,8 +182,8 @@ class TorqueJacobian:
     def theta_jacobian(self, x: torch.Tensor) -> torch.Tensor:
         """Return d theta / d x, (K, K): block diagonal over bodies, identity for all other parameters."""
         parameters = self.rigid.unflatten(x)
-        # With ten copies of the bodies' parameters one reverse pass computes the gradients of all ten inertial
-        # parameters: copy k receives the gradient of the k-th one.
+        # Ten copies of the bodies' parameters are used, so that one reverse pass computes the gradients of all ten
+        # inertial parameters: copy k receives the gradient of inertial parameter k.
         copies = parameters[self.rigid.bodies].expand(10, -1, -1).detach().requires_grad_()
         with torch.enable_grad():
             theta = self._inertial_parameters({**parameters, self.rigid.bodies: copies})
@@ -201,7 +205,7 @@ class TorqueJacobian:
     def rigid_projection(
         self, x: torch.Tensor, noise: torch.Tensor, covariance: torch.Tensor
     ) -> RigidProjection:
-        """Return the projection of joint torques onto the rigid-body and friction model.
+        """Return the projection of joint torques onto the rigid-body and friction model (see `RigidProjection`).
 
         Args:
             x: (K,) parameters, at which the torque is linearized.
@@ -210,7 +214,7 @@ class TorqueJacobian:
         """
         change = self.theta_jacobian(x)
         covariance = change @ covariance @ change.mT
-        # The projection uses theta, not x: the torque is linear in inertial parameters, so that the projection is also
+        # The projection uses theta instead of x. The torque is linear in inertial parameters, so the projection is also
         # valid for large torques.
         rows = concatenate_blocks(self.joint_rows(x), len(noise))
         gains = []
@@ -221,16 +225,14 @@ class TorqueJacobian:
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Return the parameters (K,) after a step (K,) from x, along a line that is curved in x.
 
-        The line is straight in the inertial parameters and the friction coefficients, in which the torque is linear.
-        Inertial parameters are updated by `step_in_inertial_parameters`. A coefficient c whose logarithm is a parameter
-        is updated to c (1 + step) for a positive step, and to c exp(step) for a negative one, so that c remains
-        positive.
+        The line is straight in the inertial parameters and in the friction coefficients, since the torque is linear in
+        them. `step_in_inertial_parameters` updates the inertial parameters. Of a friction coefficient c, x contains log
+        c: a step s > 0 changes c to c (1 + s), a negative step to c exp(s), so that c remains positive.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
         for name in self.rigid.names(*LOGARITHMIC_GROUPS):
-            # The parameter is log c. A step s > 0 changes c along a straight line: log(c + c s) = log c + log1p(s),
-            # which equals log c + s to first order.
+            # For s > 0: log(c (1 + s)) = log c + log1p(s), which equals log c + s to first order.
             parameters[name] = (
                 parameters[name]
                 - change[name]
@@ -259,7 +261,7 @@ class TorqueJacobian:
             )
 
     def _affected_joints(self) -> torch.Tensor:
-        """Return a mask (K', n): whether each of K' parameters affects the torque of each joint.
+        """Return a mask (K', n), True if a parameter affects the torque of a joint.
 
         The K' parameters are the entries of x that are not parameters of bodies.
         """
@@ -283,7 +285,7 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return measured minus modelled joint torque, and the friction torque of the drives, both (T, n) [Nm, N].
 
-        load: gravity torque on the drives, (T, n); None: compute it from the parameters.
+        load: gravity torque on the drives, (T, n); None: it is computed from the parameters.
         """
         samples = block.samples
 
@@ -301,18 +303,18 @@ class TorqueJacobian:
     def _compressed_jacobian(
         self, parameters: NamedTensors, block: _RegressorBlock
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-        """Return the residual of the logged torque, and minus its Jacobian, compressed over joints.
+        """Return the torque residual times `logged_scale`, and minus its derivatives, compressed over joints.
 
         Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive may
-        have the same colour. Each parameter then affects at most one joint of a colour, so that the gradient of the sum
-        of the torques of one colour contains the Jacobian rows of all its joints. One reverse pass per colour (most
+        have the same colour. Each parameter then affects at most one joint of a colour. Therefore the gradient of the
+        sum of the torques of one colour contains the Jacobian rows of all its joints. One reverse pass per colour (most
         arms have one colour) replaces n passes. Each sample has its own copy of the parameters, so that a pass computes
         the gradients of all samples.
 
         Returns:
-            Residual, (T, n) [Nm, N]. Two lists with a matrix per colour: minus the derivatives with respect to the K'
-                parameters that are not of bodies, (T, K'), and with respect to the gravity torques on the drives, (T,
-                n).
+            Residual, (T, n) [Nm, N]. Two lists with one matrix per colour: derivatives with respect to the K'
+                parameters that are not of bodies, (T, K'), and with respect to the gravity torques on the drives,
+                (T, n).
         """
         copies = {}
         for name, tensor in parameters.items():
@@ -325,8 +327,8 @@ class TorqueJacobian:
             residual = self._torque_residual(per_sample, block, load)[0] * self._logged_scale(per_sample)
         parameter_columns, load_columns, colours = [], [], torch.tensor(self._colours)
         for colour in range(max(self._colours) + 1):
-            # A gradient of all colours at once (`is_grads_batched`) would import torch's symbolic shapes, which takes
-            # half a second.
+            # The colours are processed one by one: a batch of gradients (`is_grads_batched`) would import torch's
+            # symbolic shapes, which takes half a second.
             total = -residual[:, colours == colour].sum()
             gradients = gradient(total, [load, *copies.values()], retain_graph=True, materialize_grads=True)
             load_columns.append(gradients[0])
@@ -335,7 +337,7 @@ class TorqueJacobian:
 
 
 def _colour(coupled: torch.Tensor) -> list[int]:
-    """Return a colour per joint, different for coupled joints, by the greedy algorithm; coupled: mask (n, n)."""
+    """Return one colour per joint by the greedy algorithm; coupled joints differ. coupled: mask (n, n)."""
     colours: list[int] = []
     for row in coupled.tolist():
         used = {colour for colour, shared in zip(colours, row, strict=False) if shared}

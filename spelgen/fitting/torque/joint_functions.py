@@ -29,8 +29,8 @@ TermKey = tuple[str, int | None]
 
 ALL = slice(None)
 TORQUE, FRICTION, RIPPLE = "raw_torque_splines", "raw_friction_splines", "raw_torque_ripple"
-# Largest fitted logarithm of a friction factor. The logarithm is LARGEST tanh(parameter / LARGEST) in the model, so
-# that the parameter would be infinite at LARGEST itself.
+# Largest fitted logarithm of a friction factor. In the model, the logarithm is LARGEST tanh(parameter / LARGEST): a
+# logarithm of LARGEST would need an infinite parameter.
 LOG_FACTOR_LIMIT = 0.99 * LARGEST
 
 
@@ -38,9 +38,9 @@ LOG_FACTOR_LIMIT = 0.99 * LARGEST
 class JointFunction:
     """A residual term of one joint, as a linear model of P = L + W weights on T samples.
 
-    In the model, the term has a parameter with W entries for the joint, for example spline coefficients, in units of
-    `scale`. The linear model has L more weights, the coefficients of trends. A trend adds to all entries, for example a
-    straight line over all spline coefficients. The first L weights are of the trends, the other W of single entries.
+    The parameter of the term has W entries for the joint, for example spline coefficients, divided by `scale`. The last
+    W weights of the linear model are changes of single entries. The first L weights are coefficients of trends, for
+    example of a straight line over all spline coefficients.
 
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
@@ -48,11 +48,11 @@ class JointFunction:
     direction: (n,) joint torques per unit torque of the term, since a coupled drive acts on several joints.
     trends: (W, L) changes of the entries per unit weight of each trend.
     groups: (P,) index of the group of each weight; a group has one prior precision.
-    friction: (T,) friction torque with the current factor, if the term is a friction factor: the weights then give the
-        logarithm of the factor, and columns @ weights is the torque linearized at the current factor. None: the term is
-        a torque.
-    visit_length: mean number of successive samples in which the joint moves by the knot spacing of the splines. These
-        samples are one visit of a position.
+    friction: (T,) friction torque with the current factor, if the term is a friction factor; None: the term is a
+        torque. The weights of a friction factor determine its logarithm, and columns @ weights is the linearized change
+        of the friction torque.
+    visit_length: mean number of samples of a visit. A visit of a position is a run of samples in which the joint moves
+        by the knot spacing of the splines.
     """
 
     parameter: str
@@ -68,7 +68,7 @@ class JointFunction:
     visit_length: float
 
     def read(self, terms: ResidualTerms) -> torch.Tensor:
-        """Return weights (P,) that represent the current parameter of the model."""
+        """Return the weights (P,) of the term's current parameter; the weights of trends are zero."""
         if self.friction is not None:
             entries = terms.friction_logarithms()[self.joint]
         else:
@@ -76,24 +76,27 @@ class JointFunction:
         return F.pad(entries.detach(), (self.trends.shape[1], 0))
 
     def write(self, terms: ResidualTerms, weights: torch.Tensor) -> None:
-        """Set the parameter of the model to the values that weights (P,) represent."""
+        """Set the term's parameter to the values for weights (P,)."""
         count = self.trends.shape[1]
-        # Trends have a separate prior in the fit but no separate parameter in the model: add them to the entries.
+        # Trends have a separate prior in the fit but no parameter in the model, so they are added to the entries.
         entries = self.trends @ weights[:count] + weights[count:]
         if self.friction is not None:
-            # The model bounds the log factor by a tanh: invert it.
+            # The model bounds the log factor by a tanh, which is inverted here.
             entries = LARGEST * (entries.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT) / LARGEST).atanh()
         with torch.no_grad():
             terms.get_parameter(self.parameter)[self.joint] = entries / self.scale
 
     def torque(self, weights: torch.Tensor, rows: slice | torch.Tensor = ALL) -> torch.Tensor:
-        """Return the torque (T,) [Nm, N] for weights (P,) at the samples `rows`; for a friction factor, its change."""
+        """Return the torque (T,) [Nm, N] of the term for weights (P,) at the samples `rows`.
+
+        For a friction factor, this is the change of the friction torque by the factor.
+        """
         features = self.features[rows]
         if self.friction is None:
             return features @ weights
         friction = self.friction[rows]
-        # The columns of a friction factor are splines times friction, so the log factor is columns @ weights divided by
-        # friction. At zero friction the quotient 0 / 0 is replaced by zero.
+        # The columns of a friction factor are splines times friction, so they are divided by friction to compute the
+        # log factor. At zero friction, 0 / 0 is replaced by zero.
         log_factor = (features @ weights.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT)) / friction
         return friction * log_factor.nan_to_num().expm1()
 
@@ -108,7 +111,7 @@ class JointFunction:
     ) -> BayesianRidge:
         """Return the Bayesian ridge fit of the weights to a target torque (T,) [Nm, N] at the samples `rows`.
 
-        The samples of one visit of a position count as one independent error.
+        The samples of one visit of a position count as one independent error (see ``visit_length``).
         """
         samples = append_target(self.features[rows], target[rows])
         # The error of a function of position is constant during a visit of a position, however long the visit lasts.
@@ -117,17 +120,17 @@ class JointFunction:
 
 
 class ProjectedTerms(NamedTuple):
-    """Position-dependent torques that are eliminated in a fit.
+    """Position-dependent residual torques whose weights a fit eliminates by variable projection.
 
-    terms: linear terms per joint. candidates: the residual terms. The columns of a joint's linear terms are the columns
-    of all its residual terms, concatenated in the order of the candidates.
+    candidates: the residual terms. terms: {joint: linear terms}; their columns are the columns of all residual terms of
+    the joint, concatenated in the order of the candidates.
     """
 
     terms: dict[int, LinearTerms]
     candidates: tuple[JointFunction, ...]
 
     def write(self, model: ArmModel, torque_residual: torch.Tensor) -> None:
-        """Set the residual terms of the model to the ridge solution of their weights.
+        """Compute the eliminated weights by ridge regression, and write them to the model.
 
         torque_residual: residual (T, n) [Nm, N] of the model without the eliminated terms.
         """
@@ -147,14 +150,15 @@ def refit_terms(
 ) -> ProjectedTerms:
     """Refit the selected terms to the current torque residual, one after the other.
 
-    Friction factors are written to the model. Position-dependent torques are set to zero in the model and returned as
-    linear terms with the fitted penalty; the next fit of the rigid-body parameters eliminates their weights.
+    Friction factors are written to the model. Position-dependent torques are returned as linear terms with the fitted
+    penalty, whose weights the next fit of the rigid-body parameters eliminates; in the model, these torques are set to
+    zero.
 
     Args:
         model: model with residual terms.
         samples: samples with the torque residual of the model, whose current residual terms are included.
         projection: projection onto the rigid-body and friction model.
-        selected: terms to refit.
+        selected: (parameter, joint) of the terms to refit.
         correlation_length: (n,) number of samples per independent error.
     """
     residual, noise = samples.torque_residual, rms_per_joint(samples.torque_residual)
@@ -162,7 +166,7 @@ def refit_terms(
     torques = []
     for candidate in joint_functions(model, samples, projection, selected):
         current = (candidate.features @ candidate.read(model.residuals)).unsqueeze(-1) * candidate.direction
-        # backfitting: each term is fitted to the residual of all other terms with their latest values
+        # Backfitting: each term is fitted to the residual of all other terms with their latest values.
         target = candidate.target(residual + current, noise)
         fit = candidate.fit(target, float(correlation_length[candidate.joint]))
         weights = fit.coef
@@ -175,8 +179,8 @@ def refit_terms(
                 columns = torch.cat([terms[joint].features, columns], dim=1)
                 penalty = torch.cat([terms[joint].penalty, penalty])
             terms[joint] = LinearTerms(columns, penalty)
-            # The weights of this torque will be eliminated, so the torque in the model must be zero, or it would
-            # count twice.
+            # The weights of this torque will be eliminated. The torque in the model is set to zero, or it would count
+            # twice.
             weights = torch.zeros_like(weights)
         candidate.write(model.residuals, weights)
     return ProjectedTerms(terms, tuple(torques))
@@ -190,15 +194,16 @@ def joint_functions(
 ) -> Iterator[JointFunction]:
     """Yield the candidate terms of each joint (smooth torque, friction factor, ripple), or only the selected ones.
 
-    The weights of a smooth torque or a friction factor have one common prior precision; the weights of ripple have one
-    per frequency. The straight line of smooth torques has a separate precision, since it extrapolates to positions
-    without samples, as the torque of a spring does. selected: terms to yield; None: all.
+    The spline coefficients of a smooth torque or of a friction factor have one common prior precision; ripple has one
+    per frequency. A smooth torque also has a straight line with its own precision, since, unlike splines, a line
+    extrapolates to positions without samples (torque of a spring). selected: (parameter, joint) of the terms to yield;
+    None: all.
     """
     terms, motors = model.residuals, motors_of(model)
     with torch.no_grad():
         splines, ripple = terms.splines(samples.q), terms.revolute * terms.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), terms.unit.flatten()
-    # number of visits of positions = 1 + path length / spacing of the splines
+    # The number of visits of a joint is 1 + path length / knot spacing of the splines.
     visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
     one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
     line = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1)

@@ -10,10 +10,12 @@ import torch.nn.functional as F
 
 
 class JointRows(NamedTuple):
-    """Jacobian rows of one joint's torque: residual(theta + s) = residual - jacobian @ s[columns].
+    """Linearized torque residual of one joint: residual(theta + s) = residual - jacobian @ s[columns].
 
-    columns: indices of the C parameters on which the torque of the joint depends. jacobian: derivatives of the torque
-    with respect to these parameters, (T, C). residual: torque residual, (T,) [Nm, N].
+    Attributes:
+        columns: (C,), indices of the C entries of theta on which the torque of the joint depends.
+        jacobian: (T, C), derivatives of the modelled torque with respect to these entries.
+        residual: (T,) [Nm, N], torque residual at theta.
     """
 
     joint: int
@@ -26,13 +28,12 @@ class JointRows(NamedTuple):
 class LinearTerms:
     """Linear terms of one joint's torque, whose weights are eliminated by variable projection.
 
-    features: F, (T, P). penalty: diagonal D of the penalty on squared weights, (P,); its unit is the square of the unit
-    of the torque.
+    features: F, (T, P), torques per unit weight. penalty: diagonal of D, (P,), the penalty on squared weights.
 
-    Let r be the torque residual of all other parameters. The weights are the ridge solution w(r) = (F^T F + D)^-1 F^T
-    r. The cost |r - F w(r)|^2 + |D^1/2 w(r)|^2 then depends only on the other parameters. It is the square of a vector
-    that is linear in r. F does not depend on the other parameters, so the same linear map turns the Jacobian of r into
-    the Jacobian of this vector (Golub and Pereyra, SIAM J. Numer. Anal. 10:413, 1973).
+    Let r be the torque residual without these terms. The weights are the ridge solution w(r) = (F^T F + D)^-1 F^T r.
+    The cost |r - F w(r)|^2 + |D^1/2 w(r)|^2 then depends only on the other parameters of the model, and is the squared
+    length of a vector that is linear in r. F does not depend on the other parameters, so the same linear map turns the
+    Jacobian of r into the Jacobian of this vector (Golub and Pereyra, SIAM J. Numer. Anal. 10:413, 1973).
     """
 
     features: torch.Tensor
@@ -40,20 +41,21 @@ class LinearTerms:
 
     @cached_property
     def ridge(self) -> torch.Tensor:
-        """Matrix (P, T) that maps a torque (T,) to the ridge solution (P,)."""
-        # The matrix (P, P) is small; one factorization is used for all columns of the Jacobian.
+        """Matrix (F^T F + D)^-1 F^T, (P, T), which maps a torque residual (T,) to the weights (P,)."""
+        # The result is cached, so that the small matrix (P, P) is factorized once for all columns of the Jacobian.
         gram = self.features.mT @ self.features + self.penalty.diag()
         ridge: torch.Tensor = torch.linalg.solve(gram, self.features.mT)
         return ridge
 
     def weights(self, torque: torch.Tensor) -> torch.Tensor:
-        """Return the ridge solution (P, ...) for a torque (T, ...) [Nm, N]."""
+        """Return the weights (P, ...) for a torque residual (T, ...) [Nm, N]."""
         return self.ridge @ torque
 
     def residual(self, torque: torch.Tensor) -> torch.Tensor:
-        """Return the vector (T + P, ...) whose square is the ridge cost of a torque (T, ...).
+        """Return the vector (T + P, ...) whose squared length is the ridge cost for a torque residual (T, ...).
 
-        The first T entries are the torque residual, the others the weights times the roots of their penalties.
+        The first T entries are the residual after the ridge fit. The last P entries are the weights times the square
+        roots of their penalties.
         """
         weights = self.weights(torque)
         return torch.cat([torque - self.features @ weights, self.penalty.sqrt().diag() @ weights])
@@ -65,10 +67,12 @@ NO_TERMS: Mapping[int, LinearTerms] = {}
 class RigidProjection(NamedTuple):
     """Projection of joint torques onto the rigid-body and friction model, per joint.
 
-    jacobian: for each joint, derivatives (T, C) of its torque with respect to the C entries of theta that affect it
-    (see `TorqueJacobian.joint_rows`). posterior_gain: for each joint, the posterior covariance (C, C) of these entries
-    divided by the noise variance: posterior_gain @ jacobian^T @ torque is the change of theta by which a fit would
-    absorb an additional torque (T,) on this joint.
+    If a torque (T,) were added to a joint, a fit would change theta by posterior_gain @ jacobian^T @ torque to absorb
+    it.
+
+    jacobian: one matrix (T, C) per joint, derivatives of its torque with respect to the C entries of theta that affect
+    it (see `TorqueJacobian.joint_rows`). posterior_gain: one matrix (C, C) per joint, the posterior covariance of these
+    entries divided by the variance of the joint's torque noise.
     """
 
     jacobian: tuple[torch.Tensor, ...]
@@ -82,15 +86,15 @@ class RigidProjection(NamedTuple):
     def errors(self, residual: torch.Tensor, size: int) -> torch.Tensor:
         """Return the torque errors of S segments, (S, size, n) [Nm, N], from the residual (S size, n) of a fit.
 
-        A fit reduces the residual below the errors. The correction is (1 - H)^(-1/2) residual, with the segment's block
-        H of the hat matrix: if errors are independent, the corrected residual has the covariance of the noise for any
-        number of parameters (Bell and McCaffrey, Survey Methodology 28:169, 2002).
+        The residual of a fit is smaller than the errors, since the parameters absorb a part of the errors. The
+        corrected residual is (1 - H)^(-1/2) residual, with the segment's block H of the hat matrix. If errors are
+        independent, it has the covariance of the noise (Bell and McCaffrey, Survey Methodology 28:169, 2002).
         """
         errors: torch.Tensor = residual.unflatten(0, (-1, size)).clone()
         for joint, (jacobian, gain) in enumerate(zip(self.jacobian, self.posterior_gain, strict=True)):
             rows = jacobian.unflatten(0, (-1, size))
             values, vectors = torch.linalg.eigh(torch.eye(size).double() - rows @ gain @ rows.mT)
-            # Eigenvalues are near zero if the segment determines many parameters: the lower bound limits the
+            # Eigenvalues of 1 - H are near zero if the segment determines many parameters: the lower bound limits the
             # correction.
             scale = values.clamp(min=1 / size).rsqrt().unsqueeze(-1)
             errors[..., joint] = (vectors @ (scale * (vectors.mT @ errors[..., joint : joint + 1])))[..., 0]
@@ -114,7 +118,7 @@ def concatenate_blocks(rows: Iterable[JointRows], joints: int) -> list[JointRows
 def normal_equations(
     rows: Iterable[JointRows], noise: torch.Tensor, count: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return J^T W J (K, K) and J^T W r (K,) with W = 1 / noise^2.
+    """Return J^T W J (K, K) and J^T W r (K,) for Jacobian J, torque residual r and W = 1 / noise^2.
 
     Args:
         rows: Jacobian rows of all joints and blocks.
@@ -131,9 +135,10 @@ def normal_equations(
 def least_squares_residual(
     rows: Sequence[JointRows], noise: torch.Tensor, free: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return squared residual (n,) and effective number of parameters per joint (n,) of unconstrained least squares.
+    """Return two results of unconstrained least squares: squared residual (n,) and effective parameters (n,).
 
-    The effective number of a joint is the trace of its block of the hat matrix J (J^T W J)^+ J^T W, W = 1 / noise^2.
+    The first is the sum of the squared residual of each joint [Nm^2, N^2]. The second is the effective number of
+    parameters of each joint: the trace of its block of the hat matrix J (J^T W J)^+ J^T W, W = 1 / noise^2.
 
     Args:
         rows: Jacobian rows of all joints and blocks.
@@ -142,8 +147,7 @@ def least_squares_residual(
     """
     curvature, descent = normal_equations(rows, noise, len(free))
     inverse = torch.zeros_like(curvature)
-    # There is no prior here, and some directions of the inertial parameters affect no torque: use the
-    # pseudo-inverse.
+    # The pseudo-inverse is used, since there is no prior here and some inertial parameters affect no torque.
     inverse[free[:, None] & free] = _pseudo_inverse(curvature[free][:, free]).flatten()
     step = inverse @ descent
     squared_residual, gamma = torch.zeros(2, len(noise)).double()
@@ -156,8 +160,8 @@ def least_squares_residual(
 def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
     """Return the pseudo-inverse (K, K) of a curvature matrix (K, K).
 
-    Small eigenvalues are treated as zero. The matrix is scaled to a unit diagonal before, since the parameters have
-    different units.
+    The matrix is first scaled to a unit diagonal, since the parameters have different units. Small eigenvalues of the
+    scaled matrix are treated as zero.
     """
     length = curvature.diagonal().sqrt()
     scale = torch.where(length > 0, 1 / length, 0.0)
@@ -170,10 +174,14 @@ def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
 class BayesianRidge(NamedTuple):
     """Result of `bayesian_ridge` for P weights in G groups.
 
-    coef: weights, which are the ridge solution for `penalty`, (P,). penalty: penalty on the squared weights, (P,),
-    equal to lambda / alpha times the correlation length; its unit is the square of the unit of the target. alpha:
-    precision of the noise. lambda_: precision of the weights of each group, (G,). gamma: effective number of weights of
-    each group, (G,). n_iter, converged: number of fixed-point iterations, and whether they converged.
+    Attributes:
+        coef: (P,), weights, the ridge solution for `penalty`.
+        penalty: (P,), penalty on the squared weights: lambda / alpha times the correlation length.
+        alpha: precision of the noise.
+        lambda_: (G,), prior precision of the weights of each group.
+        gamma: (G,), effective number of weights of each group.
+        n_iter: number of fixed-point iterations.
+        converged: True if the iterations have converged.
     """
 
     coef: torch.Tensor
@@ -190,12 +198,12 @@ def bayesian_ridge(
 ) -> BayesianRidge:
     """Fit a linear model, target = features @ coef + noise, with one prior precision per group of weights.
 
-    MacKay, Bayesian Interpolation, Neural Computation 4:415 (1992), with the names of scikit-learn's `BayesianRidge`:
-    the noise precision alpha and the precisions lambda of the weights maximize the marginal likelihood.
+    The noise precision alpha and the precisions lambda of the weights maximize the marginal likelihood (MacKay,
+    Bayesian Interpolation, Neural Computation 4:415, 1992). The names are as in scikit-learn's `BayesianRidge`.
 
-    With the k weights w of a group and their posterior covariance S, one iteration is lambda = gamma / |w|^2,
-    gamma = k - lambda tr S, and 1 / alpha = |target - features @ coef|^2 / count. MacKay divides by count - gamma: with
-    far more samples than weights the difference is negligible.
+    Let w be the k weights of a group, with posterior covariance S. One iteration is gamma = k - lambda tr S, lambda =
+    gamma / |w|^2, and 1 / alpha = |target - features @ coef|^2 / count. MacKay divides by count - gamma; with far more
+    samples than weights, the difference is negligible.
 
     Args:
         products: (P + 1, P + 1) Gram matrix of the columns of `append_target`.
@@ -204,12 +212,13 @@ def bayesian_ridge(
         correlation_length: number of samples per independent error, by which the log likelihood is divided.
     """
     gram, moment, square = products[:-1, :-1], products[:-1, -1], float(products[-1, -1])
-    member = F.one_hot(groups.long()).double()  # (P, G): 1 if a weight is in a group
+    member = F.one_hot(groups.long()).double()  # (P, G), 1 if the weight is in the group, otherwise 0
     excited = gram.diagonal() > 0
     # `size` is the number k of weights of each group, `variance` is 1 / alpha.
     size, variance = member.sum(dim=0), square / count
     feature_square = (member.mT @ gram.diagonal() / count / size).clamp(min=1e-300)
-    # Zero weights would be a fixed point. Initially each group therefore explains 10 % of the variance of the target.
+    # Weights of zero would be a fixed point. Therefore the initial precision of each group is the one with which the
+    # group explains 10 % of the variance of the target.
     lambda_ = 10 * feature_square * size / max(variance, 1e-300)
     n_iter, converged = 0, False
     while n_iter < 30 and not converged:

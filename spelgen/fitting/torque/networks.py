@@ -1,4 +1,4 @@
-"""Fit of networks to torques by L-BFGS: whole models of networks, and selected networks as residual terms."""
+"""Fit of networks to torques by L-BFGS: of models that consist of networks, and of networks as residual terms."""
 
 import copy
 from collections.abc import Callable, Iterator
@@ -26,7 +26,7 @@ ADAPTED_PARTS: dict[Adaptation, tuple[str, ...]] = {
     "unit": ("",),
 }
 """Prefixes of the names of the weights that an adaptation fits."""
-BLOCK = 2**16  # samples per block: gradients need all intermediate results of a block in memory
+BLOCK = 2**16  # Number of samples per block; gradients need all intermediate results of a block in memory.
 
 
 def fit_networks(
@@ -39,7 +39,7 @@ def fit_networks(
     """Minimize the mean squared torque error of a model over its weights; return the number of evaluations.
 
     Args:
-        model: model whose weights that require a gradient are fitted.
+        model: model; only its weights that require a gradient are fitted.
         samples: samples with torques as logged, (T, n) [Nm, N]; errors are divided by the standard deviation of each
             joint's torque.
         weight_decay: factor of half the sum of squares of all weight matrices, which is added to the loss.
@@ -55,7 +55,7 @@ def fit_networks(
         for number, (q, qd, qdd, tau, *_) in enumerate(samples.blocks(BLOCK)):
             error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
             cost = error.mean() if count <= BLOCK else error.sum() / (count * joints)
-            # The loss is a sum over blocks: add the penalty once, not per block.
+            # The loss is a sum over blocks, so the penalty is added to the first block only.
             if number == 0 and penalty is not None:
                 cost = cost + penalty()
             yield cost
@@ -76,8 +76,8 @@ def adapt_networks(
         model: fitted model.
         samples: samples with torques as logged, (T, n) [Nm, N].
         adapt: name of the adapted part of the model, see `ADAPTED_PARTS`.
-        weight_decay: the loss includes this factor times half the squared change of the weights, so that weights that
-            the samples do not determine are unchanged.
+        weight_decay: factor of half the squared change of the weights, which is added to the loss. Weights that the
+            samples do not determine therefore remain unchanged.
         evaluations: maximum number of evaluations of the loss.
     """
     fitted = {name: x for name, x in model.named_parameters() if name.startswith(ADAPTED_PARTS[adapt])}
@@ -97,7 +97,7 @@ def adapt_networks(
 def select_networks(
     model: ArmModel, samples: ResidualSamples, correlation_length: float
 ) -> Iterator[SelectedTerm]:
-    """Fit and select the network of the potential, then the network of the mass matrix.
+    """Fit the network of the potential, then the network of the mass matrix; yield the accepted ones.
 
     Args:
         model: model with residual terms; weights of accepted networks are written to it.
@@ -108,8 +108,8 @@ def select_networks(
     # subset suffices.
     step = -(-len(samples.q) // SELECTION.network_samples)
     subset = ResidualSamples(*(column[::step] for column in samples))
-    # The target is the torque that all residual terms together should explain: the torque residual of the model plus
-    # the torque of the current single-joint terms.
+    # The target is the torque for all residual terms together: the torque residual of the model plus the torque of its
+    # current residual terms.
     with torch.no_grad():
         current = residual_torque(model, *subset[:3])
     subset = subset._replace(torque_residual=subset.torque_residual + current)
@@ -129,11 +129,11 @@ def select_networks(
 def _fit_network(
     model: ArmModel, network: torch.nn.Module, samples: ResidualSamples, correlation_length: float
 ) -> float | None:
-    """Fit a network to the first half of the samples, and to all samples if it lowers the error on the last half.
+    """Fit a network; return the relative reduction of the squared held-out error, None if the network is rejected.
 
-    Return the relative reduction of the squared error on the last half; None if the network is rejected. A rejected
-    network keeps its initial weights. samples: samples whose torque residual is the target of the sum of all residual
-    terms.
+    The network is fitted to the first half of the samples, and accepted if it significantly lowers the error on the
+    last half. An accepted network is refitted to all samples; a rejected one has its initial weights. samples: samples
+    whose torque residual is the target for the sum of all residual terms.
     """
     initial, residual = copy.deepcopy(network.state_dict()), _remaining_residual(model, samples)
     noise = rms_per_joint(residual)
@@ -149,7 +149,7 @@ def _fit_network(
         minimise(network, lambda: [cost()], evaluations, weight_decay=1.0)
 
     first, last = split_halves(len(samples.q), correlation_length)
-    # A few evaluations of the loss show whether the network explains anything; most networks do not.
+    # Most networks explain nothing, which a few evaluations of the loss show: they are rejected without a full fit.
     for evaluations in (SELECTION.network_probe_evaluations, SELECTION.network_evaluations):
         fit(first, evaluations)
         error = _remaining_residual(model, samples)
@@ -158,7 +158,7 @@ def _fit_network(
         if after.sum() >= before.sum():
             break
     network.load_state_dict(initial)
-    # The network is accepted: fit it to all samples.
+    # An accepted network is refitted to all samples.
     if reduction is not None:
         fit(ALL, SELECTION.network_evaluations)
     model.zero_grad(set_to_none=True)
@@ -166,6 +166,6 @@ def _fit_network(
 
 
 def _remaining_residual(model: ArmModel, samples: ResidualSamples) -> torch.Tensor:
-    """Return the residual (T, n) [Nm, N] after all residual terms of the model."""
+    """Return the torque residual (T, n) [Nm, N] minus the torques of all residual terms of the model."""
     with torch.no_grad():
         return samples.torque_residual - residual_torque(model, *samples[:3])

@@ -32,7 +32,7 @@ from spelgen.logs.windows import thinned
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import TorqueFit
 
-SAMPLES = 5  # number of samples of a validation window
+SAMPLES = 5  # number of samples of a window for validation and loss scales
 FITTED = {
     "load": "only a load at the tip fitted",
     "friction": "only friction and torque offsets fitted",
@@ -43,8 +43,7 @@ FITTED = {
 class TorqueObjective(Objective):
     """Objective of a fit to torques.
 
-    `begin` runs the whole fit, which takes seconds to minutes, so that no checkpoints are needed. A run folder is
-    written after the fit has succeeded.
+    `begin` runs the whole fit. It takes seconds to minutes, so no checkpoints are written during the fit.
     """
 
     name: ClassVar[str] = "torque"
@@ -63,7 +62,7 @@ class TorqueObjective(Objective):
                 self._delay = late
                 preprocessing = replace(preprocessing, torque_delay=late.delay)
                 self.request = replace(self.request, preprocessing=preprocessing)
-        # Windows are used for validation only, so a few suffice.
+        # Windows are only used for validation and for the scales of its loss, so their number is limited.
         stride = -(-sum(map(len, self.request.logs)) // TUNING.max_windows)
         self.data = prepare_data(self.request, SAMPLES, stride)
         return self.data
@@ -87,14 +86,14 @@ class TorqueObjective(Objective):
         fit_notes, solution = fit_torques(model, samples, self.config, regularizer)
         self.results = {"notes": [note.message for note in fit_notes]}
         notes += fit_notes
-        # Residual terms that were not selected are zero: remove them to save time.
+        # Residual terms that were not selected are zero. They are removed from the validated model to save time.
         subset = replace(self.data, validation=thinned(self.data.validation, TUNING.validation_windows))
         validation = Validation(without_idle_residuals(model), subset, self.request.options.device)
         substeps = validation.substeps()
         loss = validation.loss(substeps)
         self._make_checkpoint(loss, time.monotonic() - self.request.began, substeps)
         self._checkpoint["torque_nmse"] = torque_nmse(model, samples)
-        # An adapted model has parameters of two fits, so that no joint covariance of all parameters is known.
+        # An adapted model has parameters of two fits, so the covariance of all its parameters is unknown.
         if solution is not None and not self.config.adapt:
             self._checkpoint["posterior"] = {
                 "covariance": solution.covariance,
@@ -106,7 +105,7 @@ class TorqueObjective(Objective):
 
 
 def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
-    """Return the mean squared torque error divided by the variance of the torque, per joint (n values)."""
+    """Return the nMSE of each joint: mean squared torque error divided by the variance of the torque (n values)."""
     tau = samples.columns.tau
     squares = torch.zeros(model.n, dtype=torch.float64)
     with torch.no_grad():
@@ -119,9 +118,10 @@ def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
 
 
 def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:
-    """Return the delay of the torques relative to the positions in the logs, or a coupling of motors that explains it.
+    """Return the delay of the torques relative to the positions in the logs, or a motor coupling, if detected.
 
-    With the delay, a least-squares fit of inertial and friction parameters has the smallest torque residual.
+    The delay is the one for which a least-squares fit of inertial and friction parameters has the smallest torque
+    residual. If a motor coupling is detected, no delay is estimated.
     """
     with torch.no_grad():
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
@@ -132,8 +132,8 @@ def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Pre
 def couple_motors(model: ArmModel, coupling: Coupling, remaining: float) -> Diagnostic:
     """Add a motor coupling to a model and its specification, and return the warning about the coupling.
 
-    Without the coupling, the friction of a coupled wrist would be attributed to the bodies (TX40: torque nMSE 1.1
-    instead of 0.02).
+    Without the coupling, the bodies would absorb the friction of a coupled wrist. Example: for a TX40 arm, the torque
+    nMSE is 1.1 without and 0.02 with the coupling.
 
     Args:
         model: model in which the motor of `coupling.joint` drives this joint only.
@@ -154,7 +154,7 @@ def couple_motors(model: ArmModel, coupling: Coupling, remaining: float) -> Diag
 
 
 def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
-    """Return the samples of all logs, validation included; None if no log has motion at a sufficient sample rate."""
+    """Return the samples of training and validation logs; None if no log has motion at a sufficient rate."""
     decimation, reach = 1, bristle_reach(model)
     if isinstance(model, RigidBodyDynamics):
         decimation = TUNING.decimation
@@ -172,7 +172,7 @@ def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
 def fit_torques(
     model: ArmModel, samples: TorqueSamples, config: TorqueFit, regularizer: UrdfRegularizer | None = None
 ) -> tuple[list[Diagnostic], TorqueSolution | None]:
-    """Fit a model to samples; return the notes of the fit, and the solution if the model is of rigid bodies."""
+    """Fit a model to samples; return diagnostics, and the solution if the model consists of rigid bodies."""
     notes: list[Diagnostic] = []
     solution = None
     if isinstance(model, RigidBodyDynamics):

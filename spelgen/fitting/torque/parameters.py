@@ -1,9 +1,10 @@
 """Parameters of rigid bodies, drives and friction, which a fit to torques estimates, as one vector x (K,).
 
-The prior of x is Gaussian; the mean is x before the fit. Inertial parameters of different links are independent.
-Nominal friction and armatures are derived from the effort limits of the drives. Their errors are similar at all joints,
-for example if all limits are torques before the gear. The prior of a parameter is therefore a common factor of all
-joints times a factor of the single joint, and the common factor has the larger standard deviation.
+The prior of x is Gaussian with the values before the fit as its mean. Inertial parameters of different links are
+independent. Armatures and friction are not: their initial values are derived from the effort limits of the drives,
+whose errors are similar at all joints, for example if all limits are torques before the gear. Such a parameter is
+therefore the product of a factor common to all joints and a factor of the single joint; the common factor has the
+larger standard deviation.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ SERVO_GROUPS = ("stiffness", "damping", "dead_zone", "delay")
 """Groups of position servos, which fits to torques do not have."""
 DAY_GROUPS = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
 """Groups that differ from day to day."""
-NEGLIGIBLE = -30.0  # logarithm of a negligible friction coefficient
+NEGLIGIBLE = -30.0  # logarithm of a negligible friction coefficient, relative to nominal friction
 
 
 class ParameterVector:
-    """Maps the parameters of bodies, drives, servos and friction of a model to one vector x (K,), and back.
+    """Map from the parameters of bodies, drives, servos and friction of a model to one vector x (K,), and back.
 
-    groups: parameter group of each name. initial: parameters by name when this object was created.
+    groups: {name of a parameter: its group}. initial: {name: values when this object was created}.
     """
 
     def __init__(self, model: ArmModel) -> None:
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         self.groups: dict[str, str] = {}
-        self._tensors: dict[str, torch.Tensor] = {}  # parameters, and buffers that a fit may change
+        self._tensors: dict[str, torch.Tensor] = {}  # parameters and buffers that a fit may change
         self.initial: dict[str, torch.Tensor] = {}
         for name, info in parameter_table(model).items():
             if info.kind in (*RIGID_GROUPS, *SERVO_GROUPS):
@@ -61,12 +62,12 @@ class ParameterVector:
         return [name for name, group in self.groups.items() if group in groups]
 
     def unflatten(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return views of a vector (K,) by name, each in the shape of its parameter."""
+        """Return {name: view of the vector x (K,) in the shape of the parameter}."""
         blocks = zip(self.initial.items(), x.split(self._lengths), strict=True)
         return {name: block.view_as(tensor) for (name, tensor), block in blocks}
 
     def flatten(self, parameters: NamedTensors) -> torch.Tensor:
-        """Return parameters by name as one vector (K,)."""
+        """Return the parameters in a dict {name: values} as one vector (K,)."""
         return torch.cat([parameters[name].flatten() for name in self.initial])
 
     def write(self, x: torch.Tensor) -> None:
@@ -76,14 +77,14 @@ class ParameterVector:
                 self._tensors[name].copy_(values)
 
     def mask(self, *groups: str) -> torch.Tensor:
-        """Return a mask (K,) of the parameters of the given groups."""
+        """Return a mask (K,), True for the parameters of the given groups."""
         tensors = self.initial.items()
         return (
             self.flatten({name: torch.full_like(x, self.groups[name] in groups) for name, x in tensors}) > 0
         )
 
     def free_mask(self, adapt: Adaptation | None, compensated: torch.Tensor) -> torch.Tensor:
-        """Return a mask (K,) of the parameters that a fit estimates.
+        """Return a mask (K,), True for the parameters that a fit estimates.
 
         Args:
             adapt: "load": only the last body is free; "friction": only friction parameters and torque offsets, which
@@ -100,7 +101,7 @@ class ParameterVector:
 
 
 def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
-    """Return the measured joint torque, (T, n) [Nm, N]."""
+    """Return the joint torque that belongs to the logged torque, (T, n) [Nm, N]."""
     with torch.no_grad():
         torque: torch.Tensor = samples.tau @ model.input_matrix(samples.q[:1])[0].mT
     return torque
@@ -110,14 +111,15 @@ def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
     """Limit the nominal friction of each drive to the standard deviation of its torque in the samples.
 
     Nominal friction is derived from the effort limits of the URDF, which are placeholders in many files. The prior
-    width of torque offsets is proportional to nominal friction: if it is far too large, offsets are confounded with
-    gravity.
+    width of torque offsets is proportional to nominal friction. If nominal friction is far too large, offsets may
+    absorb gravity torques.
     """
     rigid, motors = ParameterVector(model), motors_of(model)
     with torch.no_grad():
         drive_torque = joint_torque(model, samples) @ torch.linalg.inv(motors)
         limit = drive_torque.std(dim=0) / model.friction.nominal
-        # Drives at rest and drives without torque have no information on their friction: do not limit it.
+        # The friction of drives at rest and of drives without torque is not limited, since the samples have no
+        # information on it.
         informative = (limit > 0) & ((samples.qd @ motors.mT).abs().amax(dim=0) > MIN_SPEED)
         limit = torch.where(informative, limit, torch.inf)
         scale = limit.clamp(max=1.0)
@@ -133,12 +135,12 @@ def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
 def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     """Return log-Cholesky parameters (B, 10) after a step along a straight line in the inertial parameters.
 
-    The torque is linear in the inertial parameters, but not in the log-Cholesky parameters. The linear model of a
-    Gauss-Newton step is therefore exact along this line, but not along a straight line in the log-Cholesky parameters.
+    The torque is linear in the inertial parameters. The linear model of a Gauss-Newton step is therefore exact along
+    this line, in contrast to a straight line in the log-Cholesky parameters.
 
-    The pseudo-inertia of a body is C S C^T, with a constant C and S = T T^T, where T is the upper triangular matrix
-    `body_factor(raw)`. To first order, the step changes T by X, and S by T (T^-1 X + (T^-1 X)^T) T^T. This change is
-    added to S; if S would not remain positive definite, a fraction of the change is added.
+    The pseudo-inertia of a body is C S C^T with a constant matrix C and S = T T^T, where T is the upper triangular
+    matrix `body_factor(raw)`. Let X be the first-order change of T by the step. The first-order change of S is then T
+    (T^-1 X + (T^-1 X)^T) T^T. It is added to S, or only a fraction of it, so that S remains positive definite.
 
     Args:
         raw: (B, 10) log-Cholesky parameters of B bodies.
@@ -154,7 +156,7 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
     factor, factor_change = perturbed.real, perturbed.imag / epsilon
     relative = torch.linalg.solve_triangular(factor, factor_change, upper=True)
     added = relative + relative.mT
-    if not added.isfinite().all():  # overflow: the solver rejects the step by its cost
+    if not added.isfinite().all():  # after an overflow, the solver rejects the step because of its cost
         return raw + step
     min_eigenvalue = torch.linalg.eigvalsh(added)[:, 0]
     fraction = (TUNING.body_step / (-min_eigenvalue).clamp(min=1e-12)).clamp(max=1.0)
@@ -192,15 +194,18 @@ SHARED = {
 
 @dataclass(frozen=True, eq=False)
 class ParameterPrior:
-    """Prior of the parameters x: Gaussian, and Student's t for the parameters of each body.
+    """Prior of the parameters x: Student's t for the parameters of each body, Gaussian for all others.
 
-    The links of a URDF are not equally wrong. With a common Gaussian prior, a link with placeholder values would keep
-    wrong values, or would widen the prior of all links. The t distribution is a Gaussian whose width differs between
-    bodies.
+    The links of a URDF are not equally wrong. With one Gaussian prior for all links, a link with placeholder values
+    would keep wrong values, or would widen the prior of all links. The t distribution is represented as a Gaussian with
+    an estimated width for each body.
 
-    rigid: `ParameterVector` with the names and groups of the parameters x. widths: standard deviation of each group;
-    for bodies, the scale of the t distribution. hyperprior: the initial `widths`. mean: prior mean of x, (K,).
-    body_widths: standard deviation of each body, (B,).
+    Attributes:
+        rigid: `ParameterVector` of the parameters x.
+        widths: current standard deviation of each group; for bodies, the scale of the t distribution.
+        hyperprior: the initial standard deviations, about which the estimates have a hyperprior.
+        mean: prior mean of x, (K,).
+        body_widths: current standard deviation of each body, (B,).
     """
 
     rigid: ParameterVector
@@ -217,10 +222,9 @@ class ParameterPrior:
 
     @property
     def plausible(self) -> bool:
-        """Whether the URDF is plausible: its masses agree with the fit up to a factor of `TUNING.wrong_urdf`.
+        """Whether the masses of the URDF agree with the fit up to a factor of `TUNING.wrong_urdf`.
 
-        The factor is exp of the root mean square of the bodies' prior widths, since the logarithm of a mass is a
-        parameter.
+        The factor is exp(root mean square of `body_widths`), since the logarithm of a mass is a parameter.
         """
         return float(self.body_widths.square().mean().sqrt().exp()) <= TUNING.wrong_urdf
 
@@ -237,7 +241,10 @@ class ParameterPrior:
 def prior_covariance(
     widths: GaussianPrior, parameters: Mapping[str, torch.Tensor], groups: Mapping[str, str]
 ) -> torch.Tensor:
-    """Return the prior covariance (K, K) of parameters, in their order; groups: parameter group of each name."""
+    """Return the prior covariance (K, K) of the flattened parameters.
+
+    parameters: {name: values}, K values in total. groups: {name: parameter group}.
+    """
     count = sum(x.numel() for x in parameters.values())
     matrix, friction, first = torch.zeros(count, count).double(), torch.zeros(count).double(), 0
     deviations: dict[str, float] = dict(widths)
@@ -246,8 +253,8 @@ def prior_covariance(
         option = width_option(groups[name])
         matrix[rows, rows] = torch.full((len(rows),), deviations[option]).double().square()
         if option in SHARED:
-            # Most groups have one parameter per joint. Bristle fractions have one per joint and bristle, (n, elements):
-            # the fractions of bristle k of all joints have a common factor.
+            # The parameters of all joints have a common factor. Bristle fractions have one parameter per joint and
+            # bristle, (n, elements): each bristle has its own common factor.
             for of_joints in rows.view(len(x), -1).mT:
                 matrix[of_joints[:, None], of_joints] += deviations[SHARED[option]] ** 2
         if groups[name] in ("sizes", "effects"):
@@ -259,16 +266,17 @@ def prior_covariance(
 def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tensor) -> ParameterPrior:
     """Return the prior after one fixed-point step of evidence maximization for the widths of three groups.
 
-    The groups are bodies, armatures and torque offsets. MacKay, Bayesian Interpolation, Neural Computation 4:415
-    (1992): the width s of a group of k parameters that maximizes the marginal likelihood in Laplace's approximation is
-    the fixed point of s^2 = |x - mean|^2 / gamma, with the effective number of parameters gamma = k - tr(covariance) /
-    s^2. Here s^2 also has a scaled inverse chi-squared hyperprior about the initial value s0^2, with c degrees of
-    freedom. The fixed point is then s^2 = (|x - mean|^2 + c s0^2) / (gamma + c). The width has an upper bound.
+    The groups are bodies, armatures and torque offsets. The width s of a group is its prior standard deviation. In
+    Laplace's approximation, the marginal likelihood has its maximum at the fixed point of s^2 = |x - mean|^2 / gamma,
+    where gamma = k - tr(covariance) / s^2 is the effective number of the group's k parameters (MacKay, Bayesian
+    Interpolation, Neural Computation 4:415, 1992). Here s^2 also has a scaled inverse chi-squared hyperprior with c
+    degrees of freedom about its initial value s0^2, so that the fixed point is s^2 = (|x - mean|^2 + c s0^2) / (gamma +
+    c). The width has an upper bound.
 
-    The width of a single body has the same hyperprior, about the common width s of all bodies. Integrated over the
-    width, the prior of the body is a t distribution of c degrees of freedom and scale s. In the fixed point of s, the
-    squared parameters of the body have the weight s^2 / width^2 (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881,
-    1989).
+    The width of a single body has a hyperprior of the same form about the common width s of all bodies. Integrated over
+    the width of the body, its prior is a t distribution with c degrees of freedom and scale s. In the fixed point for
+    s, the squared parameters of a body have the weight s^2 / (width of the body)^2 (Lange, Little and Taylor, J. Am.
+    Stat. Assoc. 84:881, 1989).
 
     Args:
         prior: current prior.
@@ -279,16 +287,20 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
     freedom, offset = prior.widths.degrees_of_freedom, x - prior.mean
 
     def width(squares: torch.Tensor, gamma: torch.Tensor, group: str, center: float) -> torch.Tensor:
-        """Return the width of a group, sqrt((squares + c center^2) / (gamma + c)), at most its upper bound.
+        """Return sqrt((squares + c center^2) / (gamma + c)), limited by the upper bound of the group's width.
 
-        c: degrees of freedom of the hyperprior, whose width is `center`. squares: sum of squared offsets from the
-        prior mean. gamma: effective number of parameters, of the same shape.
+        c is the number of degrees of freedom of the hyperprior.
+
+        Args:
+            center: width about which the hyperprior is.
+            squares: sum of squared offsets from the prior mean.
+            gamma: effective number of parameters, same shape as squares.
         """
         square = (squares + freedom * center**2) / (gamma.clamp(min=0.0) + freedom)
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 
     mask = prior.rigid.mask("bodies")
-    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # (B,)
+    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # one sum per body, (B,)
     gamma = 10 - covariance.diagonal()[mask].view(-1, 10).sum(dim=1) / prior.body_widths.square()
     relative = (current["bodies"] / prior.body_widths).square()
     updated = {"bodies": float(width((relative * squares).sum(), gamma.sum(), "bodies", initial["bodies"]))}
@@ -298,8 +310,8 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         count = int(mask.sum())
         centring = torch.eye(count).double()
         if group in SHARED and count:
-            # The common factor has a separate width. The width of single joints is therefore estimated from the
-            # differences between joints.
+            # The common factor of all joints has a separate width. The width of single joints is therefore estimated
+            # from offsets minus their mean over the joints.
             centring -= 1 / count
         spread = centring @ covariance[mask][:, mask] @ centring
         gamma = centring.trace() - spread.trace() / current[group] ** 2

@@ -1,13 +1,14 @@
 """MAP estimation of rigid-body and friction parameters x from torques.
 
-The torque is linear in the inertial parameters, whose log-Cholesky parameters keep them physically consistent, and
-smooth in the few constants of each joint. The cost is the negative log posterior of x,
+x contains log-Cholesky parameters of the bodies, which guarantee physically consistent inertias, and a few constants of
+each joint. The cost is the negative log posterior of x,
 
     1/2 sum over joints j of |r_j(x)|^2 / s_j^2 + 1/2 (x - m)^T P (x - m),
 
-with the torque residual r, its noise s, and a Gaussian prior of mean m and precision P (see `ParameterPrior`). If motor
-gains are trained, r is the residual of the logged torque (see `TorqueJacobian.squared_residual`). Noise and prior
-widths are estimated from the data: outer iterations alternate Levenberg-Marquardt steps with their updates.
+with the torque residual r_j (T,) of joint j, its noise s_j, and a Gaussian prior of mean m and precision P (see
+`ParameterPrior`). If motor gains are trained, r is the residual of the logged torque (see
+`TorqueJacobian.squared_residual`). Noise and prior widths are estimated from the logs: outer iterations alternate
+Levenberg-Marquardt steps with updates of noise and prior widths.
 """
 
 from __future__ import annotations
@@ -45,9 +46,9 @@ State = SolverState[torch.Tensor]
 class NoiseEstimator:
     """Estimator of the torque noise s (n,) [Nm, N] from the squared residual of `count` samples.
 
-    Errors of filtered samples are correlated, so `correlation_length` (n,) samples count as one independent error. s^2
-    is the mean squared residual times this length. The sum over all samples of residual^2 / s^2 is then the number of
-    independent errors, not the number of samples. torque_std: standard deviation of the torque, (n,) [Nm, N].
+    s^2 is the mean squared residual times the correlation length. The sum over all samples of residual^2 / s^2 is then
+    the number of independent errors instead of the number of samples. correlation_length: (n,), number of correlated
+    samples that count as one independent error. torque_std: (n,) [Nm, N], standard deviation of the torque.
     """
 
     count: int
@@ -58,7 +59,7 @@ class NoiseEstimator:
     def of(cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor) -> NoiseEstimator:
         """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
-        # A joint of constant torque has a standard deviation of zero: avoid divisions by zero.
+        # The lower bound avoids divisions by zero at joints of constant torque.
         torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
         return cls(jacobian.samples.count, correlation_length, torque_std)
 
@@ -68,27 +69,29 @@ class NoiseEstimator:
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] of a model that explains nothing."""
+        """Return the noise (n,) [Nm, N] of a model that predicts a constant torque."""
         return self.torque_std * self.correlation_length.sqrt()
 
     def estimate(
         self, squared_residual: torch.Tensor, effective_parameters: torch.Tensor | float = 0.0
     ) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N], at least a fraction of the torque's standard deviation.
+        """Return the noise (n,) [Nm, N] for a squared residual; its lower bound is a fraction of `torque_std`.
 
         Args:
             squared_residual: (n,) sum over all samples [Nm^2, N^2].
             effective_parameters: (n,) number of parameters that each joint's torque determines. Each parameter reduces
                 the degrees of freedom of the residual by one independent error.
         """
-        # At least one error remains: `updated` assigns equal shares of the parameters to the joints, and a joint may
-        # have fewer independent errors than its share.
+        # At least one independent error remains. Otherwise the difference could be negative, since `updated` assigns an
+        # equal share of the parameters to each joint.
         fraction = (self.errors - effective_parameters).clamp(min=1.0) / self.errors
         rms = (squared_residual / self.count / fraction).sqrt()
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] of an annealing iteration, which is a fraction of the rms torque residual.
+        """Return the noise (n,) [Nm, N] for an iteration of noise annealing.
+
+        It is `annealing_fraction` times the noise that is estimated from the residual.
 
         squared_residual: (n,) sum over all samples [Nm^2, N^2].
         """
@@ -99,10 +102,12 @@ class NoiseEstimator:
 class TorqueProblem:
     """Negative log posterior of x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
-    noise: standard deviations, (n,) [Nm, N], scaled such that the errors of all samples can be treated as independent
-    (see `NoiseEstimator`). adapt: group of parameters to estimate, "load", "friction" or "unit"; None: all parameters.
-    compensated: joints whose drives compensate friction, (n,) (see `stages.find_compensation`). correlation_time:
-    correlation time of the torque errors, (n,) [s].
+    Attributes:
+        noise: (n,) [Nm, N], scaled such that the errors of all samples can be treated as independent (see
+            `NoiseEstimator`).
+        adapt: group of parameters to estimate, "load", "friction" or "unit"; None: all parameters.
+        compensated: (n,), True for joints whose drives compensate friction (see `stages.find_compensation`).
+        correlation_time: (n,) [s], correlation time of the torque errors.
     """
 
     jacobian: TorqueJacobian
@@ -116,7 +121,10 @@ class TorqueProblem:
     def of(
         cls, jacobian: TorqueJacobian, widths: GaussianPrior, adapt: Adaptation | None = None
     ) -> TorqueProblem:
-        """Return the problem whose prior mean is the vector of the model's current parameters."""
+        """Return the problem with the model's current parameters as the prior mean.
+
+        widths: initial standard deviations of the prior. The initial noise is the upper bound of the noise.
+        """
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
         noise = NoiseEstimator.of(jacobian, correlation_time).upper_bound()
@@ -126,7 +134,7 @@ class TorqueProblem:
 
     @cached_property
     def free(self) -> torch.Tensor:
-        """Mask (K,) of the estimated parameters."""
+        """Mask (K,), True for the parameters that are estimated."""
         return self.jacobian.rigid.free_mask(self.adapt, self.compensated)
 
     @cached_property
@@ -142,14 +150,14 @@ class TorqueProblem:
     def with_least_squares_noise(self, x: torch.Tensor) -> TorqueProblem:
         """Return the problem with the noise of unconstrained least squares, linearized at x (K,).
 
-        Unconstrained least squares fits the samples better than any physically consistent x, up to the linearization of
-        friction, so that the residual of least squares is a lower bound of the noise. Noise estimated from the residual
-        of a poor initial guess would be too large, and the fit would stop early.
+        Noise estimated from the residual of a poor initial guess would be too large, and the fit would stop early. The
+        residual of unconstrained least squares is a lower bound of the noise: except for the linearization of friction,
+        no physically consistent x has a smaller residual.
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
-        # Joints have common parameters, so the solution depends on the weights of the joints, which are computed from
-        # the noise: iterate twice.
+        # Joints have common parameters, so the solution depends on the weights 1 / noise^2 of the joints, which depend
+        # on the solution. Two iterations suffice.
         for _ in range(2):
             noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
         return replace(self, noise=noise)
@@ -168,28 +176,29 @@ class TorqueProblem:
         return float(((residual / self.noise.square()).sum() + penalty) / 2)
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
-        """Return Gauss-Newton Hessian (k, k) and negative gradient (k,) with respect to the k free parameters."""
-        # The prior of common factors couples free and fixed parameters: compute all rows, then select the free ones.
+        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) for the k free parameters."""
+        # The prior of common factors couples free and fixed parameters. Therefore all rows are computed first, and the
+        # free ones are selected afterwards.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
         return NormalEquations(curvature, (descent - penalty_gradient)[self.free])
 
     def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
-        """Yield the parameters (K,) after two variants of a step: x + step, then `TorqueJacobian.curved_step`.
+        """Yield two candidates (K,) for the parameters: x + step, then `TorqueJacobian.curved_step` of x and step.
 
-        step: (k,) step of the free parameters.
+        step: (k,), step of the free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
-        # The parameters x + step need less time and are as good near the optimum. Far from the optimum the curved step
-        # may have a lower cost.
+        # x + step needs less time and is as good near the optimum. Far from the optimum, the curved step may have a
+        # lower cost.
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
     def minimize(self, state: State, max_steps: int) -> SolverResult[torch.Tensor]:
-        """Make at most `max_steps` Levenberg-Marquardt steps from `state`, and return the result.
+        """Return the result of at most `max_steps` Levenberg-Marquardt steps from `state`.
 
-        The cost of `state` is recomputed first, since it may belong to another noise or prior.
+        The cost of `state` is recomputed first, since its noise or prior may be different.
         """
         state = replace(state, cost=self.cost(state.x, state.residual))
         return levenberg_marquardt(
@@ -204,9 +213,9 @@ class TorqueProblem:
         return self.of_all_parameters(torch.linalg.inv(curvature))
 
     def of_all_parameters(self, free_covariance: torch.Tensor) -> torch.Tensor:
-        """Return a covariance of free parameters as a covariance (K, K) of all parameters, zero for fixed ones.
+        """Return the covariance (K, K) of all parameters, which is zero for fixed parameters.
 
-        free_covariance: covariance of the k free parameters, (k, k).
+        free_covariance: (k, k), covariance of the k free parameters.
         """
         covariance = torch.zeros_like(self.prior.precision)
         covariance[self.free[:, None] & self.free] = free_covariance.flatten()
@@ -215,12 +224,13 @@ class TorqueProblem:
     def updated(self, state: State, covariance: torch.Tensor) -> TorqueProblem:
         """Return the problem with noise and prior widths re-estimated at a state.
 
-        The effective number of parameters is gamma = tr(1 - covariance P), with the precision P of the prior (MacKay,
-        1992). Each joint is assigned an equal share of gamma.
+        The noise depends on the effective number of parameters, gamma = tr(1 - covariance P), with the precision P of
+        the prior (MacKay, 1992). Each joint is assigned an equal share of gamma. covariance: (K, K), posterior
+        covariance.
         """
         free, joints = self.free, len(state.residual)
-        # A parameter of a body is determined by the torques of several joints: gamma is computed for all joints
-        # together.
+        # gamma is computed for all joints together, since the torques of several joints determine a parameter of a
+        # body.
         gamma = float(free.sum() - (covariance * self.prior.precision)[free][:, free].sum())
         noise = self.noise_estimator.estimate(state.residual, gamma / joints)
         # The prior width of the bodies cannot be estimated if only one body, the load, is fitted.
@@ -232,8 +242,8 @@ class TorqueProblem:
 class TorqueEstimate:
     """MAP estimate: the problem with its noise and prior, and the last state of the solver.
 
-    covariance: posterior covariance of x, (K, K). After `alternate` it belongs to the last linearization, and to noise
-    and prior before their last update; `with_current_covariance` recomputes it.
+    covariance: (K, K), posterior covariance of x. After `alternate`, it is the covariance for the noise and the prior
+    before their last update; `with_current_covariance` recomputes it.
     """
 
     problem: TorqueProblem
@@ -241,7 +251,7 @@ class TorqueEstimate:
     covariance: torch.Tensor
 
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
-        """Return the estimate with the same x and another Jacobian (of other samples, residual terms or friction)."""
+        """Return the estimate with the same x, but for other samples, residual terms or friction forms."""
         state = replace(self.state, residual=jacobian.squared_residual(self.state.x))
         return replace(self, problem=replace(self.problem, jacobian=jacobian), state=state)
 
@@ -251,24 +261,25 @@ class TorqueEstimate:
         return replace(self, covariance=self.problem.covariance(normal.curvature))
 
     def on_segments(self, samples: TorqueSamples) -> TorqueEstimate:
-        """Return the estimate on segments of consecutive samples, with the current covariance.
+        """Return the estimate with the same x on segments of consecutive samples, and with the current covariance.
 
-        The noise is converted to the sample interval of the segments.
+        The problem of the estimate may have subsampled samples, whose correlation cannot be estimated. The noise is
+        converted to the sample interval of the segments.
         """
         jacobian = TorqueJacobian(
             self.problem.jacobian.model, samples.segments(TUNING.segment, TUNING.initial_samples)
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
-        # The weight of an independent error, length / noise^2, must not depend on the sample interval.
+        # The weight of an independent error, length / noise^2, must be the same for both sample intervals.
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
     def linearize(self) -> tuple[ResidualSamples, RigidProjection]:
         """Return the torque residual, and the projection of joint torques onto the rigid-body and friction model.
 
-        The covariance must be the one for the current noise (`with_current_covariance`). With the covariance for a
-        larger noise, the projection would remove too much of a torque.
+        The covariance must be current (see `with_current_covariance`). With the covariance for a larger noise, the
+        projection would remove too much of a torque.
         """
         jacobian, x = self.problem.jacobian, self.state.x
         projection = jacobian.rigid_projection(x, self.problem.noise, self.covariance)
@@ -276,7 +287,9 @@ class TorqueEstimate:
 
 
 def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
-    """Alternate Levenberg-Marquardt steps with updates of noise and prior until the noise has converged.
+    """Alternate Levenberg-Marquardt steps with updates of noise and prior; return the MAP estimate.
+
+    The iterations end when the noise has converged.
 
     Args:
         problem: problem with initial noise and prior.
@@ -286,7 +299,8 @@ def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
         result = problem.minimize(state, TUNING.iteration_steps)
         state, covariance = result.state, problem.covariance(result.normal_equations.curvature)
         previous, problem = problem, problem.updated(state, covariance)
-        # The first update is no test of convergence: the initial noise may be of other samples or another model.
+        # Convergence is not tested after the first update, since the initial noise may be of other samples or of
+        # another model.
         if number and (problem.noise > TUNING.noise_converged * previous.noise).all():
             break
     return TorqueEstimate(problem, state, covariance)
@@ -295,32 +309,32 @@ def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
 def refine(
     estimate: TorqueEstimate, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
 ) -> TorqueEstimate:
-    """Return the estimate refitted to other samples or with other linear terms; the given estimate is a warm start."""
+    """Return the estimate for other samples or linear terms, refitted with ``estimate`` as the warm start."""
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
-    # The noise of the given estimate belongs to other samples or other terms: estimate it again.
+    # The noise is estimated again, since the noise of ``estimate`` is of other samples or terms.
     noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
     return alternate(replace(estimate.problem, noise=noise), estimate.state)
 
 
 def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> TorqueEstimate:
-    """Return the estimate with correlation times (n,) [s] that are estimated on segments of samples.
+    """Return the estimate with correlation times (n,) [s] of the torque errors that are estimated from samples.
 
-    The torque error is the sum of filtered white noise, correlated over 0.06 s, and of the model's error, correlated
-    over tenths of a second to seconds. The integrated correlation time of the sum is estimated from the residual.
-    Fitted parameters reduce the correlation of the residual, which is therefore corrected first
-    (`RigidProjection.errors`). The result is the weighted mean of the estimated correlation time and its prior mean
-    `TUNING.correlation_time`, with the numbers of independent errors as weights.
+    The torque error is a sum of two errors: filtered white noise, with a correlation time of 0.06 s, and the error of
+    the model, with tenths of a second to seconds. The integrated correlation time of the sum is estimated on segments
+    of samples, from the residual. Since fitted parameters reduce the correlation of the residual, the residual is
+    corrected first (see `RigidProjection.errors`). The result is the mean of the estimate and the prior mean
+    `TUNING.correlation_time`, weighted with the numbers of independent errors.
 
-    The correlation time is estimated once, after the choice of the friction model, since the errors of a wrong friction
-    model last longer. Updates in the outer iterations would be unstable: a joint with a long correlation time has a
-    small weight, so that its residual grows, and the correlation time with the residual.
+    The correlation time is estimated only once. Updates in the outer iterations would be unstable: a joint with a long
+    correlation time has a small weight, so its residual grows, which makes the correlation time even longer.
     """
     segments, problem, prior_mean = estimate.on_segments(samples), estimate.problem, TUNING.correlation_time
     residual, projection = segments.linearize()
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # `weight` is the number of independent errors of the segments divided by the weight of the prior mean.
+    # `weight` is the weight of the estimate, if the weight of the prior mean is 1: a ratio of numbers of independent
+    # errors.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

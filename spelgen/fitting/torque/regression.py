@@ -1,4 +1,4 @@
-"""Ridge regression of the torque on the samples of a fit: the simple method that a fit may not be worse than."""
+"""Ridge regression of the torque on the samples of a fit, a simple method to which the fit is compared."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -19,17 +19,19 @@ from spelgen.fitting.torque.stages import initial_fit
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.settings.fits import GaussianPrior
 
-# Penalties on columns of length one; the smallest one is least squares.
+# [1] Penalties for columns scaled to unit length. With the smallest penalty, ridge regression is least squares.
 PENALTIES = np.logspace(-10, 2, 13)
-# m, h, I of a sphere of 1 kg with a radius of gyration of 0.1 m, whose centre is 0.1 m from the joint's axis.
+# Mass, first moments and inertia of a sphere of 1 kg. Its radius of gyration is 0.1 m, and its centre is 0.1 m from the
+# axis of the joint.
 DEFAULT_BODY = (1.0, 0.1, 0.0, 0.1, 0.02, 0.0, -0.01, 0.03, 0.0, 0.02)
 
 
 class Regression(NamedTuple):
-    """Ridge regression with the penalty of the smallest held-out error.
+    """Result of ridge regression with the penalty that has the smallest held-out error.
 
-    held_out: sum over joints of the squared torque residual of each block by the fit to all other blocks, divided by
-    the variances of the torques, (blocks,). torque: function that returns the joint torques (T, n) [Nm, N] of samples.
+    held_out: (blocks,) [1], sum over joints and samples of the squared torque residual of each block after a fit to all
+    other blocks, divided by the variance of the joint's torque. torque: function that predicts the joint torques (T, n)
+    [Nm, N] of samples.
     """
 
     held_out: np.ndarray
@@ -37,7 +39,9 @@ class Regression(NamedTuple):
 
 
 def best_regression(model: ArmModel, blocks: Sequence[TorqueSamples], torque_std: np.ndarray) -> Regression:
-    """Return the better one of two ridge regressions, with Coulomb friction from the velocity or the friction state.
+    """Return the better one of two ridge regressions, which has the smaller held-out error.
+
+    In one of them, Coulomb friction depends on the velocity, in the other on the friction state z.
 
     Args:
         model: model whose arm, drives and gains are used.
@@ -52,17 +56,17 @@ def best_regression(model: ArmModel, blocks: Sequence[TorqueSamples], torque_std
 def _regression(
     model: ArmModel, blocks: Sequence[TorqueSamples], torque_std: np.ndarray, friction: FrictionModel
 ) -> Regression:
-    """Return the regression with the columns of `identify`; other arguments: see `best_regression`."""
+    """Return the ridge regression for a friction model; other arguments: see `best_regression`."""
     motors, reach = motors_of(model).numpy(), bristle_reach(model).values
 
     def columns(x: SampleBlock) -> np.ndarray:
-        """Return the columns of bodies, armature, friction and offset, (T, n, K)."""
+        """Return the regressor of inertial parameters, armatures, friction and offsets, (T, n, K)."""
         bent = x.z.numpy() / reach if friction.memory and x.z is not None else None
         drives = friction.columns(x.qd.numpy(), x.qdd.numpy(), bent, motors)
         return np.concatenate([regressor_of(model.chain, x.q, x.qd, x.qdd).numpy(), drives], axis=2)
 
     def products(x: SampleBlock) -> np.ndarray:
-        """Return the Gram matrix (K + 1, K + 1) of columns and torque, each joint divided by `torque_std`."""
+        """Return the Gram matrix (K + 1, K + 1) of the regressor and the torque, divided by `torque_std` per joint."""
         rows = np.concatenate([columns(x), joint_torque(model, x).numpy()[..., None]], axis=2)
         rows = (rows / torque_std[:, None]).reshape(-1, rows.shape[2])
         return np.asarray(rows.T @ rows)
@@ -74,32 +78,35 @@ def _regression(
     grams, total = (gram / np.outer(scale, scale) for gram in (grams, total))
 
     def solution(gram: np.ndarray, penalty: float) -> np.ndarray:
-        """Return the weights (..., K + 1) of scaled columns, and -1 for the torque."""
+        """Return (..., K + 1): the weights of the scaled columns, then -1 as the weight of the torque.
+
+        The quadratic form of a Gram matrix with this vector is the squared residual.
+        """
         normal = gram[..., :-1, :-1] + penalty * np.eye(len(length))
         weights = np.linalg.solve(normal, gram[..., :-1, -1:])[..., 0]
         return np.concatenate([weights, np.full((*weights.shape[:-1], 1), -1.0)], axis=-1)
 
     def held_out(penalty: float) -> np.ndarray:
-        """Return the sum of the squared residual of each block by the solution for all others, (blocks,)."""
+        """Return the sum of the squared residual of each block after a fit to all other blocks, (blocks,)."""
         weights = solution(total - grams, penalty)
         return np.asarray(np.einsum("bk,bkl,bl->b", weights, grams, weights))
 
     penalty = min(PENALTIES, key=lambda penalty: float(held_out(penalty).sum()))
-    parameters = (solution(total, penalty) / scale)[:-1]  # of columns in their units
+    parameters = (solution(total, penalty) / scale)[:-1]  # weights of the unscaled columns
     return Regression(held_out(penalty), lambda x: columns(x) @ parameters)
 
 
 def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) -> None:
-    """Set the bodies of a model to the physically consistent projection of a regression.
+    """Set the bodies of a model to physically consistent bodies that approximate a regression.
 
-    The projection is a fit to the torques of the regression, with a wide prior about bodies of 1 kg: the prior at the
-    URDF is the reason why a fit is worse than a regression, for example if its centres of mass are in mm. Friction and
-    drives of the projection are discarded: a regression may have negative friction, which the projection would explain
+    They are fitted to the torques that the regression predicts, with a wide prior about bodies of 1 kg. The URDF is not
+    the prior mean: a wrong URDF, for example with centres of mass in mm, is why a fit is worse than a regression.
+    Friction and drives of this fit are discarded: a regression may have negative friction, which the fit would explain
     by drives that compensate friction.
     """
     with torch.no_grad():
         body = pseudo_inertia(torch.tensor([DEFAULT_BODY]).double())
-        relative = torch.linalg.solve(model.bodies.factors, body)  # C^-1 J
+        relative = torch.linalg.solve(model.bodies.factors, body)  # C^-1 J, with the pseudo-inertia J
         relative = torch.linalg.solve(model.bodies.factors, relative.mT)  # C^-1 J C^-T
         model.bodies.raw.copy_(log_cholesky_parameters(upper_cholesky((relative + relative.mT) / 2)))
         inputs = torch.linalg.pinv(model.input_matrix(samples.columns.q[:1])[0])

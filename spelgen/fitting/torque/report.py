@@ -57,7 +57,7 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
         )
     if residual_terms(model) is not None:
         yield Diagnostic("info", "residuals", "model", None, _selected_terms(samples, solution, names))
-    # a few positions suffice for the mean inertia
+    # A few positions suffice for the mean inertia.
     subset = samples.subsampled(50).columns
     inertia, std = posterior.uncertain(lambda other: _mean_inertia(other, subset.q))
     undetermined = std > TUNING.undetermined * inertia
@@ -79,8 +79,8 @@ def _warning(code: str, message: str, element: str = "logs") -> Diagnostic:
 
 
 def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
-    """Return a note with the common prior width of the bodies, or a warning if it shows that the URDF is wrong."""
-    # The log-Cholesky parameters are logarithms of mass and radii, so exp(width) is a factor of the mass.
+    """Return a note with the estimated prior width of the bodies, or a warning if the width is implausibly large."""
+    # A log-Cholesky parameter is the logarithm of the mass, so exp(width) is a factor of the mass.
     factor = float(np.exp(solution.prior.bodies))
     message = f"prior standard deviation of URDF masses: factor {factor:.2g}"
     if factor <= TUNING.wrong_urdf:
@@ -98,10 +98,10 @@ def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
 
 
 def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray:
-    """Return the median-unbiased nMSE of held-out blocks (n,).
+    """Return the nMSE of held-out blocks, (n,), corrected such that too small and too large values are as likely.
 
     The mean of few squared errors is more often too small than too large. The sum of the squared errors of S seconds is
-    assumed to be chi-squared with S degrees of freedom; the median of this distribution is below S.
+    assumed to be chi-squared with S degrees of freedom, so the nMSE is multiplied by S / median of this distribution.
     """
     seconds = samples.count * samples.interval / TUNING.segment
     # The correction is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve seconds.
@@ -114,10 +114,10 @@ def _few_data(
 ) -> Diagnostic:
     """Return the warning that the logs have too little motion for the parameters of some joints.
 
-    nmse: median-unbiased nMSE of held-out blocks, (n,).
+    nmse: (n,), nMSE of held-out blocks from `_likely_nmse`.
     """
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
-    # The nMSE due to parameter errors is inversely proportional to the duration of the motion.
+    # The recommended duration assumes that the nMSE is inversely proportional to the duration of the motion.
     enough = math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported)
     ridge = "" if comparison is None else f" (nMSE {comparison.regression:.2g}, mean over joints)"
     return _warning(
@@ -163,7 +163,7 @@ def _trained_gains(posterior: Posterior) -> Diagnostic:
 
 
 def _selected_terms(samples: TorqueSamples, solution: TorqueSolution, names: np.ndarray) -> str:
-    """Return a sentence with the selected terms and their error reductions."""
+    """Return a sentence with the selected residual terms and their error reductions."""
     if not solution.selected_terms:
         return "no residual terms selected (cross-validation)"
     parts = []
@@ -182,7 +182,7 @@ def _selected_terms(samples: TorqueSamples, solution: TorqueSolution, names: np.
 
 
 def terms_in_use(model: ArmModel) -> list[str]:
-    """Return a text for each residual term of a model that is not zero, with the joints on which it acts."""
+    """Return a text for each nonzero residual term of a model, with the joints on which the term acts."""
     names = model.joint_names
     residuals = residual_terms(model)
     if residuals is None:

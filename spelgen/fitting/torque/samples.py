@@ -1,4 +1,4 @@
-"""Samples of all logs that a model is fitted to, as tensors; blocks of bounded size limit the memory of fits."""
+"""Samples of all logs to which a model is fitted, as tensors; they can be divided into blocks to limit the memory."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 class SampleBlock(NamedTuple):
     """T samples: q, qd, qdd [rad, m, s] and tau as logged [Nm, N], all (T, n).
 
-    z: friction state, (T, n, K) [rad, m]. direction: direction in [-1, 1] of rate-only dry friction, (T, n) (see
-    `DynamicsSamples`). Both are None if unknown.
+    z: (T, n, K) [rad, m], friction state with K bristles per joint. direction: (T, n), direction of motion between -1
+    and 1, with which rate-only dry friction is computed (see `DynamicsSamples`). Both are None if unknown.
     """
 
     q: torch.Tensor
@@ -33,10 +33,12 @@ class SampleBlock(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TorqueSamples:
-    """Samples of all trajectories, concatenated.
+    """Concatenated samples of all trajectories.
 
-    original_count: number of samples before decimation and subsampling. interval: time between successive samples [s].
-    recordings: index of the recording of each sample, (T,).
+    Attributes:
+        original_count: number of samples before decimation and subsampling.
+        interval: time between successive samples [s].
+        recordings: (T,), index of the recording to which each sample belongs.
     """
 
     columns: SampleBlock
@@ -52,7 +54,7 @@ class TorqueSamples:
         recordings = []
         for x in trajectories:
             columns = (x.q, x.qd, x.qdd, x.tau, x.z, x.direction)
-            # A view would keep all samples in memory: copy the selected ones.
+            # The selected samples are copied, since a view would keep all samples in memory.
             decimated.append(
                 [None if column is None else np.ascontiguousarray(column[::decimation]) for column in columns]
             )

@@ -1,8 +1,8 @@
 """Selection of single-joint residual terms by cross-validation of the torque residual.
 
-If there are several recordings, whole recordings are held out. A single recording is divided into ten contiguous
-blocks, which are held out one at a time, with a gap on both sides, since successive errors are correlated. A candidate
-must pass three tests:
+Several recordings are held out one at a time, or in groups if there are more than ten. A single recording is divided
+into ten contiguous blocks, which are held out one at a time, with a gap on both sides, since successive errors are
+correlated. A candidate must pass three tests:
 
 - The mean relative error reduction over ten blocks is significant (one-sided t test, 1 %, or 0.1 % for one or two
   recordings).
@@ -10,9 +10,9 @@ must pass three tests:
   repeats errors that another motion does not have.
 - With one or two recordings, the torque of the candidate is plausible (`max_torques`).
 
-If no candidate of a joint passes, the first two tests are repeated with only those held-out samples whose positions are
-within the range of the fitted samples, since splines do not extrapolate. Of the accepted candidates of a joint, the one
-with the largest error reduction is selected.
+If no candidate of a joint passes, the first two tests use only the held-out samples whose positions are within the
+range of the fitted samples, since splines do not extrapolate. Of the accepted candidates of a joint, the one with the
+largest error reduction is selected.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -40,9 +40,11 @@ from spelgen.fitting.torque.tuning import SELECTION
 class SelectedTerm:
     """A selected residual term.
 
-    name: name of the parameter of the term, or `residual_potential` or `residual_mass`. joint: index of the joint; None
-    for networks. error_reduction: relative reduction of the held-out squared torque residual at the joints on which the
-    term acts.
+    Attributes:
+        name: name of the parameter of the term, or `residual_potential` or `residual_mass`.
+        joint: index of the joint; None for networks.
+        error_reduction: relative reduction of the held-out squared torque residual at the joints on which the term
+            acts.
     """
 
     name: str
@@ -51,13 +53,13 @@ class SelectedTerm:
 
 
 def can_split(count: int, correlation_length: float) -> bool:
-    """Return True if the halves of `count` samples are longer than the gap between them."""
+    """Return True if `count` samples are enough for two halves with a gap that is shorter than the first half."""
     first, last = split_halves(count, correlation_length)
     return bool(last.start - first.stop <= first.stop)
 
 
 def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
-    """Return slices of `count` samples: the first half without the gap at its end, and the last half."""
+    """Return two slices of `count` samples: the first half, shortened by a gap at its end, and the last half."""
     middle = count // 2
     return slice(0, max(0, middle - _gap(correlation_length))), slice(middle, count)
 
@@ -68,7 +70,7 @@ def _gap(correlation_length: float) -> int:
 
 
 def within_range(position: torch.Tensor, fitted: torch.Tensor) -> torch.Tensor:
-    """Return a mask of the positions (T, ...) within the range of fitted positions (T', ...)."""
+    """Return a mask (T, ...), True for positions within the range of the fitted positions (T', ...)."""
     return (position >= fitted.amin(dim=0)) & (position <= fitted.amax(dim=0))
 
 
@@ -81,13 +83,13 @@ def select_functions(
     recordings: torch.Tensor,
     torque_std: torch.Tensor,
 ) -> list[SelectedTerm]:
-    """Return the selected term of each joint that has an accepted candidate.
+    """Return the selected terms: at most one per joint, the best accepted candidate.
 
     Args:
         model: model with residual terms.
         samples: samples with the torque residual of the model, whose current residual terms are included.
         projection: projection onto the rigid-body and friction model.
-        selected: terms that were selected before, which are no candidates.
+        selected: (parameter, joint) of the terms that were selected before; they are no candidates.
         correlation_length: (n,) number of samples per independent error.
         recordings: (T,) index of the recording of each sample.
         torque_std: (n,) standard deviation of the torque [Nm, N].
@@ -97,9 +99,8 @@ def select_functions(
     for candidate in joint_functions(model, samples, projection):
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
-    # With two recordings, one is fitted and the other one is held out, so that several of the ten blocks have the
-    # errors of the same fit. The blocks are then not independent, and the stricter test is used, as for a single
-    # recording.
+    # With two recordings, each of two fits predicts half of the ten blocks, so the errors of the blocks are not
+    # independent. The stricter test is then used, as for a single recording.
     limits = None if int(recordings.max()) > 1 else max_torques(model, samples.q, torque_std)
     best = (
         _best(of_joint, samples.torque_residual, noise, float(length), recordings, limits)
@@ -109,11 +110,10 @@ def select_functions(
 
 
 def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Return the largest plausible standard deviations (n,) [Nm, N] of the torques of residual terms.
+    """Return {name of a term's parameter: bound of the standard deviation of the term's torque, (n,) [Nm, N]}.
 
-    The result is a dict whose keys are the names of the terms' parameters.
-    The bounds apply to terms that are selected on one or two recordings. Springs and gas cylinders balance a load, so
-    the bound of a smooth torque is zero for joints without gravity load.
+    The bounds apply to terms that are selected on one or two recordings. The bound of a smooth torque is zero for
+    joints without gravity load, since springs and gas cylinders balance a load.
 
     Args:
         model: fitted model.
@@ -134,13 +134,19 @@ def _best(
     recordings: torch.Tensor,
     limits: dict[str, torch.Tensor] | None,
 ) -> SelectedTerm | None:
-    """Return the accepted candidate of one joint with the largest error reduction, or None.
+    """Return the accepted candidate with the largest error reduction; None if no candidate is accepted.
 
-    torque_residual: (T, n) [Nm, N]. noise: (n,) [Nm, N]. recordings: index of the recording of each sample, (T,).
-    limits: result of `max_torques`, for one or two recordings; None: no bounds.
+    Args:
+        candidates: residual terms of one joint.
+        torque_residual: (T, n) [Nm, N].
+        noise: (n,) [Nm, N].
+        correlation_length: number of samples per independent error.
+        recordings: (T,), index of the recording of each sample.
+        limits: result of `max_torques` for one or two recordings; None: no bounds.
     """
     significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
-    # The halves test the largest extrapolation in time that a single recording allows.
+    # The second test is on halves: of all divisions, they have the largest distance in time between fitted and held-out
+    # samples.
     first, last = split_halves(len(torque_residual), correlation_length)
     best = best_within = None
     for candidate in candidates:
@@ -153,7 +159,7 @@ def _best(
         if reduction is None and reduction_within is None:
             continue
         weights = candidate.fit(target, correlation_length, first).coef
-        # An implausibly large torque is more likely a model error that repeats with the motion than a torque of the
+        # An implausibly large torque is probably a model error that repeats with the motion and not a torque of the
         # joint.
         if limits and candidate.torque(weights).std() > limits[candidate.parameter][candidate.joint]:
             continue
@@ -164,34 +170,34 @@ def _best(
         if reduction_within is not None and after[within].sum() < before[within].sum():
             accepted = SelectedTerm(candidate.parameter, candidate.joint, reduction_within)
             best_within = _better(best_within, accepted)
-    # A candidate that passes the tests on all held-out samples is preferred: its errors are also small at positions
-    # outside the fitted range, where most functions of position have large errors.
+    # A candidate that passes the tests on all held-out samples is preferred, since it also predicts the torque at
+    # positions outside the fitted range.
     return best or best_within
 
 
 def _better(first: SelectedTerm | None, other: SelectedTerm) -> SelectedTerm:
-    """Return the other term if its held-out error is clearly smaller, else the first one."""
-    # Splines, which come first, are preferred to ripple at similar errors: for a linear spring both reduce the
-    # error by similar amounts, but only splines extrapolate.
+    """Return the other term if its held-out error is clearly smaller (`preference_ratio`), otherwise the first one."""
+    # Candidates are tested in the order splines, friction factor, ripple. At similar errors splines are preferred to
+    # ripple: both fit the torque of a linear spring, but only splines extrapolate it.
     if first is None or 1 - other.error_reduction <= SELECTION.preference_ratio * (1 - first.error_reduction):
         return other
     return first
 
 
 def _blocks(count: int) -> list[slice]:
-    """Return contiguous blocks of `count` samples, one per fold."""
+    """Return the slices of ten contiguous blocks of `count` samples, one per fold."""
     edges = torch.linspace(0, count, SELECTION.folds + 1).long().tolist()
     return [slice(start, stop) for start, stop in pairwise(edges)]
 
 
 def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-    """Yield masks (T,) of the held-out and of the fitted samples, for each fold.
+    """Yield two masks (T,) per fold: the held-out samples, and the fitted samples.
 
-    recordings: index of the recording of each sample, (T,). gap: number of unused samples at both ends of a held-out
-    block.
+    recordings: (T,), index of the recording of each sample. gap: number of unused samples at both ends of a held-out
+    block of a single recording.
     """
-    # Recordings differ in day, load and motion, so errors differ more between recordings than between blocks of one
-    # recording: hold out whole recordings if possible.
+    # Whole recordings are held out if possible: they differ in day, load and motion, so their errors differ more than
+    # the errors of blocks of one recording.
     number = int(recordings.max()) + 1
     if number == 1:
         rows = torch.arange(len(recordings))
@@ -208,10 +214,10 @@ def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, t
 def _cross_validate(
     candidate: JointFunction, target: torch.Tensor, correlation_length: float, recordings: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the cross-validation error (T,) [Nm, N] and a mask (T,).
+    """Return the cross-validation error (T,) [Nm, N], and a mask (T,) of the samples without extrapolation.
 
-    The error at a sample is the error of the fit to the other folds. The mask marks the samples whose positions are
-    within the range of the positions that were fitted.
+    The error at a sample is the error of the fit to the other folds. The mask is True if the position of the sample is
+    within the range of positions of this fit.
     """
     position = candidate.position
     error, within = torch.zeros_like(target), torch.zeros_like(target, dtype=torch.bool)
@@ -223,7 +229,7 @@ def _cross_validate(
 
 
 def block_squares(values: torch.Tensor) -> torch.Tensor:
-    """Return the sum of squares of values (T, ...) per block, (folds,)."""
+    """Return the sum of the squared values (T, ...) of each of ten contiguous blocks, (folds,)."""
     squares = [values[block].square().sum() for block in _blocks(len(values))]
     return torch.stack(squares)
 
@@ -233,9 +239,9 @@ def significant_reduction(
 ) -> float | None:
     """Return the relative reduction of squared errors, or None if it is not significant.
 
-    The t test is on g = (before - after) / (before + after) of each block. g is between -1 and 1, so that neither a
-    block of large torques nor a block of extrapolation dominates the variance. A negligible part of the mean square is
-    added to the denominator, so that g is zero for blocks without torque.
+    A t test is applied to g = (before - after) / (before + after) of all blocks. g is between -1 and 1, so that no
+    single block dominates the variance, for example one with large torques or with extrapolation. A negligible number
+    is added to the denominator, so that g is zero for blocks without torque.
 
     Args:
         before: sum of squared errors of each block without the term, (folds,).
@@ -243,12 +249,12 @@ def significant_reduction(
         standard_errors: value of t that the mean of g over the blocks must exceed.
     """
     negligible = 2 * SELECTION.min_reduction * before.mean()
-    # g is antisymmetric: for halved and for doubled squared errors it has opposite values.
+    # If a term halves the squared error of one block and doubles the squared error of another, their g add up to zero.
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:
         return None
     mean = float(g.mean())
-    # The relative reduction (before - after) / before is computed from the mean of g.
+    # From g = (before - after) / (before + after) follows (before - after) / before = 2 g / (1 + g).
     reduction = 2 * mean / (1 + mean)
     return reduction if reduction > SELECTION.min_reduction else None

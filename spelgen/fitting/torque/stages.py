@@ -26,11 +26,11 @@ EFFECT_GROUPS = ("effects", "load_dependence")
 
 
 def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
-    """Fit all parameters from the prior mean.
+    """Fit the free parameters from the prior mean; return the MAP estimate.
 
-    If the residual of some joints shows a friction compensation, the fit restarts with trained compensation at these
-    joints, until no further joint shows one. Without restarts, other parameters would absorb the compensation, and the
-    fit would not recover.
+    If the torque residual of some joints shows a friction compensation of the drive, the fit is restarted with trained
+    compensation at these joints, until no further joint shows one. Without a restart, the other parameters would remain
+    at values that have absorbed the compensation.
     """
     problem, state = _annealed_fit(problem, 0)
     while problem.adapt is None and (further := find_compensation(problem, state.x)).any():
@@ -39,19 +39,20 @@ def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
     estimate = alternate(problem, state)
     if problem.adapt is not None or estimate.problem.prior.plausible or problem.compensated.all():
         return estimate
-    # The fitted masses differ implausibly from the URDF (`ParameterPrior.plausible`). More likely the drives compensate
-    # friction, and the masses absorbed the compensation: refit with compensation at all joints.
+    # Here the fitted masses differ implausibly from the URDF (see `ParameterPrior.plausible`). A probable reason is
+    # that the drives compensate friction and the masses absorbed the compensation. The fit is repeated with
+    # compensation at all joints, and kept if it is plausible.
     problem = replace(problem, compensated=torch.ones_like(problem.compensated))
     compensated = alternate(*_annealed_fit(problem, estimate.state.steps))
     return compensated if compensated.problem.prior.plausible else estimate
 
 
 def _annealed_fit(problem: TorqueProblem, steps: int) -> tuple[TorqueProblem, State]:
-    """Fit from the prior mean by noise annealing; steps: number of solver steps before this fit.
+    """Fit from the prior mean by noise annealing; return the problem and the last state of the solver.
 
-    Far from the optimum, the cost at the least-squares noise is a narrow curved valley, along which steps are small.
-    Larger noise widens the valley and allows larger steps. The noise starts at a fraction of the torque residual, and
-    falls with the residual to the least-squares noise.
+    With the small noise of least squares, the cost far from the optimum is a narrow curved valley, along which steps
+    are small. Larger noise widens the valley and allows larger steps. Therefore the noise is a fraction of the current
+    torque residual until this is below the least-squares noise. steps: number of solver steps before this fit.
     """
     estimator, mean = problem.noise_estimator, problem.prior.mean
     problem = problem.with_least_squares_noise(mean)
@@ -66,7 +67,7 @@ def _annealed_fit(problem: TorqueProblem, steps: int) -> tuple[TorqueProblem, St
 
 
 def _least_squares_noise_fit(problem: TorqueProblem, state: State) -> tuple[TorqueProblem, State]:
-    """Fit from a state, with the noise of unconstrained least squares linearized at this state."""
+    """Fit from a state with the least-squares noise at this state (see `with_least_squares_noise`)."""
     problem = problem.with_least_squares_noise(state.x)
     state = initial_state(problem, state.x, steps=state.steps)
     return problem, problem.minimize(state, TUNING.initial_steps).state
@@ -75,13 +76,18 @@ def _least_squares_noise_fit(problem: TorqueProblem, state: State) -> tuple[Torq
 def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     """Return the joints (n,) whose residual at x (K,) shows a friction compensation that is not modelled yet.
 
-    Friction cannot explain a torque that decreases with velocity. A drive that compensates friction after the torque
-    was measured adds such a torque. The residual is regressed on velocity; the slope must be negative and significant.
-    Both are first regressed on position: the torque of a spring is correlated with velocity in a motion that does not
-    return to its first position. The torque of the regression line must also be a visible part of the measured torque,
-    since a delay of some milliseconds between torque and motion causes a smaller negative slope. The drives of an arm
-    are similar: if one of them compensates friction, a negative slope of more than one standard deviation, without the
-    regression on position, suffices for the others, whose parameters may have absorbed a part of the compensation.
+    A drive may add a torque that compensates friction after the torque was measured. The residual then decreases with
+    velocity, which friction cannot explain. Criteria for a joint:
+
+    - The residual is regressed on velocity. The slope is negative and significant.
+    - Before this, both are regressed on position: in a motion that does not return to its first position, the torque
+      of a spring is correlated with velocity.
+    - The torque of the regression line is a visible part of the measured torque: a delay of some milliseconds between
+      torque and motion causes a smaller negative slope.
+
+    The drives of an arm are similar. If one of them is known to compensate friction, a negative slope of more than one
+    standard deviation, without the regression on position, suffices for the others: their parameters may have absorbed
+    a part of the compensation.
     """
     samples = problem.jacobian.residual_samples(x)
     residual, qd, estimator = samples.torque_residual, samples.qd, problem.noise_estimator
@@ -110,15 +116,15 @@ def _without_line(values: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
 
 
 def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
-    """Choose per joint between rate-only friction, which the given estimate has, and friction with bristle states.
+    """Choose per joint between rate-only friction and friction with bristle states; return the new estimate.
 
-    The force of bristles reverses over a displacement, hence later than the velocity. At joints whose friction reverses
-    with the velocity, the delayed force would be confounded with inertia. The choice is by the evidence (see
-    `_rejected`).
+    ``estimate`` has rate-only friction. The force of bristles reverses over a displacement, later than the velocity. At
+    joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The marginal
+    likelihoods of both fits decide (see `_rejected`).
     """
     friction = estimate.problem.jacobian.model.friction
     friction.memoryless.fill_(0.0)
-    # Bristles explain more than rate-only friction, so the noise is estimated again.
+    # The noise is estimated again, since bristles explain more of the torque than rate-only friction does.
     problem, state = _least_squares_noise_fit(estimate.problem, estimate.state)
     hysteretic = alternate(problem, state)
     evidence = log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic)
@@ -134,18 +140,18 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
 
 
 def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
-    """Choose the joints with Stribeck effect, saturation and load dependence of friction.
+    """Choose the joints with Stribeck effect, saturation and load dependence of friction; return the new estimate.
 
     The coefficients of these effects are constrained to be positive, so noise biases all of them upwards. The effects
-    are removed at joints where they do not improve the likelihood enough for one additional parameter.
+    are removed at joints at which they do not improve Akaike's criterion with one parameter (see `_rejected`).
     """
     rigid = estimate.problem.jacobian.rigid
     index = rigid.unflatten(torch.arange(len(estimate.state.x)))
     effects = torch.stack(
         [index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1
-    )  # (n, effects): indices in x
+    )  # (n, effects), indices of the coefficients in x
     plain = _without(estimate, effects.flatten())
-    # penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974)
+    # 2 is the penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
     rejected = _rejected(log_likelihood_ratio(estimate, plain) - 2)
     if rejected.all():
         return plain
@@ -153,7 +159,7 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
 
 
 def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
-    """Refit with negligible friction coefficients at the given indices (k,) of x."""
+    """Return a refit in which the friction coefficients at the given indices (k,) of x are negligible."""
     problem, x, mean = estimate.problem, estimate.state.x.clone(), estimate.problem.prior.mean.clone()
     # The prior mean is changed, too: otherwise the prior would restore the coefficients.
     mean[indices] = x[indices] = NEGLIGIBLE
@@ -163,38 +169,39 @@ def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
 
 
 def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> torch.Tensor:
-    """Return 2 log(L(estimate) / L(other)) per joint, (n,), each likelihood L at its maximum-likelihood noise.
+    """Return 2 log(L(estimate) / L(other)) of each joint, (n,), with the likelihood L of the joint's torque.
 
-    Positive values favour `estimate`.
+    Each likelihood is computed with the noise that maximizes it. Positive values favour `estimate`.
     """
     samples = estimate.problem.jacobian.samples
-    # At the maximum-likelihood noise of each estimate, the result is the number of independent errors times the log
-    # of the ratio of squared residuals.
+    # With the noise that maximizes each likelihood, the ratio depends only on the squared residuals and on the number
+    # of independent errors.
     errors = samples.count * min(1.0, samples.interval / TUNING.reversal_correlation_time)
     return errors * (other.state.residual / estimate.state.residual).log()
 
 
 def fraction_occam_factor(estimate: TorqueEstimate) -> torch.Tensor:
-    """Return -2 log(Occam factor) of the bristle fractions per joint, (n,).
+    """Return -2 log(Occam factor) of the bristle fractions of each joint, (n,).
 
-    The value is log det of their prior covariance minus log det of their posterior covariance (MacKay, 1992). The
-    evidence of a model is its likelihood times the Occam factor, which accounts for the noise that free parameters
-    explain.
+    The marginal likelihood of a model is its likelihood times the Occam factor, which accounts for the noise that free
+    parameters explain (MacKay, 1992). The result is log det of the prior covariance of the fractions minus log det of
+    their posterior covariance.
     """
     rigid = estimate.problem.jacobian.rigid
     (name,) = rigid.names("fractions")
-    fractions = rigid.unflatten(torch.arange(len(estimate.state.x)))[name]  # (n, elements): indices in x
+    fractions = rigid.unflatten(torch.arange(len(estimate.state.x)))[name]  # (n, elements), indices in x
     block = fractions.unsqueeze(-1), fractions.unsqueeze(-2)
     prior: torch.Tensor = torch.linalg.inv(estimate.problem.prior.precision)[block]
     return prior.logdet() - estimate.covariance[block].logdet()
 
 
 def _rejected(evidence: torch.Tensor) -> torch.Tensor:
-    """Return the joints (n,) at which a model is rejected; evidence: twice the log evidence for the model, (n,).
+    """Return a mask (n,), True for joints at which a model of friction is rejected.
 
-    The gears of an arm have similar friction, so joints with weak evidence use the sum over all joints. If the sum
-    favours the model, it is rejected only at joints with strong evidence against it. Otherwise it is rejected at all
-    joints without strong evidence for it.
+    If the sum of the evidence over all joints favours the model, it is rejected only at joints with strong evidence
+    against it. Otherwise it is rejected at all joints without strong evidence for it: the gears of an arm have similar
+    friction, so the sum decides at joints with weak evidence. evidence: (n,), twice the log of the likelihood ratio;
+    positive values favour the model.
     """
     return evidence < -TUNING.strong_evidence * evidence.sum().sign()
 
@@ -204,9 +211,9 @@ def fit_residual_terms(
 ) -> tuple[TorqueEstimate, list[SelectedTerm]]:
     """Select residual terms on samples, and fit them together with the rigid-body parameters.
 
-    Single-joint terms are selected first, in passes. Each pass is followed by a refit of the rigid-body parameters,
-    which improves the residual for the selection of further terms. Networks, which act on several joints, are selected
-    last, on the residual of the model with the selected single-joint terms.
+    Single-joint terms are selected first, in passes. After each pass, the rigid-body parameters are refitted, so that
+    further terms are selected on a better residual. Networks act on several joints and are selected last, on the
+    residual of the model with the selected single-joint terms.
     """
     model = estimate.problem.jacobian.model
     if samples is not estimate.problem.jacobian.samples:
@@ -223,7 +230,8 @@ def fit_residual_terms(
         estimate = _refit(estimate, samples, selected).with_current_covariance()
     residual_samples = estimate.problem.jacobian.residual_samples(estimate.state.x)
     selected += select_networks(model, residual_samples, float(correlation_length.max()))
-    # Friction factors and networks are not eliminated by variable projection: alternate with the rigid-body fit.
+    # Friction factors and networks are not eliminated by variable projection. Their fits and the rigid-body fit are
+    # therefore alternated.
     for _ in range(TUNING.alternations if selected else 0):
         estimate = _refit(estimate.with_current_covariance(), samples, selected)
     return estimate, selected
@@ -232,7 +240,7 @@ def fit_residual_terms(
 def _refit(
     estimate: TorqueEstimate, samples: TorqueSamples, selected: Sequence[SelectedTerm]
 ) -> TorqueEstimate:
-    """Refit the selected single-joint terms, then rigid-body parameters and position-dependent torques together."""
+    """Refit friction factors, then rigid-body parameters and position-dependent torques together."""
     model, correlation_length = estimate.problem.jacobian.model, estimate.problem.correlation_length
     projected = refit_terms(model, *estimate.linearize(), _keys(selected), correlation_length)
     estimate = refine(estimate, samples, projected.terms)

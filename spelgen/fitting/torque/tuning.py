@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
-# [1] Standard deviations by which the friction parameters (logarithms, fractions) of an arm vary from day to day.
+# [1] Standard deviations of the friction parameters of one arm on different days, as options of `GaussianPrior`.
 DAY_TO_DAY = {
     "sizes": 0.1,
     "velocities": 0.1,
@@ -21,7 +21,7 @@ DAY_TO_DAY = {
 class TorqueTuning:
     """Constants of fits of rigid-body models to torques (`fitting.torque`)."""
 
-    # [1] Only every n-th sample is used: after the filter at 8 Hz, 50 of 100 samples per second contain all
+    # [1] Only every second sample is used. After the low-pass filter at 8 Hz, 50 of 100 samples per second contain all
     # information.
     decimation: int = 2
     # [s] Prior mean of the correlation time of torque errors, from recordings of arms. Samples within a correlation
@@ -34,15 +34,16 @@ class TorqueTuning:
     correlation_weight: float = 30.0
     # [s] Duration of the segments from which the correlation time is estimated.
     segment: float = 1.0
-    # [1] Largest estimated prior width: masses and armatures are known to a factor of 20, torque offsets to three times
-    # the typical friction. Logs that need a wider prior are not of the URDF's arm, or not in Nm.
+    # [1] Upper bound of an estimated prior standard deviation: exp(3) is a factor of 20 for masses and armatures; for
+    # torque offsets it is three times the typical friction. Logs that need more are of another arm than the URDF, or
+    # not in Nm.
     max_width: float = 3.0
-    # [1] Largest number of outer iterations, which alternate steps with estimates of noise and prior.
+    # [1] Largest number of outer iterations; each makes solver steps and then estimates noise and prior.
     iterations: int = 20
-    # [1] Twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773,
-    # 1995).
+    # [1] Evidence, twice the logarithm of a likelihood ratio, that counts as strong (Kass and Raftery, J. Am. Stat.
+    # Assoc. 90:773, 1995).
     strong_evidence: float = 6.0
-    # [1] Largest number of steps before noise and prior are estimated.
+    # [1] Largest number of solver steps after noise annealing, before noise and prior are estimated.
     initial_steps: int = 60
     # [1] Largest number of iterations of noise annealing, which lowers the noise to the least-squares noise.
     annealing_iterations: int = 12
@@ -59,7 +60,7 @@ class TorqueTuning:
     alternations: int = 3
     # [1] Number of evenly spaced samples in the stages before the selection of residual terms; the final fit uses all.
     initial_samples: int = 2**10
-    # [1] Largest number of windows of 5 samples from which the scales of the motion are computed.
+    # [1] Largest number of windows of 5 samples from which the scales of the validation loss are computed.
     max_windows: int = 2**12
     # [1] Largest number of windows on which the fitted model is validated.
     validation_windows: int = 2**8
@@ -77,26 +78,27 @@ class TorqueTuning:
     # [B] Memory of the regressors, which limits the number of samples to 70,000 for six joints. Larger logs are
     # subsampled.
     regressor_bytes: float = 4e8
-    # [1] Largest step of a body's inertial parameters, as a fraction of the step to physically inconsistent parameters.
+    # [1] Largest step of a body's inertial parameters, as a fraction of the step that would make them physically
+    # inconsistent.
     body_step: float = 0.3
     # [1] A warning names inertias whose relative standard deviation exceeds this value.
     undetermined: float = 0.5
-    # [1] A warning names motor gains whose relative standard deviation exceeds this value: the 95 % interval is then
-    # wider than +-20 %, which is the difference between two datasheets.
+    # [1] A warning names motor gains whose relative standard deviation exceeds this value. The 95 % interval is then
+    # wider than +-20 %, a typical difference between two datasheets.
     undetermined_gain: float = 0.1
     # [1] A warning names joints whose nMSE of held-out blocks exceeds this value.
     unsupported: float = 0.5
-    # [1] A warning states that the URDF is wrong if the prior standard deviation of its masses exceeds this factor.
+    # [1] The URDF is implausible if exp(prior standard deviation of the logarithms of its masses) exceeds this factor.
+    # The fit then tries friction compensation at all joints, and a warning is issued.
     wrong_urdf: float = 5.0
-    # [1] A warning names joints whose torque residual divided by the inertial torque exceeds this value: the predicted
-    # motion is then unreliable.
+    # [1] A warning names joints whose RMS torque residual divided by the RMS inertial torque exceeds this value: their
+    # predicted motion is unreliable.
     weak_acceleration: float = 2.0
     # [1] Prior standard deviations of an adapted fit, for each value of the option `adapt`; the prior mean is the
-    # source fit. load: the mass is known to a factor of twenty. With the standard deviation 10, the mean squared torque
-    # error after a fit to half a second of motion of a UR10e is 27 times the variance of the torque. friction:
-    # temperature changes the common factor of all joints by tens of per cent, the factors of single joints by less
-    # (Bittencourt and Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: arms of one model also differ in
-    # mass, by a few per cent.
+    # source fit. load: exp(3) is a factor of twenty for the mass. A larger value is too wide for short logs: with 10, a
+    # fit to half a second of motion of a UR10e predicts torques with an nMSE of 27. friction: temperature changes the
+    # common factor of all joints by tens of per cent, the factors of single joints by less (Bittencourt and Gunnarsson,
+    # J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: arms of the same type also differ in mass, by a few per cent.
     priors: Mapping[Adaptation, GaussianPrior] = field(
         default_factory=lambda: {
             "load": GaussianPrior(bodies=3.0),
@@ -112,23 +114,24 @@ class ResidualTuning:
 
     # [1] Number of contiguous blocks of samples, each of which is held out once.
     folds: int = 10
-    # [1] Gap between fitted and held-out samples, in correlation times.
+    # [1] Gap between fitted and held-out samples, divided by the correlation time of the torque errors.
     gap: float = 2.5
-    # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
-    # degrees of freedom.
+    # [1] Smallest t value of the mean error reduction over the blocks: p = 0.01 for Student's t with nine degrees of
+    # freedom.
     standard_errors: float = 2.82
-    # [1] `standard_errors` for one or two recordings, whose motion may repeat model errors: p = 0.001.
+    # [1] Smallest t value of the mean error reduction with one or two recordings, for p = 0.001. It is larger than
+    # `standard_errors`, since their motion may repeat the errors of the model.
     standard_errors_of_one: float = 4.30
     # [1] Largest standard deviation of a position-dependent torque that is selected on one or two recordings, as a
     # fraction of the standard deviation of the joint's torque.
     max_torque_fraction: float = 0.5
-    # [1] A joint has no spring that balances its load if the standard deviation of its gravity torque is below this
-    # fraction of the standard deviation of its torque.
+    # [1] Smallest standard deviation of a joint's gravity torque for which a spring at this joint is plausible, as a
+    # fraction of the standard deviation of the joint's torque.
     min_load_fraction: float = 0.1
     # [1] Smallest error reduction of a residual term.
     min_reduction: float = 1e-3
-    # [1] A candidate replaces the best candidate of a joint so far only if its held-out squared residual is below this
-    # fraction of the best candidate's. Candidates are tested in the order splines, friction factor, ripple.
+    # [1] A candidate replaces the best previous candidate of a joint only if its held-out squared residual is below
+    # this fraction of the previous one. The order of the candidates is splines, friction factor, ripple.
     preference_ratio: float = 0.9
     # [1] Largest number of samples to which networks are fitted.
     network_samples: int = 2**12
