@@ -201,7 +201,7 @@ def test_its_report_shows_servos_and_replays_and_no_torques(fitted, results):
         '<h2 id="servos">Servos</h2>' in page
         and re.search(f"<td[^>]*>{kd}", page)
         and "dry/kp of elbow" in told
-        and "divided by kp of the first joint" in told
+        and f"ratios to kp of {fitted.posterior.scale_joint}" in told
         and f"{fitted.posterior.drives['kp'][0].text} Nm/rad" in told
     )
     assert "<td>command [rad]</td>" in page
@@ -303,7 +303,8 @@ def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
         posterior.torque(*np.zeros((3, 1, 2)))
     assert spelgen.load_run(fitted.folder).posterior.to_dict() == posterior.to_dict()
     text = "".join(table.text() for table in posterior.listings)
-    assert "divided by kp of the first joint" in " ".join(text.split()) and "Delay of the commands" in text
+    assert f"ratios to kp of {posterior.scale_joint}" in " ".join(text.split())
+    assert "Delay of the commands" in text
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 PRECISE = ("firm", "fair")
 """Classes of intervals that the logs determine to 20 % or better."""
 PER_KP = "/kp"
-"""Ending of the names of base parameters that are divided by kp of the first joint."""
+"""Ending of the names of base parameters that are ratios to kp of `Posterior.scale_joint`."""
 
 
 class Uncertain(NamedTuple):
@@ -145,20 +145,27 @@ class Posterior:
     def base_parameters(self) -> tuple[Interval, ...]:
         """95 % intervals of the base parameters: identifiable combinations of inertial parameters and armatures.
 
-        Under position servos of unknown gains, they are divided by kp of the first joint.
+        Under position servos of unknown gains, they are ratios to kp of one joint, `scale_joint`.
         """
         names, combination = self._base
-        scaled = self._open_scale
-        values, roots = (
-            self.propagate(lambda model: combination @ _constants(model) / model.servo.kp()[0])
-            if scaled
-            else (combination @ factor for factor in self._constants)
-        )
+        values, roots = (combination @ factor for factor in self._constants)
+        joint = self._scale_index
+        if joint is not None:
+            names = tuple(f"{name}{PER_KP}" for name in names)
+            values, roots = _ratios(Propagated(values, roots), self._stiffness, joint)
         rows = zip(names, values.tolist(), roots.norm(dim=1).tolist(), strict=True)
         return tuple(
-            Interval(f"{name}{PER_KP}" if scaled else name, value, std, "" if scaled else base_unit(name))
-            for name, value, std in rows
+            Interval(name, value, std, base_unit(name) if joint is None else "") for name, value, std in rows
         )
+
+    @property
+    def scale_joint(self) -> str | None:
+        """Name of the joint whose kp divides the base parameters; None if they are not divided.
+
+        Positions under servos determine masses and friction only relative to kp, unless a kp is known. The ratios to
+        kp of this joint have the smallest errors (median of the relative standard deviations).
+        """
+        return None if self._scale_index is None else self.model.joint_names[self._scale_index]
 
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
@@ -187,7 +194,8 @@ class Posterior:
             # The errors of the two terms are then correlated by less than -1/2.
             if all(term is not None and total.std < term.std for term in terms)
         ]
-        return tuple(single + pairs + ["a common factor of kp and all masses"] * self._open_scale)
+        common = [] if self._scale_index is None else ["a common factor of kp and all masses"]
+        return tuple(single + pairs + common)
 
     @cached_property
     def drives(self) -> dict[str, tuple[Interval, ...]]:
@@ -227,7 +235,7 @@ class Posterior:
             f"{len(self.base_parameters) - len(determined)} more are not determined to 20 %. Unidentifiable on their "
             f"own: {', '.join(self.unidentifiable) or 'none'}."
         )
-        unit = "kg, m, divided by kp of the first joint" if self._open_scale else "kg, m"
+        unit = "kg, m" if self.scale_joint is None else f"kg, m; ratios to kp of {self.scale_joint}"
         title = f"Base parameters [{unit}], with half 95 % intervals; numbers after names: joint"
         columns = {"joint": list(self.model.joint_names), **self.drive_columns}
         drives = tuple(zip(*columns.values(), strict=True))
@@ -276,10 +284,19 @@ class Posterior:
         """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance."""
         return self.propagate(_constants)
 
-    @property
-    def _open_scale(self) -> bool:
-        """True under position servos of unknown gains: positions determine masses and friction only relative to kp."""
-        return self.model.input_quantity == "position" and bool(self.model.servo.trained.all())
+    @cached_property
+    def _stiffness(self) -> Propagated:
+        """kp of all servos, (n,) [Nm/rad, N/m]."""
+        return self.propagate(lambda model: model.servo.kp())
+
+    @cached_property
+    def _scale_index(self) -> int | None:
+        """Index of `scale_joint`."""
+        if self.model.input_quantity != "position" or not self.model.servo.trained.all():
+            return None
+        base = Propagated(*(self._base[1] @ factor for factor in self._constants))
+        ratios = [_ratios(base, self._stiffness, joint) for joint in range(self.model.n)]
+        return int(np.argmin([float((root.norm(dim=1) / value.abs()).median()) for value, root in ratios]))
 
     def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         return constants_regressor(self.model.chain, motors_of(self.model), q, qd, qdd)
@@ -328,6 +345,13 @@ def posterior_of(
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     std = None if torque_std is None else torque_std.numpy()
     return Posterior(model, covariance, std, late if delay else None)
+
+
+def _ratios(values: Propagated, divisors: Propagated, joint: int) -> Propagated:
+    """Return the ratios of values (r,) to one of the divisors (n,)."""
+    divisor, root = divisors.value[joint], divisors.root[joint]
+    ratio = values.value / divisor
+    return Propagated(ratio, (values.root - ratio.outer(root)) / divisor)
 
 
 def _constants(model: ArmModel) -> Tensor:

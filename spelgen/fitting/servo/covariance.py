@@ -16,10 +16,10 @@ def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content
     """Return `Checkpoint.posterior` of a servo fit: the covariance (K, K) of the parameters of a `ParameterVector`.
 
     The covariance of the fitted parameters is scaled such that 1.96 standard deviations are half of Student's 95 %
-    interval. The deviations of the form of the friction model, and the prior of the directions of the bodies that are
-    not fitted, are added. If no kp is known, the standard deviation of a common factor of all torques is at least the
-    one of the prior of masses: effort limits may determine this factor in the logs, but limits of URDFs are often not
-    those of the motors.
+    interval. Two covariances are added: of the deviations of the form of the friction model, and the prior covariance
+    of the directions of the bodies that are not fitted. If no kp is known, the standard deviation of a common factor of
+    all torques is at least the prior standard deviation of masses: effort limits may determine this factor in the logs,
+    but the limits in URDFs often differ from the limits of the motors.
     """
     parameters, model = problem.parameters, problem.rollouts.model
     vector, directions = ParameterVector(model), parameters.directions
