@@ -301,7 +301,9 @@ def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
             assert 0.5 < (stated.high - value) / (high - value) < 1.05
     with pytest.raises(RunError, match="got intervals of torques, expected a fit to logs with torques"):
         posterior.torque(*np.zeros((3, 1, 2)))
-    assert spelgen.load_run(fitted.folder).posterior.to_dict() == posterior.to_dict()
+    again = spelgen.load_run(fitted.folder).posterior
+    for one, other in zip(again.base_parameters, posterior.base_parameters, strict=True):
+        assert one.name == other.name and one.high == pytest.approx(other.high, rel=1e-6, abs=1e-12)
     text = "".join(table.text() for table in posterior.listings)
     assert f"ratios to kp of {posterior.scale_joint}" in " ".join(text.split())
     assert "Delay of the commands" in text
