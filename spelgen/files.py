@@ -45,7 +45,8 @@ def read_bytes(
         do: advice for a file that is too large.
     """
     try:
-        # The size is checked before reading: a sparse file can state many gigabytes without occupying disk space.
+        # The size of the file is checked before it is read: a sparse file can have many gigabytes without occupying
+        # disk space.
         size = path.stat().st_size
         require_regular_file(path, error, kind)
         # The parsers of JSON and Python cannot be interrupted, so the size of their input is limited.
@@ -236,7 +237,7 @@ def _fetch(address: str) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="spelgen-"))
     # Copies are removed at the end of the process; written results were sent to the address before.
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    # The copy keeps the name of the original, because the suffix selects the reader.
+    # The local copy of a remote file has the same name, because the suffix of the name selects the reader.
     copy = _inside(folder, address.rpartition("/")[2], address)
     with reached(address) as (system, remote):
         if system.isdir(remote):

@@ -34,7 +34,7 @@ class Listing:
         """Return the table for a terminal or a file, without a line end."""
         columns = list(map(list, zip(self.head, *self.rows, strict=True)))
         tables = "\n\n".join(self._layout(columns, group) for group in _groups(_fitted(columns)))
-        # The note is indented like the rows, so that titles, which are not indented, are easy to find.
+        # The note below a table is indented like the rows, so that titles, which are not indented, are easy to find.
         note = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
         return "\n".join([*textwrap.wrap(self.title, WIDTH), tables, *note])
 

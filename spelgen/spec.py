@@ -231,7 +231,8 @@ def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
                 f"a specification of format {version!r}", file=file, expected=expected, do=again
             )
         spec = TypeAdapter(ModelSpec).validate_python(content)
-        # The result is converted back to JSON and compared, because pydantic converts values and ignores unknown keys.
+        # The specification is converted back to JSON and compared with the text, because pydantic converts values and
+        # ignores unknown keys.
         if json.loads(spec.to_json()) == {"format": version, **content}:
             return spec
         # A difference between file and specification is an error: the model would not be the one that the file

@@ -69,7 +69,7 @@ def _ray(jobs: int, address: str | None) -> Iterator[ModuleType]:
         raise RunError("several runs at a time without Ray", expected="the extra parallel", do=do)
     # Ray must not send usage statistics.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # This value avoids a warning of Ray about a changed default.
+    # The value "0" avoids a warning of Ray about a changed default of this variable.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     import ray
 

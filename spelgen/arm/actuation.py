@@ -177,7 +177,7 @@ def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[
     errors = []
     for coupling in settings.couplings:
         locked = [name for name in coupling.joints if name not in joints]
-        # A coupling whose joints are all locked belongs to another arm of the robot.
+        # A coupling whose joints are all locked is skipped: it belongs to another arm of the robot.
         if len(locked) == len(coupling.joints):
             continue
         free.difference_update(coupling.joints)

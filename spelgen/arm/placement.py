@@ -200,9 +200,9 @@ class Placement:
         return frame.body, rotation, self._seen_from_both(rotation, frame.position)
 
     def inertia(self, link: UrdfLink, inertial: Inertial) -> TenVector:
-        """Return the inertial parameters (m, m c, I) of a link, (10,) [kg, kg m, kg m2].
+        """Return the inertial parameters (m, m c, I) of a link in the frame of its body, (10,) [kg, kg m, kg m2].
 
-        They are about the origin of the frame of the link's body, in this frame (parallel-axis theorem).
+        m: mass; c: center of mass; I: inertia about the origin of the frame, by the parallel-axis theorem.
         """
         where = f"link {link.name!r} inertial origin"
         origin = self._rounding.origin(inertial.com, inertial.rpy, where, inertial.line)

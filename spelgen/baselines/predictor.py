@@ -1,4 +1,4 @@
-"""Predictors of the motion of an arm, under torques or under position commands, and the integration of dynamics."""
+"""Predictors of the motion of an arm under torques or position commands, and an integrator for stiff friction."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,13 +18,16 @@ GAMMA = 1 - 0.5**0.5  # The Rosenbrock method is L-stable with this parameter.
 
 
 State = tuple[Tensor, Tensor, Tensor]
-"""Positions q and velocities qd, (W, n) each [rad, m], and the friction state z, (W, n, K)."""
+"""Positions q [rad, m] and velocities qd [rad/s, m/s] of W windows, (W, n) each, and the friction state z of K
+bristles per joint, (W, n, K) [rad, m]."""
 
 
 def roll_out_stiff(
     dynamics: object, windows: Windows, substeps: int, disturbance: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return predicted positions and velocities (W, K-1, n) at samples 1..K-1, from sample 0 of each window.
+    """Return predicted positions and velocities, (W, K-1, n) each, of W windows of K samples.
+
+    Sample 0 of a window is the initial state; samples 1 to K-1 are predicted.
 
     Method: ROS2, a Rosenbrock method. It has order two for any approximation of the Jacobian, and is L-stable with the
     exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the approximation is
@@ -60,14 +63,17 @@ def _stepper(
 ) -> Callable[[State, Tensor, Tensor], State]:
     """Return a function that computes one integrator step of M qdd = force from (state, torque, step length).
 
-    width: finite-difference steps of velocity for the Jacobian of friction, (n,) [rad/s, m/s]. disturbance: (W, n), a
-    force [Nm, N] if the state of the dynamics contains momenta, else an acceleration [rad/s^2, m/s^2].
+    Args:
+        dynamics: dynamics of the arm.
+        width: finite-difference steps of velocity for the Jacobian of friction, (n,) [rad/s, m/s].
+        disturbance: constant disturbance in W windows, (W, n): a force [Nm, N] if the state of the dynamics contains
+            momenta, else an acceleration [rad/s^2, m/s^2].
     """
     pose_at = equations_of(dynamics)
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return the generalised forces M qdd, (W, n) [Nm, N]. pose: equations of motion at q."""
+        """Return the generalised forces M qdd in W windows, (W, n) [Nm, N]. pose: equations of motion at q."""
         added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
         return pose.force(qd, tau, z) + added
 
@@ -87,7 +93,7 @@ def _stepper(
         )
 
         def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the solution (v, a), (W, n) each, of (1 - h A) (v, a) = (velocity, M^-1 force)."""
+            """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force) in W windows, (W, n) each."""
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
@@ -113,7 +119,7 @@ def _friction_slopes(
 ) -> tuple[Tensor, Tensor]:
     """Return the derivatives of friction with respect to velocity (D) and, through the bristles, to position (K).
 
-    Both are diagonals, (W, n): friction depends on the motion of its own joint only.
+    Both are diagonals of matrices of W windows, (W, n): the friction of a joint depends only on the joint's motion.
     """
     # Central differences are used, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
@@ -166,7 +172,9 @@ class Solver:
     substeps: int
 
     def __call__(self, windows: Windows, disturbance: Tensor | None = None) -> States:
-        """Return predicted q and qd of W windows at samples 1..K-1, (W, K-1, n); NaN after a divergence.
+        """Return predicted q and qd at samples 1 to K-1 of W windows of K samples, (W, K-1, n) each.
+
+        Values after a divergence are NaN.
 
         disturbance: constant disturbance (W, n) from `observe`.
         """
@@ -199,10 +207,10 @@ def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
 
 @dataclass(frozen=True)
 class Predictor:
-    """Predictor of the motion in windows, from their first samples and their torques.
+    """Predictor of the motion in windows, from the first sample and the torques of each window.
 
-    solver: function that returns q and qd of W windows at all samples except the first, (W, K-1, n) each; a `Solver` if
-    the prediction integrates dynamics. dynamics: the integrated dynamics, or None.
+    solver: function that returns q and qd of W windows of K samples, (W, K-1, n) each, at all samples except the first;
+    a `Solver` if the prediction integrates dynamics. dynamics: the integrated dynamics, or None.
     """
 
     name: str

@@ -31,7 +31,7 @@ from spelgen.logs.windows import Windows
 from spelgen.spec import Options
 
 FittedBaselines = dict[str, Any]
-"""Content of least_squares.json: the fitted baselines, and the coverage of the training logs."""
+"""Content of least_squares.json: the fitted baselines, and the range of motion of the training logs."""
 LinearServoRecord = Mapping[str, Any]
 """Parameters of `LinearServos` in the record of a fit, by name."""
 
@@ -70,7 +70,10 @@ def constant_velocity(arm: EvaluatedArm) -> list[Predictor]:
 
 
 def hold_velocity(windows: Windows) -> States:
-    """Return q [rad, m] and qd [rad/s, m/s], (W, K-1, n), at samples 1..K-1, for constant velocity from sample 0."""
+    """Return q [rad, m] and qd [rad/s, m/s] of W windows of K samples for constant velocity from sample 0.
+
+    Both are (W, K-1, n), at samples 1 to K-1.
+    """
     elapsed = windows.dt.cumsum(dim=1).unsqueeze(-1)  # (W, K-1, 1) [s]
     qd = windows.qd[:, :1]
     return windows.q[:, :1] + qd * elapsed, qd.expand(-1, elapsed.shape[1], -1)
@@ -143,12 +146,15 @@ def torque_predictors(arm: EvaluatedArm) -> list[Predictor]:
 
 
 def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> FittedBaselines:
-    """Return the content of least_squares.json: the coverage of the logs, and identified parameters.
+    """Return the content of least_squares.json: the motion that the logs cover, and identified parameters.
 
-    Parameters are identified by linear least squares, (K,) for each friction model. They are absent if the logs have no
-    torques or no accelerations. preprocessing: preprocessing of the fit, in which all default values are resolved.
+    The motion is described by the duration, and by ranges and histograms of positions and velocities (see `coverage`).
+    For each friction model, inertial and friction parameters are identified by linear least squares. The parameters are
+    absent if the logs have no torques or no accelerations.
+
+    preprocessing: preprocessing of the fit, in which all default values are resolved.
     """
-    # The coverage is stored for the assessment, which compares the range of motion in test logs with it.
+    # The coverage is stored for the assessment of an evaluation, which compares the motion in test logs with it.
     fitted: FittedBaselines = {"coverage": coverage(logs)}
     methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
     try:

@@ -74,7 +74,7 @@ class Axes:
         return True
 
     def keep_offset(self, slider: int, hinge: int) -> bool:
-        """Whether all bodies that the prismatic joint ``slider`` carries keep their distance from a plane.
+        """Whether all points that the prismatic joint ``slider`` carries keep a constant signed distance from a plane.
 
         The plane contains the axis of the revolute joint ``hinge`` and is parallel to the axis of ``slider``. The
         distance must be constant for any motion of the joints from ``hinge`` to the tip; ``hinge`` is nearer the root

@@ -223,9 +223,10 @@ class _Writer:
         return Formula(entry, terms, grouped(functions))
 
     def _polynomials(self, entry: Entry, budget: Budget) -> dict[str, fmpq_mpoly]:
-        """Return {base parameter: its polynomial coefficient in an entry}, without the constant of V.
+        """Return {base parameter: coefficient of this parameter in an entry of M, or in V without its constant}.
 
-        Raises TooLarge if the expansion exceeds the budget.
+        A coefficient is a polynomial in sines, cosines and positions of the joints. Raises TooLarge if the expansion
+        exceeds the budget.
         """
         energies = self._expansion.energies
         element = energies.potential if entry == "V" else energies.mass[entry[0] - 1, entry[1] - 1]

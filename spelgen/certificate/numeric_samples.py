@@ -79,7 +79,7 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
 
 
 def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
-    """Return the torque regressors at m random states q, qd, qdd, (m n, 10 B) for n coordinates and B bodies."""
+    """Return the torque regressors of n coordinates and B bodies, (m n, 10 B), at m random states q, qd, qdd."""
     # The regressor does not depend on inertial parameters. Random ones are used, because Pinocchio needs some values.
     dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
     n, bodies = len(arm.coordinates), len(arm.bodies)
@@ -117,7 +117,7 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
 
 @dataclass(frozen=True)
 class ReadingDifference:
-    """Largest differences of a quantity between readings of a URDF, divided by the quantity's magnitude [1].
+    """Largest relative differences of a quantity between readings of a URDF.
 
     difference: between Pinocchio and the chain without rounding. rounding: between the arm's chain and the chain
     without rounding of angles.
@@ -181,7 +181,7 @@ def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
 
 
 def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Return {quantity: values} of the B moving bodies of an arm at positions q (S, n).
+    """Return {quantity: values} of the B moving bodies of an arm at S positions q (S, n).
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
     (S, B, B + 1): M of the B joints with doubled diagonal entries, then the gravity torque as the last column.

@@ -281,7 +281,7 @@ def _potential(structure: Structure, samples: NumericSamples) -> _DerivedFact:
 
 
 def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
-    """Return the fact that the matrix ``rows`` (m, k) has this rank, the number of its nonzero singular values.
+    """Return the fact that the matrix ``rows`` has this rank, the number of nonzero singular values.
 
     fact: name of the fact.
     """

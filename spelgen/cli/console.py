@@ -90,7 +90,7 @@ def _local(value: object) -> object:
 
 
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
-    """Report an exception on stderr and exit with its exit code; with `debug`, its traceback first."""
+    """Report an exception on stderr, with `debug` after the traceback; exit with the exit code of the exception."""
     if isinstance(error, BrokenPipeError):
         # The reader of stdout has ended. No message is printed; stdout becomes /dev/null, so that the flush at the exit
         # of the interpreter does not fail.
@@ -123,7 +123,7 @@ def _message(error: BaseException, debug: bool) -> str:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
-    """Show a progress bar on stderr if it is a terminal.
+    """Show a progress bar on stderr if stderr is a terminal.
 
     Yield a function with the arguments number of finished steps, number of all steps, and optionally title of the
     current step.
@@ -131,7 +131,7 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
     from rich.console import Console
     from rich.progress import Progress
 
-    # The bar is on stderr, because stdout contains only the result.
+    # The progress bar is on stderr, because stdout contains only the result of the command.
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, total, now=title: bar.update(task, completed=done, total=total, description=now)
@@ -152,7 +152,7 @@ def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
 
     form: "text" prints `lines`, the result as lines of text; "json" prints `record`, the same result, as JSON.
     """
-    # The JSON has one line, because log files of pipelines have one record per line.
+    # The JSON object is printed on one line, because log files of pipelines have one record per line.
     if form == "json":
         print(json.dumps(record, default=str))
         return

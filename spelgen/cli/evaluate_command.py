@@ -67,7 +67,7 @@ def evaluate(
             progress=progress,
         )
     record = results.to_dict()
-    # The file is written before anything is printed, so that a closed pipe does not lose the result.
+    # evaluation.json is written before anything is printed, so that a closed pipe does not lose the result.
     write_json(RunFolder(run).evaluation, record)
     # Diagnostics go to stderr, because scripts read the result from stdout.
     for diagnostic in results.diagnostics:

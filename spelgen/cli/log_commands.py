@@ -165,7 +165,7 @@ def logs(
         say(result.text())
     else:
         say(json.dumps(result.to_dict(), indent=2))
-    # The page is also written for logs with errors, because charts may show the cause.
+    # The HTML page is also written for logs with errors, because charts may show the cause of an error.
     if html is not None:
         from spelgen.render.arm_pages import logs_page
 

@@ -120,8 +120,8 @@ def common(
 
 def main() -> None:
     """Entry point of the command `spelgen`."""
-    # The variable is set before BLAS and torch are imported, because they read it only once. One thread makes runs
-    # deterministic, and is fastest for small matrices.
+    # OMP_NUM_THREADS is set before BLAS and torch are imported, because both read the variable only once. One thread
+    # makes runs deterministic, and is fastest for small matrices.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):
         # Names from a file may contain characters that the encoding of the terminal does not have.

@@ -169,7 +169,7 @@ def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequen
     from spelgen.logs.arm_mapping import log_source
 
     for code in codes or ():
-        # An unknown code is an error, because it would have no effect.
+        # An unknown code of --accept is an error: a misspelled code would accept nothing.
         if code not in get_args(Accepted):
             hint = suggestion(code, get_args(Accepted))
             raise typer.BadParameter(f"unknown code {code!r}; {hint}", param_hint="'--accept'")

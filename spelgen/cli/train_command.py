@@ -1,4 +1,4 @@
-"""The command `train`: it fits a module to log files and writes a run folder."""
+"""The command `train`, which fits a module to log files and writes a run folder."""
 
 from __future__ import annotations
 

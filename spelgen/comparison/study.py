@@ -62,7 +62,7 @@ class Study:
             text += f", {len(self.results)} finished before"
         if not self.estimates:
             return text
-        # The estimate assumes that all workers are equally loaded. It is at least the duration of the longest run.
+        # The estimated time assumes that all workers are equally loaded. It is at least the time of the longest run.
         seconds = max(sum(self.estimates.values()) / parallel, *self.estimates.values(), 0.0)
         return f"{text}; estimated time {duration(seconds)}"
 
@@ -123,7 +123,7 @@ def run_study(study: Study, note: Callable[[str], None], jobs: int = 1, address:
             line += f"; about {duration((time.monotonic() - start) * (total / done - 1))} left"
         note(f"{count}/{len(waiting)} {job.name}: {line}")
     finished = replace(study, results=results, failures=failures, estimates={})
-    # The file contains no curves of simulated arms, because they are in result.json of each run.
+    # comparison.json contains no curves of simulated arms, because result.json of each run contains them.
     figures = [record(replace(result, simulated=None)) for result in results.values()]
     write_json(study.folder / "comparison.json", {"schema": 1, "failures": failures, "results": figures})
     return finished

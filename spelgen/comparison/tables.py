@@ -45,7 +45,7 @@ def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFi
     """Return the tables of an arm, the main result first. published: {preset: figures of a publication}."""
     runs = _by_preset(results)
     figures = {name: [run.simulated for run in x if run.simulated] for name, x in runs.items()}
-    # The true parameters of a user's arm are unknown, so its only table has the errors on the test logs.
+    # The true parameters of a user's arm are unknown, so the only table about such an arm has the errors on test logs.
     if not all(figures.values()):
         return [_ranking(runs)]
     of_seeds: dict[str, Numbers] = {}

@@ -1,4 +1,4 @@
-"""Joint positions of all bodies as a linear function of the coordinates of an arm; it needs no Pinocchio."""
+"""Joint positions of all bodies as a linear function of the coordinates of an arm, computed without Pinocchio."""
 
 import numpy as np
 

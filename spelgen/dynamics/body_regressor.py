@@ -28,17 +28,17 @@ def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 def quaternion(rotation: object) -> np.ndarray:
     """Return the unit quaternion (w, x, y, z) with w >= 0 of a rotation matrix (3, 3)."""
     matrix = np.array(rotation, dtype=float)
-    # SciPy returns quaternions in the order (x, y, z, w).
+    # SciPy returns quaternions in the order (x, y, z, w); `np.roll` moves w to the front.
     result: np.ndarray = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
     result[np.abs(result) < 1e-16] = 0.0  # Smaller elements are rounding errors.
     return result
 
 
 def pseudo_inertia(ten: Tensor) -> Tensor:
-    """Return the pseudo-inertia (..., 4, 4) of inertial parameters (m, m c, I), (..., 10).
+    """Return the pseudo-inertia [[tr(I)/2 1 - I, m c], [(m c)^T, m]], (..., 4, 4), of inertial parameters (..., 10).
 
-    It is [[tr(I)/2 - I, m c], [(m c)^T, m]]. It is positive definite if and only if the parameters are physically
-    consistent (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
+    The parameters are mass m, first moment m c, and inertia I about the origin. The pseudo-inertia is positive definite
+    if and only if they are physically consistent (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
     """
     m, x, y, z, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
     half = (xx + yy + zz) / 2

@@ -54,7 +54,7 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
 
 
 def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-    """Return the exact deflections, (..., n, K), of bristles after a monotonic displacement of the drives.
+    """Return the exact deflections, (..., n, K), of K bristles per drive after a monotonic displacement of the drives.
 
     Args:
         z: (..., n, K) deflections of the bristles [rad, m].
@@ -67,8 +67,9 @@ def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Ten
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     """Return the friction state z, (T, n, K) [rad, m], along positions q (T, n) [rad, m]; z[0] is zero.
 
-    q: measured positions, from which encoder jitter is removed first. After a reversal of a drive, z depends only on z
-    at this reversal and the displacement since then: the loop is over reversals, not over samples.
+    K is the number of bristles per drive. Encoder jitter is first removed from q, the measured positions. After a
+    reversal of a drive, z depends only on z at this reversal and on the displacement since then: the loop is over
+    reversals, not over samples.
     """
     path = encoded(q)
     if bristles.motors is not None:

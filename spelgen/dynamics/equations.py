@@ -52,30 +52,36 @@ def equations_of(dynamics: object) -> EquationsAt:
 
 
 def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEquations:
-    """Return the equations of a port-Hamiltonian model at q (W, n); prepared: the model's parameter cache."""
+    """Return the equations of motion of W rollouts of a port-Hamiltonian model at q (W, n).
+
+    prepared: parameter cache of the model.
+    """
     pose = model.configuration(q, prepared)
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
-        """Return the friction torque, (W, n) [Nm, N]."""
+        """Return the friction torque of W rollouts, (W, n) [Nm, N]."""
         return model.friction_torque(pose, qd, *known_past(model, z))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        """Return the force M qdd, (W, n) [Nm, N]."""
+        """Return the force M qdd of W rollouts, (W, n) [Nm, N]."""
         return model.input_force(pose, qd, tau) - model.nonlinear_effects(pose, qd) - friction(qd, z)
 
     return MotionEquations(pose.mass, force, friction)
 
 
 def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
-    """Return the equations at q (W, n) of dynamics of any other class, from their forward dynamics."""
+    """Return the equations of motion of W rollouts at q (W, n) for dynamics of any other class.
+
+    The force M qdd is computed from the forward dynamics.
+    """
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
-        """Return the friction torque, (W, n) [Nm, N]."""
+        """Return the friction torque of W rollouts, (W, n) [Nm, N]."""
         return torch.as_tensor(dynamics.friction_torque(q, qd, *known_past(dynamics, z)))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        """Return the force M qdd, (W, n) [Nm, N]."""
+        """Return the force M qdd of W rollouts, (W, n) [Nm, N]."""
         # `RigidDynamics` has no method that returns M qdd, so the acceleration qdd is multiplied by M.
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
@@ -91,14 +97,16 @@ def runge_kutta(
     z: Tensor,
     step: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return q, p and z after one step of the classical Runge-Kutta method, and q' at the start of the step.
+    """Return q, p and z after one step of the classical Runge-Kutta method, and dq/dt at the start of the step.
 
     Hairer et al., Solving ODEs I, II.1.
 
     Args:
-        rhs: function of (q, p, z) that returns q' and p'.
+        rhs: function of (q, p, z) that returns dq/dt and dp/dt.
+        q: positions, (..., n) [rad, m].
         p: momenta or velocities, (..., n).
-        z: friction state, (..., n, K); it is not integrated, but computed from the displacement of the joints.
+        z: friction state of K bristles per joint, (..., n, K); it is not integrated, but computed from the displacement
+            of the joints.
         step: duration [s].
     """
 

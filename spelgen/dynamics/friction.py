@@ -137,7 +137,8 @@ class FrictionModel:
 
         Args:
             qd, qdd: velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2] of the joints, (T, n).
-            bent: deflections of the bristles divided by their break-away displacements, (T, n, K); None: unknown.
+            bent: deflections of K bristles per drive, divided by the break-away displacements, (T, n, K); None:
+                unknown.
             motors: matrix C, (n, n): the velocities of the drives are C qd; None: each drive moves its own joint.
         """
         motors = np.eye(qd.shape[-1]) if motors is None else motors

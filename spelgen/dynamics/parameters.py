@@ -1,4 +1,8 @@
-"""Trained parameters of a model: groups, units, number, evaluation at other values, and removal of residual terms."""
+"""Functions of the trained parameters of a model.
+
+They return groups, units and number of the parameters, a copy without residual terms, and the value of a function of
+the model at other parameters.
+"""
 
 import copy
 from collections.abc import Callable, Mapping

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class State(NamedTuple):
-    """State of an arm: positions q and velocities qd, (..., n), and the friction state z, (..., n, K)."""
+    """State of an arm: q and qd, (..., n), and the friction state z, (..., n, K), of K bristles per joint."""
 
     q: Tensor
     qd: Tensor
@@ -191,7 +191,7 @@ def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: 
     """Return the Jacobians, (batch, m, n), of a function with respect to each of its first ``variables`` inputs.
 
     Args:
-        function: function of the states without batch dimension, (n,) each, with the result (m,).
+        function: function of the states without batch dimension, (n,) each, that returns a vector (m,).
         states: (batch, n) each.
     """
     if not torch.is_grad_enabled():

@@ -81,7 +81,7 @@ def motors_of(model: Any) -> Tensor:
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
     """Return the friction state z, (..., n, K), of joints that have moved at qd for a long time.
 
-    K is 0 for friction without a state.
+    K is the number of bristles per joint, 0 for friction without a state.
     """
     if not is_stateful(dynamics):
         return qd.unsqueeze(-1)[..., :0]
@@ -112,7 +112,7 @@ def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = No
     """Return (z, direction), (z,) or (): the arguments that describe past motion to the methods of `dynamics`.
 
     Args:
-        z: friction state, (..., n, K) [rad, m]; omitted if friction has no state.
+        z: friction state of K bristles per joint, (..., n, K) [rad, m]; omitted if friction has no state.
         direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles. It is
             needed only if tau was filtered: it must have passed the same filter.
     """

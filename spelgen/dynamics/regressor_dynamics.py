@@ -48,6 +48,8 @@ def _row(values: tuple[object, ...]) -> Row:
 class RegressorDynamics:
     """Dynamics of an arm of n coordinates and B bodies with given inertial parameters (see ``RigidDynamics``).
 
+    Friction depends on K bristles per drive.
+
     Args:
         parameters: inertial parameters, (10 B,), in the order of ``regressor``.
         armature: armature of the drives, (n,) [kg m^2, kg].

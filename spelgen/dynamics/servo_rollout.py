@@ -35,7 +35,7 @@ class ServoDrives(NamedTuple):
 
 
 class ServoState(NamedTuple):
-    """State of an arm: positions q and velocities qd, (..., n), and the friction state z, (K, ..., n)."""
+    """State of an arm: q and qd, (..., n), and the friction state z, (K, ..., n), of K bristles per joint."""
 
     q: Tensor
     qd: Tensor
@@ -150,8 +150,8 @@ def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt
     M and the gravity torque are evaluated once per interval.
 
     Args:
-        q, qd: initial positions and velocities, (W, n).
-        commands: delayed commands, (W, I, S, n), with S steps per interval.
+        q, qd: initial positions [rad, m] and velocities [rad/s, m/s], (W, n).
+        commands: delayed commands, (W, I, S, n) [rad, m], with S steps per interval.
         dt: durations of the intervals, (W, I) [s].
     """
     with torch.no_grad():

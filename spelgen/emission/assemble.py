@@ -60,7 +60,8 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
     # same operations in the same order, so that rounding errors are equal.
     names["mass_entries"] = partial(_mass_entries, entry_sums(spec))
     try:
-        # The tables are evaluated first, because the arguments of the model refer to them by name.
+        # The tables of joints, links and functions are evaluated before the arguments of the model, which refer to the
+        # tables by name.
         for name, rows in assembly.rows.items():
             names[name] = tuple(_value(row, names) for row in rows)
         arguments = {str(name): _value(item, names) for name, item in assembly.model.arguments}

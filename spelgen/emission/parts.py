@@ -195,7 +195,7 @@ def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
 def _potential(spec: ModelSpec) -> Call:
     # The inputs cos q and sin q of a joint have the same scale.
     scales = (tuple(joint.potential_sensitivity for joint in spec.joints),) * 2
-    # V is a single output, but M has many: a fraction of the units suffices for V.
+    # V is a single output, but M has many: for V, a fraction of the hidden units of the networks of M suffices.
     width = max(TUNING.min_units, round(TUNING.potential_fraction * units(spec)))
     return _network(spec, (_joint_names(spec, spec.potential),), scales, width=width)
 

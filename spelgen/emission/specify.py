@@ -62,7 +62,7 @@ def make_spec(
         depth=depth,
     )
     spec = derive_spec(arm, options)
-    # The path is relative, so that a project folder with module and URDF can be moved.
+    # The module contains a relative path of the URDF, so that a project folder with module and URDF can be moved.
     return spec if module is None else replace(spec, urdf=_path_of_urdf(module, arm.robot.path))
 
 

@@ -52,7 +52,8 @@ class ModelTuning:
     # [1] Number of hidden units of Kolmogorov-Arnold networks, divided by the number for multilayer perceptrons (the
     # option `width`); smaller, because each edge has several weights.
     kan_fraction: float = 0.25
-    # [1] Units of the network of V, which has one output, divided by the width of the networks of M.
+    # [1] Number of hidden units of the network of V, divided by the number of the network of M; smaller, because V is a
+    # single output.
     potential_fraction: float = 0.5
 
 

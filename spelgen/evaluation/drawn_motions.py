@@ -53,9 +53,9 @@ class PredictedMotion(DrawnMotion):
         qd: Measured velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         predicted_qd: Predicted velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         u: Commands of position servos, (T, n) [rad, m]; None for a window.
-        error: For a window: relative error at its last sample [1], the RMS over the relative errors of q and qd of all
-            joints. A relative error is the error divided by the RMS change of q or qd over the horizon. For a replayed
-            log: RMS position error [rad, m].
+        error: For a window: relative error at the last sample of the window, the RMS over the relative errors of q and
+            qd of all joints. A relative error is the error divided by the RMS change of q or qd over the horizon. For a
+            replayed log: RMS position error [rad, m].
     """
 
     start: float | None = None
@@ -70,7 +70,7 @@ class TorqueTrace(DrawnMotion):
     """Measured joint torques along ten seconds of a log, and the torques of the predictors.
 
     Attributes:
-        error: Normalised mean squared error (nMSE) of the torques of the model [1].
+        error: Normalised mean squared error (nMSE) of the torques of the model.
         measured: Measured joint torques, (T, n) [Nm, N].
         predicted: {name of a predictor: predicted joint torques, (T, n) [Nm, N]}.
         parts: {name of a term: torque, (T, n) [Nm, N]}, for the inertia, Coriolis, gravity and friction term of the

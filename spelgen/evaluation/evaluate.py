@@ -86,7 +86,7 @@ def evaluate(
 
     Raises LogError.
     """
-    # The input is checked before the rollouts, because rollouts take minutes.
+    # Model and logs are checked before the rollouts, because rollouts take minutes.
     tested = subject(model, arm)
     logs = [logs] if isinstance(logs, Trajectory) else list(logs)
     # Joints are matched by name: the order of the joints in a log may differ, but a missing joint is an error.

@@ -100,9 +100,9 @@ class StateErrors:
     Attributes:
         q: Position errors [rad, m]; revolute positions are compared modulo a revolution.
         qd: Velocity errors [rad/s, m/s].
-        q_relative_rms: Position errors divided by the RMS change of q over the horizon [1].
-        qd_relative_rms: Velocity errors divided by the RMS change of qd over the horizon [1].
-        mean_relative_rms: Mean of the relative errors of q and qd of all joints [1].
+        q_relative_rms: Position errors divided by the RMS change of q over the horizon.
+        qd_relative_rms: Velocity errors divided by the RMS change of qd over the horizon.
+        mean_relative_rms: Mean of the relative errors of q and qd of all joints.
         tip_mm: Position error of the tip [mm]; None also if the tip is unknown.
     """
 
@@ -260,7 +260,7 @@ def end_errors(
 ) -> StateErrors:
     """Return the errors at the last sample of W windows of K samples.
 
-    states: predicted q and qd at the samples after the first, (W, K-1, n) each.
+    states: predicted q [rad, m] and qd [rad/s, m/s] at the samples after the first, (W, K-1, n) each.
     """
     q, qd = (predicted[:, -1] for predicted in states)  # (W, n) each
     measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]

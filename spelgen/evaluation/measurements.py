@@ -49,7 +49,7 @@ class Measurements:
         torque: {predictor: torque errors}; empty if the sample rate is too low for accelerations.
         torque_steps: {joint: quantisation step of its torque [Nm, N]}, see `coarse_torques`.
         replays: Errors of replayed commands, for an arm under position servos.
-        mass_errors: {predictor: relative error of M [1]}; empty if the true M is unknown.
+        mass_errors: {predictor: relative error of M}; empty if the true M is unknown.
         assessment: Assessment of the model in words; None before it is added.
     """
 

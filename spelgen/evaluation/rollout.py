@@ -1,4 +1,8 @@
-"""Forward simulation of a model, its invariants, and the error of M of simulated arms whose truth is known."""
+"""Forward simulation of a model, tests of the model's physical consistency, and the error of the model's M.
+
+The tests are on positive definiteness of M, and on the energy of free motion. The error of M needs the true M, which is
+known for simulated arms only.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -88,7 +92,7 @@ def true_mass(robot: Arm | Path | str, q: Tensor, joints: Sequence[str] | None =
 
     Args:
         robot: The true arm, or the path of its URDF.
-        q: Positions (T, n) [rad; m].
+        q: Positions (T, n) [rad, m].
         joints: Names of the n joints in the order of q; None: the joints in the settings, else the longest chain.
     """
     from spelgen.dynamics.pinocchio_arm import arm_dynamics
@@ -119,13 +123,13 @@ def mass_error(learned: Tensor, true: Tensor) -> float:
 def mass_errors(
     dynamics: Mapping[str, RigidDynamics], truth: Arm | Path | str, joints: Sequence[str], q: Tensor
 ) -> dict[str, float]:
-    """Return {predictor: relative error of M [1]}, see `mass_error`, at a subset of the test positions.
+    """Return {predictor: relative error of M, see `mass_error`}, at a subset of the test positions.
 
     Args:
         dynamics: {name of the model or of a baseline: dynamics}.
         truth: The true arm, or the path of its URDF.
         joints: Names of the n joints.
-        q: Positions (T, n) [rad; m] of the test logs.
+        q: Positions (T, n) [rad, m] of the test logs.
     """
     # Positions are subsampled: M changes slowly along a trajectory, so more positions give the same error.
     q = q[:: max(1, len(q) // TUNING.mass_positions)]

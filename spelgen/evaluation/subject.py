@@ -1,4 +1,4 @@
-"""The model that is evaluated, with its fit and its arm if known."""
+"""The model that an evaluation tests, with data about the fit and the arm of this model, and reading of test logs."""
 
 import copy
 from collections.abc import Iterable

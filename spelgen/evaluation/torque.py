@@ -117,8 +117,8 @@ def coarse_torques(
     """
     steps = {}
     for k, joint in enumerate(joints):
-        # The step of a joint is the median over the logs. A log without a quantisation step has the value infinity, so
-        # the median is finite only if most logs are quantised.
+        # The quantisation step of a joint's torque is the median over the logs. A log without a quantisation step has
+        # the value infinity, so the median is finite only if most logs are quantised.
         step = float(np.median(np.nan_to_num([quantisation_step(log.tau[:, k]) for log in logs], nan=np.inf)))
         torque = joined_column(logs, "tau")[:, k]
         if np.isfinite(step) and has_few_levels(step, float(np.ptp(torque))):

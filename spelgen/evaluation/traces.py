@@ -48,8 +48,8 @@ class Growth:
     Attributes:
         seconds: Times since the start of a prediction, (T,) [s].
         windows: Number of predictions.
-        relative: {predictor: quantiles of the relative error [1]}, the errors of q and qd divided by the RMS change of
-            q and qd since the start.
+        relative: {predictor: quantiles of the relative error}: the errors of q and qd divided by the RMS change of q
+            and qd since the start.
         tip_mm: {predictor: quantiles of the position error of the tip [mm]}; empty without a URDF.
     """
 
@@ -77,7 +77,7 @@ class MassTrace:
 
 @dataclass(frozen=True, eq=False)
 class FrictionTrace:
-    """Friction torque of each joint as a function of its velocity.
+    """Friction torque of each joint as a function of the joint's velocity.
 
     Only one joint moves at a time, and the arm is at the mean position of the logs.
 
@@ -148,7 +148,7 @@ def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
 
 
 def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> dict[str, Tensor]:
-    """Return {predictor: relative error, (W, K-1) [1]} for W windows of K samples, without the initial sample.
+    """Return {predictor: relative error, (W, K-1)} for W windows of K samples, without the initial sample.
 
     The relative error is the RMS over the errors of position and velocity of all joints. Each of these errors is
     divided by the RMS change of the position or velocity since the start of a window (see `loss_scales`).
@@ -182,7 +182,7 @@ def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosi
 def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[PredictedMotion, ...]:
     """Return two predicted windows of the model: the window of median error and the window of largest error.
 
-    errors: relative error at the end of each window, (W,) [1].
+    errors: relative error of the model at the end of each of W windows, (W,).
     """
     motions = []
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
@@ -193,7 +193,7 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
 
 
 def _quantiles(values: Tensor) -> Quantiles:
-    """Return the quantiles over the W windows of values (W, T), each (T,); NaN is treated as infinity."""
+    """Return the quantiles over W windows of values at T times, (W, T), each (T,); NaN is treated as infinity."""
     ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values.numpy()
     last = len(ordered) - 1
     return Quantiles(*(ordered[round(quantile * last)] for quantile in (0.1, 0.5, 0.9)))

@@ -10,7 +10,8 @@ class EvaluationTuning:
     # [s] Time that the momentum observer runs before a prediction; 0.2 and 0.3 s are no better on the UR10e of
     # `benchmarks/arms.py`.
     observed_past: float = 0.1
-    # [s] 1 / K of the momentum observer; 0.02 to 0.1 s differ by 3 % on the UR10e of `benchmarks/arms.py`.
+    # [s] Time constant 1 / K of the momentum observer with the gain K; 0.02 to 0.1 s differ by 3 % on the UR10e of
+    # `benchmarks/arms.py`.
     observer_time_constant: float = 0.05
     # [1] Largest number of windows per horizon. The windows are evenly spread over the logs.
     most_windows: int = 1000

@@ -52,8 +52,9 @@ def verdict(
 ) -> Verdict:
     """Return the assessment of an evaluation.
 
-    identified: content of least_squares.json, for the coverage of the training logs. limits: position limits of the
-    joints. independent: names of joints on whose position the dynamics do not depend, such as a vertical first axis.
+    identified: content of least_squares.json, for the range of motion of the training logs. limits: position limits of
+    the joints. independent: names of joints on whose position the dynamics do not depend, such as a vertical first
+    axis.
     """
     # Each assessment function adds uses, and the texts with the errors from which they were decided.
     uses = _Uses()
@@ -153,7 +154,7 @@ def _assess_replays(results: Measurements, uses: _Uses) -> None:
 
 
 def _relative(errors: StateErrors | None) -> float:
-    """Return the mean relative error, RMS error / RMS change over the horizon [1]; infinity if it is unknown."""
+    """Return the mean of RMS error / RMS change over the horizon; infinity if this relative error is unknown."""
     error = None if errors is None else errors.mean_relative_rms
     return math.inf if error is None else error
 
@@ -207,7 +208,7 @@ def _worst_joint(results: Measurements) -> tuple[str, str, str]:
 def _worst_motion(results: Measurements) -> tuple[str, float]:
     """Return the joint of the largest relative position error at the longest horizon, and this error.
 
-    The relative error is the RMS error divided by the RMS change over the horizon [1].
+    The relative error is the RMS error divided by the RMS change over the horizon.
     """
     for last in results.horizons[-1:]:
         errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN.

@@ -1,4 +1,4 @@
-"""Bounds of a motion: limits of the joints, and the surroundings of an arm, which are read from a YAML file."""
+"""Bounds of a motion: bounds of the joints, and the surroundings of an arm (floor and boxes) from a YAML file."""
 
 from __future__ import annotations
 

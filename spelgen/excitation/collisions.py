@@ -32,8 +32,8 @@ FLOOR = "the floor"
 class Contact:
     """Contact of two objects during a motion.
 
-    time: first time at which the objects are closer than the clearance [s]. distance: distance at this time [m]. first,
-    second: names of the objects.
+    time: first time at which the objects are closer than the clearance [s]. distance: signed distance at this time [m],
+    negative for overlapping shapes. first, second: names of the objects.
     """
 
     time: float
@@ -46,7 +46,7 @@ class Contact:
 
 
 class Collisions:
-    """Distances of the links of an arm to each other, and to floor and boxes.
+    """Signed distances of the links of an arm to each other, and to floor and boxes; negative for overlapping shapes.
 
     The objects are the collision shapes of the links, the floor and the boxes. Links of the same body, or of two bodies
     connected by a joint, are not compared, because their shapes overlap.
@@ -160,7 +160,7 @@ class Collisions:
         return value, gradient
 
     def _distance_gradient(self, pair: int) -> np.ndarray:
-        """Return the derivative of the distance of a pair with respect to q, (n,).
+        """Return the derivative of the signed distance of a pair with respect to q, (n,).
 
         ``distances`` and the joint Jacobians must have been computed at q.
         """
@@ -174,8 +174,8 @@ class Collisions:
             if joint:
                 frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
                 jacobian = pin.getJointJacobian(self._model, self._data, joint, frame)
-                # The derivative of the distance is the relative velocity of the two nearest points along the normal,
-                # which points from the first to the second object.
+                # The derivative of the signed distance is the velocity of the nearest point of the second object
+                # relative to the nearest point of the first, along the normal, which points from first to second.
                 arm = np.cross(point - self._data.oMi[joint].translation, result.normal)
                 gradient += sign * (result.normal @ jacobian[:3] + arm @ jacobian[3:])
         derivative: np.ndarray = gradient @ self._constraint.jacobian

@@ -93,7 +93,7 @@ class Criterion:
         return self._log_condition(rows) + penalties
 
     def _rows(self, states: Tensor) -> Tensor:
-        """Return the regressor (T, n, K): columns of bodies, then armature and friction as in `FRICTION.columns`."""
+        """Return the regressor of K parameters, (T, n, K): bodies, then armature and friction (`FRICTION.columns`)."""
         q, qd, qdd = states
         direction = (qd / FRICTION.coulomb_smoothing_velocity).tanh()
         effects = torch.stack([qdd, qd, direction, torch.ones_like(qd)])
@@ -101,11 +101,11 @@ class Criterion:
         return torch.cat([regressor_of(self.chain, q, qd, qdd), drives], dim=2)
 
     def _efforts(self, rows: Tensor) -> Tensor:
-        """Return rigid-body torques divided by the effort limits, (T, n), from the regressor (T, n, K)."""
+        """Return rigid-body torques divided by the effort limits, (T, n), from the regressor of `_rows`."""
         return rows[:, :, : len(self.inertial)] @ self.inertial / self.limits
 
     def _log_condition(self, rows: Tensor) -> Tensor:
-        """Return the logarithm of the condition number, (), from the regressor (T, n, K)."""
+        """Return the logarithm of the condition number, (), of the base regressor, from the regressor of `_rows`."""
         columns = rows[:, :, self.columns].flatten(0, 1)
         length = columns.norm(dim=0)
         # The column of a parameter that the motion does not excite is zero.

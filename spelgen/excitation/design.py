@@ -187,7 +187,7 @@ def _start(
     """
     if start is None:
         middle = (limits.low + limits.high) / 2
-        # The default is zero if possible, since the controllers of most arms start at zero.
+        # The default start position is zero if possible, since the controllers of most arms start there.
         position = np.where((limits.low <= 0) & (limits.high >= 0), 0.0, middle)
         if collisions is not None and collisions.contact_at(position):
             position = middle
@@ -227,8 +227,8 @@ def _improved(
         progress(min(done, trials), trials)
         return value, gradient
 
-    # The tolerance of the cost is zero, because a step with a small decrease may be followed by a step with a large
-    # decrease. The search ends after `trials` evaluations.
+    # The tolerance of the criterion, `ftol`, is zero, because a step with a small decrease may be followed by a step
+    # with a large decrease. The search ends after `trials` evaluations.
     options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.history, "ftol": 0.0}
     minimize(evaluate, initial, jac=True, method="L-BFGS-B", options=options)
     return best

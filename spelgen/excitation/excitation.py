@@ -137,5 +137,5 @@ def _numbers(values: np.ndarray) -> str:
 
     No number has an exponent, because YAML would read it as text.
     """
-    # The zero that is added turns -0 into 0.
+    # Adding 0.0 changes -0.0 to 0.0.
     return f"[{', '.join(f'{x:.9f}' for x in np.round(values, 9) + 0.0)}]"

@@ -166,7 +166,7 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
 
 
 def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
-    """Return the value (1, 1) of a spline at the position q (1, 1) of a joint; it is constant outside of the knots."""
+    """Return the value (1, 1) of a spline at the position q (1, 1) of a joint; outside of the knots it is constant."""
     knots, degree = spline.t, spline.k
     # CasADi's bspline extrapolates the last polynomial, but the model's splines are constant there.
     inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])

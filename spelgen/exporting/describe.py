@@ -1,4 +1,4 @@
-"""``Trained``, the argument of every exporter: a trained model with its arm. Its conversion to NumPy arrays."""
+"""``Trained``, a model with its arm, which every exporter gets as argument, and its conversion to NumPy arrays."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ def _network(
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
     """Return {index of a joint: cubic spline}; joints whose coefficients are all zero are omitted.
 
-    weights: coefficients of k B-splines per joint, (n, k).
+    weights: coefficients of the B-splines of each joint, (n, splines).
     """
     splines = {}
     for joint in torch.nonzero(weights.any(dim=1)).flatten().tolist():

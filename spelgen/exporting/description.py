@@ -249,5 +249,5 @@ def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
         if name not in options:
             expected = f"one of {', '.join(options)}"
             raise RunError(f"the function {name!r}", expected=expected)
-    # The order does not depend on the user's order, so that the same selection gives the same files.
+    # The functions have a fixed order, not the user's order, so that the same selection gives the same files.
     return [name for name in options if name in names or not names]

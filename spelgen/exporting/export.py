@@ -52,7 +52,7 @@ def export(
     if to not in EXPORTERS:
         do = suggestion(to, EXPORTERS)
         raise RunError(f"the format {to!r}", expected=f"one of {', '.join(EXPORTERS)}", do=do)
-    # The path is checked first, because loading and exporting a run takes seconds.
+    # The path of the export is checked first, because loading and exporting a run takes seconds.
     if path is not None:
         require_fitting(to, Path(path))
     if isinstance(trained, str | Path):

@@ -1,4 +1,4 @@
-"""The formats of exports, and a trained model as files of one format."""
+"""The properties of an export format (``Exporter``), and the files of an export (``Exported``) with their README."""
 
 from __future__ import annotations
 

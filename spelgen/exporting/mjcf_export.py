@@ -308,7 +308,7 @@ def _form(shape: LinkShape, assets: etree._Element) -> dict[str, object]:
 
 
 def _is_flat(vertices: np.ndarray) -> bool:
-    """Whether the vertices (V, 3) of a mesh lie in a plane, so that the convex hull has no volume."""
+    """Whether the V vertices (V, 3) of a mesh lie in a plane, so that the convex hull has no volume."""
     # A flat mesh may lie in any plane, so its thickness is the smallest singular value.
     extents = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
     return len(extents) < 3 or bool(extents[2] <= TUNING.flat * extents[0])

@@ -1,4 +1,8 @@
-"""Entry points of a trained model as CasADi expressions of state, inputs, and symbols for the residual terms."""
+"""CasADi expressions of the functions of a trained model (entry points), for example of inverse dynamics.
+
+The variables of an expression are the inputs of the entry point, for example q and qd, and symbols that represent the
+residual terms (see `residual_expressions`).
+"""
 
 from collections.abc import Mapping
 
@@ -75,7 +79,7 @@ def _expressions(
 
     Args:
         model: the model as NumPy arrays.
-        inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1).
+        inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1), of K bristles per joint.
         residuals: symbols of the residual terms, see ``residual_symbols``.
         derivatives: True if the expressions will be differentiated. The symbol ``first``, the derivative of M's
             residual term with respect to q, then replaces the symbols ``rate`` and ``kinetic``.
@@ -146,7 +150,7 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
         model: the model as NumPy arrays.
         qd: velocities of the motors, (n, 1) [rad/s, m/s].
         gravity: gravity torques of the motors, (n, 1) [Nm, N].
-        z: friction state, (n K, 1), the K bristles of the first joint first.
+        z: friction state of K bristles per joint, (n K, 1), the bristles of the first joint first.
     """
     constants = model.friction
     # ca.reshape is column-major, so that each column has the K bristles of a joint.
@@ -174,7 +178,7 @@ def _smooth_sign(velocity: ca.SX, width: np.ndarray) -> ca.SX:
 
 
 def sliding_bristles(model: TrainedModel, qd: ca.SX) -> ca.SX:
-    """Return the steady friction state z, (n K, 1), of motors that move at constant velocities qd, (n, 1)."""
+    """Return the friction state z, (n K, 1), of motors with K bristles that move at constant velocities qd, (n, 1)."""
     direction = ca.tanh(qd / model.friction.coulomb_smoothing_velocity)
     return ca.SX(_per_element(model.breakaway, direction) * model.breakaway.ravel())
 
@@ -183,7 +187,7 @@ def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
     """Return the friction state z, (n K, 1), after a displacement of the motors without reversals.
 
     Args:
-        breakaway: break-away displacements, (n, K) [rad, m].
+        breakaway: break-away displacements of K bristles per motor, (n, K) [rad, m].
         z: friction state before the displacement, (n K, 1) [rad, m].
         dq: displacements of the motors, (n, 1) [rad, m].
     """
@@ -192,7 +196,7 @@ def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
 
 
 def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:
-    """Return (n K, 1): each of the values (n, 1) repeated K times, once per bristle of the joint."""
+    """Return (n K, 1): each of the values (n, 1) repeated K times, once per bristle of the motor."""
     return ca.vec(ca.repmat(values.T, breakaway.shape[1], 1))
 
 

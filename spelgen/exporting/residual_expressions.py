@@ -57,7 +57,10 @@ def residual_symbols(model: TrainedModel) -> Symbols:
 
 
 def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
-    """Return the symmetric matrix (n, n) with the given values (m, 1) at the nonzero entries of R."""
+    """Return the symmetric matrix (n, n) with the structure of R, the residual term of M.
+
+    values: (m, 1), for the m nonzero entries in the lower triangle of R.
+    """
     matrix = ca.SX(model.n, model.n)
     for k, (row, column) in enumerate(model.residuals.entries):
         matrix[row, column] = matrix[column, row] = values[k]
@@ -76,7 +79,10 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
 
 
 def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
-    """Return c, (m, 1), with 1/2 qd^T R qd = c^T mass, where mass (m, 1) are the entries of R; qd: (n, 1)."""
+    """Return c, (m, 1), with 1/2 qd^T R qd = c^T mass; qd: (n, 1).
+
+    R is the residual term of M, `mass` (m, 1) are the m nonzero entries in its lower triangle.
+    """
     products = []
     for row, column in model.residuals.entries:
         # An off-diagonal entry occurs twice in R, so the factor 1/2 cancels.

@@ -34,7 +34,7 @@ class NearestFriction(NamedTuple):
         viscous: coefficients [Nm s/rad, N s/m].
         forward, backward: Coulomb torques [Nm, N] in both directions of motion, backward <= 0 <= forward.
         error: RMS difference between this friction and the model's friction over positions and speeds, divided by the
-            RMS of the model's friction [1].
+            RMS of the model's friction.
     """
 
     viscous: np.ndarray
@@ -60,7 +60,7 @@ class RigidBodyProjection:
         exact: True if the trained model consists of rigid bodies, which are used; False if rigid bodies were fitted to
             it.
         mass_error, gravity_error: RMS difference between the rigid bodies and the trained model, of M and of the
-            gravity torque, divided by the RMS of the trained model [1].
+            gravity torque, divided by the RMS of the trained model.
         bodies: float64 model that consists of the rigid bodies only.
     """
 

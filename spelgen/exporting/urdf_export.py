@@ -105,7 +105,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
     coulomb = np.stack([projection.friction.forward, projection.friction.backward], axis=1)
-    # {section: {name: array (n,) or (n, K)}}, one row per joint.
+    # {section: {name: array (n,), or (n, K) with K values per joint}}.
     sections = {"viscous_coulomb": {"viscous": projection.friction.viscous, "coulomb": coulomb}}
     # Only rigid-body models have a friction model with constants; others have friction networks.
     if projection.exact:
@@ -126,7 +126,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
 
 
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
-    """Return {name: constants of the friction model, (n,) or (n, K), in SI units}."""
+    """Return {name: constants of the friction model in SI units}: (n,), or (n, K) for K values per joint."""
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
@@ -137,7 +137,7 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
 
 
 def _plain(value: npt.ArrayLike) -> object:
-    """Return a number, or an array (K,) as a list, rounded to twelve digits, more than any fit determines."""
+    """Return a number, or an array as a list, rounded to twelve digits, more than any fit determines."""
     rounded = np.vectorize(lambda x: float(_number(x)), otypes=[float])
     return rounded(value).tolist()
 

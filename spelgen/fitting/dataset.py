@@ -50,7 +50,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """The arguments of `fit` after its default values have been resolved.
+    """The arguments of `fit` with all default values resolved.
 
     Attributes:
         validation: fraction of the logs that is set aside for validation, or the validation trajectories.
@@ -204,7 +204,7 @@ class Validation:
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)
 
     def loss(self, substeps: int) -> float:
-        """Return the `rollout_loss` of the validation windows [1]; infinite if a rollout diverges."""
+        """Return the dimensionless `rollout_loss` of the validation windows; infinite if a rollout diverges."""
         total = 0.0
         try:
             with torch.no_grad():

@@ -109,9 +109,9 @@ def fit(
     request = FitRequest(model, logs, config, preprocessing, validation, seed, urdf, options, began, folder)
     objective = objective_of(request)
     if run is not None and not options.resume:
-        # The folder is checked before the logs are filtered and cut into windows, which may take minutes.
+        # The run folder is checked before the logs are filtered and cut into windows, which may take minutes.
         run.require_free(force=options.force)
-    # The folder is created and locked after the check of the options, so that a wrong option creates no folder.
+    # The run folder is created and locked after the check of the options, so that a wrong option creates no folder.
     with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
         return _Fitting(request, objective, run).fitted()

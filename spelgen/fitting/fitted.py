@@ -86,7 +86,7 @@ class Fit:
 
     @property
     def best_validation(self) -> float:
-        """Lowest validation loss: `rollout_loss` [1]; for position servos, RMS position error [rad, m]."""
+        """Lowest validation loss: `rollout_loss`; for position servos, RMS position error [rad, m]."""
         return self.checkpoint.best_loss
 
     @property

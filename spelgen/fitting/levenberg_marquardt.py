@@ -29,13 +29,16 @@ class Termination(Enum):
 
 
 class NormalEquations(NamedTuple):
-    """Gauss-Newton Hessian of a cost, (..., k, k), and its negative gradient, (..., k)."""
+    """Gauss-Newton Hessian H, (..., k, k), and negative gradient -g, (..., k), of a cost with k parameters."""
 
     curvature: Tensor
     descent: Tensor
 
     def step(self, damping: float | Tensor = 0.0) -> Tensor:
-        """Return the damped steps (..., k). damping: a number for all systems of equations, or (...), one for each."""
+        """Return the steps (H + damping diag H)^-1 (-g), (..., k).
+
+        damping: a number for all systems of equations, or (...), one for each.
+        """
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
         # Marquardt's scaling by diag H instead of Levenberg's identity: steps are independent of the parameters' units.
         diagonal = torch.diag_embed(self.curvature.diagonal(dim1=-2, dim2=-1))
@@ -43,7 +46,7 @@ class NormalEquations(NamedTuple):
         return result
 
     def predicted_decrease(self, step: Tensor) -> float:
-        """Return the decrease of the cost that its quadratic model predicts for a step s (k,): -g^T s - s^T H s / 2."""
+        """Return the decrease of the cost by a step s (k,) in the quadratic model of the cost: -g^T s - s^T H s / 2."""
         return float(step @ (self.descent - self.curvature @ step / 2))
 
 
@@ -94,7 +97,7 @@ class LeastSquaresProblem(Protocol[Parameters]):
         """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) with respect to k free parameters."""
 
     def candidates(self, x: Parameters, step: Tensor) -> Iterable[Parameters]:
-        """Return the candidates, one or more, for the parameters after a step (k,).
+        """Return one or more candidates for the parameters after a step (k,) of the k free parameters.
 
         The solver evaluates the next candidate only if the gain ratio of the best candidate so far (decrease of the
         cost divided by the predicted decrease) is low.
@@ -161,7 +164,8 @@ def _accepted_step(
     for _ in range(TUNING.max_trials):
         step = normal.step(damping)
         predicted = normal.predicted_decrease(step)
-        # The search ends here, since a larger damping has an even smaller predicted decrease.
+        # The search for a damping ends at a small predicted decrease of the cost: a larger damping would have an even
+        # smaller one.
         if predicted < max(TUNING.min_predicted_decrease * state.cost, min_decrease):
             return Termination.SMALL_PREDICTION
         best = _best_candidate(problem, state, step, predicted)
@@ -189,7 +193,7 @@ def _best_candidate(
         candidate = initial_state(problem, x, state.damping, state.steps + 1)
         if candidate.cost < best.cost:
             best = candidate
-        # The quadratic model predicts the decrease well: further candidates would gain little.
+        # Here the quadratic model predicts the decrease of the cost well: further candidates would lower it little.
         if state.cost - best.cost >= TUNING.min_gain_ratio * predicted:
             break
     return best

@@ -88,7 +88,7 @@ class MiniBatchAdamW(WindowOptimizer):
         # Several random permutations of all windows are concatenated and cut into batches, so that all windows are used
         # about equally often.
         passes = [torch.randperm(size, generator=self._generator) for _ in range(-(-rows // size))]
-        # The sum remains on the device of the losses, since float() in each step would wait for a GPU.
+        # The sum of the losses remains on their device, since float() in each step would wait for a GPU.
         total: Tensor | float = 0.0
         for step, batch in enumerate(torch.cat(passes)[:rows].split(self._batch)):
             for group in self._optimizer.param_groups:
@@ -98,7 +98,7 @@ class MiniBatchAdamW(WindowOptimizer):
         return mean if math.isfinite(mean) else math.nan
 
     def _step(self, loss: Loss, windows: Windows) -> Tensor | float:
-        """Take a step and return the loss before it, (); NaN if the loss or its gradient is not finite."""
+        """Take a step and return the loss before the step, (); NaN if this loss or the gradient is not finite."""
         self._optimizer.zero_grad()
         try:
             value = loss(windows)

@@ -46,10 +46,11 @@ class Uncertain(NamedTuple):
 
 
 class Propagated(NamedTuple):
-    """Value of a function of the model, (...), and a square root of its covariance, (..., k).
+    """Value of a function of the model, (...), and a square root of the covariance of the value, (..., k).
 
-    root: J R, with the Jacobian J (..., K) of the value with respect to the K fitted parameters, and their covariance R
-    R^T, R (K, k). The norm of ``root`` over its last axis is the standard deviation of the value.
+    root: J R, with the Jacobian J, (..., K), of the value with respect to the K fitted parameters. R, (K, k), is a
+    square root of rank k of the covariance R R^T of these parameters. The norm of ``root`` over the last axis is the
+    standard deviation of the value.
     """
 
     value: Tensor
@@ -61,7 +62,7 @@ class Posterior:
     """Posterior of a model that was fitted to torques, or to positions under position servos.
 
     Attributes:
-        covariance: (K, K), covariance of the rigid-body, drive and friction parameters.
+        covariance: (K, K), covariance of the K rigid-body, drive and friction parameters.
         torque_std: (n,) [Nm, N], RMS of the low-pass filtered torque residual on blocks of samples that were not
             fitted; None for position servos, whose torques are not logged.
         delay: delay of the torques relative to the positions, or of the commands of position servos [s]; None if there
@@ -82,14 +83,14 @@ class Posterior:
         return Uncertain(value.numpy(), root.norm(dim=-1).numpy())
 
     def propagate(self, function: Callable[[ArmModel], Tensor]) -> Propagated:
-        """Return the value (...) of a function of the model, and a square root of its covariance, (..., k).
+        """Return the value (...) of a function of the model, and a square root J R of its covariance, (..., k).
 
-        The square root is J R, with the Jacobian J of the function with respect to the fitted parameters, computed by
-        central differences, and R from `_root`.
+        J is the Jacobian of the function with respect to the fitted parameters, computed by central differences. R has
+        k columns (see `_root`).
         """
 
         def at(x: Tensor) -> Tensor:
-            """Return the value of the function at parameters x, (K,)."""
+            """Return the value of the function at the K fitted parameters x, (K,)."""
             return evaluate_with(self.model, self._vector.unflatten(x), function)
 
         # Step of the central differences, in standard deviations of the fitted parameters: small enough that the
@@ -317,8 +318,8 @@ def posterior_of(
 
     Args:
         model: model with the fitted parameters.
-        content: field ``posterior`` of a checkpoint: covariance (K, K), delay_std [s], and torque_std (n,) unless the
-            model has position servos.
+        content: field ``posterior`` of a checkpoint: covariance of the K parameters, (K, K), delay_std [s], and, unless
+            the model has position servos, torque_std, (n,) [Nm, N].
         delay: delay of the torques relative to the positions [s].
         file: path of the checkpoint, for error messages.
 

@@ -51,7 +51,7 @@ def roll_out(
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
 
         def rhs(q: Tensor, p: Tensor, z: Tensor, tau: Tensor = tau) -> tuple[Tensor, Tensor]:
-            """Return dq/dt and dp/dt, (W, n) each."""
+            """Return dq/dt and dp/dt of the W windows, (W, n) each."""
             return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
 
         for substep in range(substeps):
@@ -73,7 +73,7 @@ def _adaptive_step(
     z: Tensor,
     step: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return q, p, z at the end of one interval, integrated with adaptive steps, and dq/dt at its start.
+    """Return q, p, z at the end of an interval, integrated with adaptive steps, and dq/dt at the start of the interval.
 
     The solver is dopri5 (Dormand and Prince, J. Comput. Appl. Math. 6, 1980); gradients are propagated through its
     steps. All W windows are integrated together, with time divided by the duration of the window's interval.
@@ -87,7 +87,7 @@ def _adaptive_step(
     from torchdiffeq import odeint  # imported only if needed, since the import takes half a second
 
     def rate(t: Tensor, state: Tensor) -> Tensor:
-        """Return the derivative of the state (q, p), (W, 2 n), with respect to time in units of the interval."""
+        """Return d(q, p) / dt, (W, 2 n), of W windows, with t: time divided by the duration of the interval."""
         q_now, p_now = state.chunk(2, dim=-1)
         return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
 
@@ -112,7 +112,7 @@ def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequen
 
 
 class LossScales(NamedTuple):
-    """Divisors of the errors of q, qd and tau in the losses.
+    """Divisors of the errors of q, qd and tau in the losses of windows of K samples.
 
     Attributes:
         q: (K-1, n) [rad, m], RMS over all windows of the position change from sample 0 to each of the samples 1 to K-1.
@@ -173,7 +173,7 @@ def rollout_errors(
 def rollout_loss(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> Tensor:
-    """Return the mean square of `rollout_errors`, () [1].
+    """Return the mean square of `rollout_errors`, a dimensionless scalar.
 
     If the predicted state remains the initial state, the loss is 1. All joints and samples have the same weight, since
     the errors are divided by ``scales``. The loss (eq. 8) of the paper whose model is the preset `spel` sums the same
@@ -183,7 +183,7 @@ def rollout_loss(
 
 
 def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tensor:
-    """Return the mean squared residual of the weak form of the equations of motion, () [1].
+    """Return the mean squared residual of the weak form of the equations of motion, a dimensionless scalar.
 
     The residual is p(t) - p(0), with the momentum p = M(q) qd, minus the impulse of all forces from 0 to t. It is
     divided by t, which gives a mean torque, and by the standard deviation of the joint's torque. The impulse is the
@@ -192,8 +192,8 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
 
     Args:
         model: model with the momentum M(q) qd.
-        windows: measured motion (W, K, n) and inputs (W, K-1, n).
-        scales: the scale of the torque, (n,) [Nm, N], is used.
+        windows: measured motion (W, K, n) and inputs (W, K-1, n) of W windows of K samples.
+        scales: only the scale of the torque, (n,) [Nm, N], is used.
     """
     q, qd, tau, dt = windows.q, windows.qd, windows.tau, windows.dt.unsqueeze(-1)
     # M is not constrained to be positive definite here: it is not inverted, since the velocities are measured. With the
@@ -218,7 +218,7 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
 
 
 def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> Tensor:
-    """Return `rollout_errors`, (W, K-1, 2n), without gradients; NaN if the rollout diverges."""
+    """Return `rollout_errors` without gradients; NaN if the rollout diverges."""
     try:
         with torch.no_grad():
             return rollout_errors(model, windows, scales, substeps)
@@ -227,13 +227,13 @@ def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int)
 
 
 def integration_error(coarse: Tensor, fine: Tensor) -> float:
-    """Return the integration error of a rollout, divided by the prediction error of the model [1].
+    """Return the integration error of a rollout, divided by the prediction error of the model.
 
     The integration error is the difference from a rollout with half the step size.
 
     Args:
-        coarse: (W, K-1, 2n) scaled errors of the rollout.
-        fine: (W, K-1, 2n) scaled errors of the rollout with half the step size.
+        coarse: `rollout_errors` of the rollout.
+        fine: `rollout_errors` of the rollout with half the step size.
     """
     model_error = max(fine.square().mean().sqrt().item(), TUNING.min_model_error)
     error = (coarse - fine).square().mean().sqrt().item() / model_error

@@ -157,7 +157,8 @@ class RolloutObjective(MomentumObjective):
         One is the fraction of all steps that is completed after ``ahead`` more steps, the other is the elapsed fraction
         of the time limit.
         """
-        # The elapsed time is included so that the learning-rate schedule ends with the time limit, too.
+        # The elapsed fraction of the time limit is included, so that the learning-rate schedule also ends with the
+        # time limit.
         steps = self.config.epochs * self.epoch_steps
         return max((self.step + ahead) / steps, self.fraction(self.seconds))
 

@@ -1,4 +1,4 @@
-"""Run folder: reading and writing of its files, each completely or not at all, and the model of the run."""
+"""The files of a run folder, and the model of a run. A file is written completely or not at all."""
 
 import io
 import json
@@ -29,7 +29,7 @@ class RunFolder:
         checkpoint: state from which the fit is resumed.
         weights: the best state_dict so far.
         evaluation: results of `evaluate`.
-        baseline: least-squares baselines, and the coverage of the logs.
+        baseline: least-squares baselines, and the range of motion of the training logs.
         estimator: noise levels of the state estimator.
     """
 

@@ -76,8 +76,8 @@ class Record(BaseModel):
     @classmethod
     def _of_the_objective(cls, options: object, info: ValidationInfo) -> object:
         """Return the options as an object of the objective's configuration class."""
-        # The key is absent if the objective is invalid. pydantic reports the invalid objective, so the options need no
-        # check.
+        # `info.data` has no objective if the objective is invalid. pydantic reports the invalid objective, so the
+        # options need no check.
         if "objective" not in info.data:
             return FitConfig()
         try:

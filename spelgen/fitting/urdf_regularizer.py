@@ -24,8 +24,8 @@ class UrdfRegularizer(NamedTuple):
     Attributes:
         q: (S, n), positions [rad, m].
         whitening: (n, n), W = inverse Cholesky factor of the model's mean M before the fit.
-        variation: (S, n, n) [1], W (M - mean M) W^T for the M of the URDF.
-        gravity: (S, n), gravity torque [Nm, N].
+        variation: (S, n, n), dimensionless, W (M - mean M) W^T for the M of the URDF.
+        gravity: (S, n), gravity torque of the URDF [Nm, N].
         gravity_scale: (n,), divisor of the errors of the gravity torque [Nm, N].
     """
 
@@ -36,7 +36,7 @@ class UrdfRegularizer(NamedTuple):
     gravity_scale: Tensor
 
     def loss(self, model: ArmModel) -> Tensor:
-        """Return the mean squared difference between model and URDF, () [1].
+        """Return the mean squared difference between model and URDF, a dimensionless scalar.
 
         The loss is the sum of two mean squares: of the difference of W (M - mean M) W^T, and of the gravity torque's
         difference divided by its scale.
@@ -74,7 +74,7 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
     Args:
         urdf: URDF file.
         model: model before the fit; the mean of its M is the unit of M.
-        windows: windows with the positions (W, K, n) [rad, m] of the logs.
+        windows: windows of the logs, whose positions define the range.
 
     Raises:
         ImportError: if Pinocchio is not installed. Errors of Pinocchio are raised, too.
@@ -97,5 +97,5 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
 
 
 def _variation(mass: Tensor, whitening: Tensor) -> Tensor:
-    """Return W (M - mean M) W^T, (S, n, n), for mass matrices M (S, n, n) and the whitening matrix W (n, n)."""
+    """Return W (M - mean M) W^T, (S, n, n), for S mass matrices M, (S, n, n), and the whitening matrix W, (n, n)."""
     return whitening @ (mass - mass.mean(dim=0)) @ whitening.mT

@@ -155,21 +155,24 @@ class LoadFilter:
 
 
 class JointFilters:
-    """Independent filters of the friction scale a and the disturbance d of each joint, for a known payload.
+    """Independent filters of the change a of friction and the disturbance d of each joint, for a known payload.
 
-    Filters with different noise can be computed at once: their axes are the leading axes (...). Each filter has K
-    states: (a, d), or (a, b, d) if there is a torque offset b. x: states, (..., n, K). P: covariances, (..., n, K, K).
+    The friction torque is 1 + a times the friction torque of the model. Each filter has K states: (a, d), or (a, b, d)
+    if there is a torque offset b. Filters with different noise can be computed at once, along the leading axes (...) of
+    all arrays.
+
+    x: states, (..., n, K). P: covariances, (..., n, K, K).
     """
 
     def __init__(
         self, deviations: np.ndarray, white: np.ndarray, time_constant: np.ndarray, *, drifts: bool = False
     ) -> None:
-        """Initialize the states to zero.
+        """Initialize all states to zero: friction as in the model, no offset and no disturbance.
 
         Args:
             deviations: prior standard deviations of the states, (..., n, K). The value for d is also the stationary
                 standard deviation of d.
-            white: standard deviations of white noise, (..., n) [Nm, N].
+            white: standard deviations of the white noise of the torque residual y, (..., n) [Nm, N].
             time_constant: time constant of d, (..., n) [s].
             drifts: True: a is a random walk, and joints at rest update d. False: a is constant, and joints at rest
                 update no state.

@@ -177,7 +177,7 @@ def find_levels(
 
 
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
-    """Return the factor by which the covariance of an estimated payload is multiplied, and its degrees of freedom.
+    """Return the factor on the covariance of an estimated payload, and the degrees of freedom of this factor.
 
     The factor is the mean normalised squared error of estimated payloads. The logs are without payload, so each
     estimated payload is an error. Each window of consecutive blocks gives one estimate (a trial), with two errors: the
@@ -249,9 +249,9 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
-    """Return the levels with the noise of the momentum observer, and with the exponential tail of its peaks.
+    """Return ``levels`` with the noise of the momentum observer, and with the distribution of the largest peaks.
 
-    tested: held-out samples of each log.
+    The new fields are ``observer`` to ``peak_count`` of `NoiseLevels`. tested: held-out samples of each log.
     """
     residuals = [_observer_residuals(levels, samples) for samples in tested]
     signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))
@@ -288,7 +288,7 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
 def _observer_residuals(
     levels: NoiseLevels, samples: Sequence[HeldOutSample]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the residual of the momentum observer, its variance and the velocities, (T, n) each."""
+    """Return the residual of the momentum observer, the variance of the residual, and qd, (T, n) each, at T samples."""
     observer = ContactObserver(levels, TUNING.alarms_per_minute)
     drift = JointFilters.of_drift(levels.drift)
     columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
@@ -305,7 +305,7 @@ def _observer_residuals(
 def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, object]:
     """Return the parameters of an exponential distribution of the largest peaks, as fields of `NoiseLevels`.
 
-    peaks: peaks of each log, (W, n) [1]; they are multiplied by `factor`.
+    peaks: peaks of each log in W time windows, (W, n) [1]; they are multiplied by `factor`.
     """
     together = factor * np.concatenate(peaks)
     start = np.quantile(together, 1 - TUNING.tail, axis=0)

@@ -91,7 +91,7 @@ def balance(
         model: model in double precision.
         point: point of the last body, in the frame of this body, whose Jacobian is returned, (3,) [m].
         samples: q, qd and tau, (T, n).
-        bounds: lower and upper bound of the friction state, (T, n, K) [rad, m].
+        bounds: lower and upper bound of the friction state of K bristles per drive, (T, n, K) [rad, m].
         prepared: parameter cache of the model; None: the function computes it.
     """
     with torch.no_grad():

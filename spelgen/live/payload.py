@@ -93,7 +93,7 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive definite matrix (k, k) whose entries may differ by orders of magnitude."""
+    """Return the inverse of a positive definite matrix whose entries may differ by orders of magnitude."""
     root = solve_triangular(np.linalg.cholesky(matrix), np.eye(len(matrix)), lower=True)
     inverse: np.ndarray = root.T @ root
     return inverse
@@ -118,7 +118,7 @@ def _at_scale(
         scale: mass of the prior mean [kg].
         start: parameters from which Newton's method starts with w = 1, (10,).
     """
-    # The prior mean is a ball whose centre is at a distance from the origin along z.
+    # The prior mean is a homogeneous ball, whose centre is on the z axis at the position +`TUNING.distance`.
     height, about_z = TUNING.distance, 2 / 5 * TUNING.radius**2
     about_x = about_z + height**2
     mean = scale * np.array([1, 0, 0, height, about_x, 0, 0, about_x, 0, about_z])

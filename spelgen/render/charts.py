@@ -263,14 +263,14 @@ def _spaced(pixels: np.ndarray) -> str:
 
 
 def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
-    """Return the finite values of all columns (T,) as one array (K,); if `positive`, only the positive values."""
+    """Return the finite values of all columns as one vector; if `positive`, only the positive values."""
     values = np.concatenate([np.zeros(0), *columns])
     drawable: np.ndarray = values[np.isfinite(values) & ((values > 0) | (not positive))]
     return drawable
 
 
 def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool) -> Axis:
-    """Return an axis for the values (K,) with margins of `pad` times their range on both sides."""
+    """Return an axis for a vector of values, with margins of `pad` times the range of the values on both sides."""
     low, high = float(values.min()), float(values.max())
     if log:
         low = max(low, high * 10.0**-TUNING.decades)
@@ -285,12 +285,12 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
 
 
 def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Return ticks (K,) and labels of a logarithmic axis: powers of ten, if at least three are on the axis.
+    """Return ticks and labels of a logarithmic axis: powers of ten, if at least three are on the axis.
 
     Otherwise the ticks are 1, 2 and 5 times powers of ten. If fewer than three of these values are on the axis, the
     ticks are equidistant, as on a linear axis (`_steps`).
     """
-    # The tolerance includes a power of ten at the end of the axis despite rounding.
+    # With the tolerance 1e-9, a power of ten at the end of the axis is included despite rounding.
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
     powers = range(first, last + 1, max(1, (last - first) // 5 + 1))
     if len(powers) >= 3:
@@ -304,7 +304,7 @@ def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
 
 
 def _steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Return ticks (K,) and labels at multiples of 1, 2 or 5 times a power of ten."""
+    """Return ticks and labels of a linear axis: multiples of 1, 2 or 5 times a power of ten."""
     # The step is the smallest of 1, 2, 5 or 10 times a power of ten that gives at most five intervals.
     rough = (high - low) / 5
     fine = 10.0 ** math.floor(math.log10(rough)) * np.array([1, 2, 5, 10])

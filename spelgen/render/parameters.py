@@ -113,7 +113,7 @@ def base_table(
         columns["model"] = list(map(_number, learned))
     columns["least squares, 95 %"] = list(map(_interval, parameters))
     columns["determined"] = determined
-    # The formula is omitted if it equals the name: the parameter is then not combined with others.
+    # The formula of a base parameter is omitted if it equals the name: the parameter is then not a combination.
     columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
     rows = list(zip(*columns.values(), strict=True))
     sure = tuple(row for row in rows if row[-2] in PRECISE)

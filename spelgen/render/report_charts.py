@@ -1,4 +1,4 @@
-"""Charts of the report on a run: from the curves of its evaluation, the losses and the coverage of the logs."""
+"""Charts of the report on a run: training losses, curves of the evaluation, and ranges of motion of the logs."""
 
 from collections.abc import Sequence
 
@@ -59,7 +59,8 @@ def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
     """Return the chart of training and validation loss over the epochs, with a line at the epoch of the best model."""
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
     epochs, *losses = array(columns).T
-    # The vertical line extends from the smallest to the largest loss. It cannot start at zero on a logarithmic axis.
+    # The vertical line at the best epoch extends from the smallest to the largest loss: on a logarithmic axis it cannot
+    # start at zero.
     ends = (np.nanmin(losses), np.nanmax(losses))
     lines = [
         Line("training loss", epochs, losses[0], "train"),
@@ -117,7 +118,10 @@ def friction_panels(
 
 
 def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
-    """Return limits of the y axis that contain the model's curve and the values (K,) [Nm, N] except outliers."""
+    """Return limits of the y axis that contain the model's curve, and all values except outliers.
+
+    values: measured friction [Nm, N]. curve: friction of the model [Nm, N]. None if no value is finite.
+    """
     values = values[np.isfinite(values)]
     if not values.size:
         return None

@@ -176,7 +176,10 @@ def _rotation(joint: UrdfJoint) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Triangle mesh: vertices (V, 3) [m] in the link frame, vertex indices (F, 3) counterclockwise from outside."""
+    """Triangle mesh in the link frame.
+
+    vertices: (V, 3) [m], V vertices. faces: (F, 3), vertex indices of F triangles, counterclockwise from outside.
+    """
 
     vertices: Curve
     faces: Annotated[np.ndarray, PlainValidator(np.array), PlainSerializer(np.ndarray.tolist)]

@@ -21,11 +21,11 @@ class ChainConfiguration(NamedTuple):
     place: Tensor  # positions [m] of the points times the square roots of their masses, (..., 3, bodies, 4)
     mass: Tensor  # square roots of the masses of the four points of each body, (..., 1, bodies, 4)
     axes: Tensor  # twist of each body relative to its parent per unit joint rate, (..., 6, bodies)
-    # Derivatives of the coordinates of all points with respect to the joint displacement of each body, times
-    # the square roots of the masses, (..., bodies, 12 bodies): 3 coordinates of 4 points per body.
+    # Derivatives of the coordinates of all points with respect to the joint displacement of each of B bodies,
+    # times the square roots of the points' masses, (..., B, 12 B): 3 coordinates of 4 points per body.
     jacobian: Tensor
-    # Minus the acceleration of gravity, times the square root of the mass, for each coordinate of each
-    # point, (..., 12 bodies) [m/s^2 kg^(1/2)].
+    # Minus the acceleration of gravity, times the square root of the point's mass, for each coordinate of
+    # each point of each of B bodies, (..., 12 B) [m/s^2 kg^(1/2)].
     weight: Tensor
 
 

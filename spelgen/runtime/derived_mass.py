@@ -146,7 +146,7 @@ class DerivedMass(LinearMass):
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
-        """Return M'(q), (..., n, n), and the values that its derivatives need.
+        """Return M'(q), (..., n, n), and the values that the derivatives of M' need.
 
         The values are the intermediate values of the network, and the factor t (see the class).
         """
@@ -266,7 +266,7 @@ class DenseMass(nn.Module):
         return solution
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, DenseIntermediates]:
-        """Return M(q), (..., n, n), and the intermediates of its derivatives."""
+        """Return M(q), (..., n, n), and intermediate values for the derivatives of M."""
         raw, intermediates = self.network.forward(encoded, layers)
         factor, scale = self._factor(raw)
         # U^-1 A is solved from a triangular system. An inversion of the larger matrix C U diag(e) U^T C^T

@@ -15,7 +15,10 @@ SMOOTHING_VELOCITY = 0.006
 
 
 class FrictionConstants(NamedTuple):
-    """The friction constants of all joints, (n,). All are >= 0; torques are 0 at joints without friction."""
+    """The friction constants of all joints, (n,), and of K bristles per joint, (n, K).
+
+    All are >= 0; torques are 0 at joints without friction.
+    """
 
     viscous: Tensor  # viscous friction coefficient [Nm s/rad, N s/m]
     saturation: Tensor  # limit of the saturating viscous friction [Nm, N]
@@ -120,7 +123,7 @@ class FrictionLaws(nn.Module):
     ) -> None:
         """Create the friction of the joints, with all constants at their initial values.
 
-        breakaway: break-away displacements per joint type, (K,) [rad, m], shortest first.
+        breakaway: break-away displacements of K bristles per joint type, (K,) [rad, m], shortest first.
         """
         super().__init__()
         self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
@@ -162,7 +165,7 @@ def turning(velocity: Tensor, width: Tensor) -> Tensor:
 
 
 class SlidingFriction(FrictionLaws):
-    """Friction without state: dry friction depends on velocity; the width of its sign change is trained."""
+    """Friction without state: dry friction depends on velocity by a smooth sign, whose width is trained."""
 
     parameter_groups = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", SMOOTHING_VELOCITY),)
 

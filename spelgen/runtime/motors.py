@@ -133,5 +133,8 @@ class PositionServo(nn.Module):
 
 
 def beyond(distance: Tensor, dead_zone: Tensor) -> Tensor:
-    """Return distances, (..., n), reduced by half the width of a dead zone, (n,); zero within the zone."""
+    """Return signed distances x, (..., n), as x - dead_zone above the zone, x + dead_zone below it, else 0.
+
+    dead_zone: half the width of the dead zone, (n,), which is centred at zero.
+    """
     return distance - distance.clamp(-dead_zone, dead_zone)

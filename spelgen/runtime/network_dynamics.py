@@ -97,7 +97,7 @@ class NetworkDynamics(PortHamiltonian):
 
 
 class DenseInputDynamics(NetworkDynamics):
-    """A model whose M, V and D are networks, as is its diagonal input matrix G(q).
+    """A model whose M, V, D and diagonal input matrix G(q) are networks.
 
     The network of G has three outputs per joint, one for each axis of the joint's frame. Only the output of
     the z axis, about or along which the joint moves, is used.
@@ -184,7 +184,7 @@ class JointFriction(NetworkFriction):
     def forward(
         self, encoded: Tensor, qd: Tensor, parameters: JointFrictionParameters, right: Tensor
     ) -> Tensor:
-        """Return the product of D(q, qd) and the matrix ``right``, (..., n, k)."""
+        """Return the product of D(q, qd) and the matrix ``right``; both are (..., n, columns)."""
         layers, viscous, smoothing = parameters
         smooth_speed = torch.sqrt(qd * qd + smoothing)
         inputs = torch.cat([encoded, qd, qd / smooth_speed], dim=-1)
@@ -219,7 +219,7 @@ class DenseFriction(NetworkFriction):
         return self.network.prepare(output_map, (size * self.initial).flatten())
 
     def forward(self, encoded: Tensor, qd: Tensor, layers: Layers, right: Tensor) -> Tensor:
-        """Return the product of D(q, qd) and the matrix ``right``, (..., n, k)."""
+        """Return the product of D(q, qd) and the matrix ``right``; both are (..., n, columns)."""
         rows = self.network.forward(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
         factor = rows.reshape(*qd.shape[:-1], *self.initial.shape)
         return factor @ (factor.mT @ right)

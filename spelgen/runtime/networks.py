@@ -195,7 +195,7 @@ class MaskedMLP(MaskedNetwork):
 class Bumps(NamedTuple):
     """Arguments and values of the Gaussians of a layer of ``MaskedKAN``, (..., inputs, GRID) each."""
 
-    distance: Tensor  # distance of the input from each grid point, in grid spacings
+    distance: Tensor  # input minus grid point (signed), in grid spacings
     height: Tensor
 
 

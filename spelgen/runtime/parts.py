@@ -24,7 +24,7 @@ class Mass(Protocol):
         """Return the parameter cache: quantities that depend on trained parameters only."""
 
     def forward(self, encoded: Tensor, parameters: Parameters) -> tuple[Tensor, Intermediates]:
-        """Return M(q), (..., n, n), and intermediate values for its derivatives."""
+        """Return M(q), (..., n, n), and intermediate values for the derivatives of M."""
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Intermediates) -> Tensor:
         """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""

@@ -221,8 +221,8 @@ class ResidualTerms(nn.Module):
 
     def splines(self, q: Tensor) -> Tensor:
         """Return the values of the cubic B-splines at q, (..., n, SPLINES); their maximum is 2/3."""
-        # At the distance d from its middle, a cubic B-spline of unit spacing is (max(2 - d, 0)^3 - 4 max(1 -
-        # d, 0)^3) / 6.
+        # At the distance d >= 0 from its middle, a cubic B-spline of unit spacing is (max(2 - d, 0)^3 - 4
+        # max(1 - d, 0)^3) / 6.
         wide = (2 - self._distances(q).abs()).relu()
         return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4) / 6
 
@@ -232,7 +232,7 @@ class ResidualTerms(nn.Module):
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
 
     def _distances(self, q: Tensor) -> Tensor:
-        """Return the signed distance of q from each spline's middle, in knot spacings, (..., n, SPLINES)."""
+        """Return q minus the middle of each spline (signed), in knot spacings, (..., n, SPLINES)."""
         return (q.unsqueeze(-1) - self.middles) / self.spacing
 
 
@@ -253,7 +253,7 @@ class ResidualDynamics(RigidBodyDynamics):
         return prepared._replace(residual=self.residuals.prepare(prepared.armature))
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m]; the residual R is part of its M."""
+        """Return the configuration cache at q, (..., n) [rad, m]; M in the cache includes the residual R."""
         cache = super().configuration(q, prepared)
         if self.residuals is None:
             return cache

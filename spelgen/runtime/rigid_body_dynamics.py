@@ -37,8 +37,8 @@ class RigidConfiguration(NamedTuple):
 class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction and a torque offset.
 
-    The friction state z, (..., n, K) [rad, m], has the displacements of the bristles, whose energy is part of
-    H. Without z, dry friction depends on velocity.
+    The friction state z, (..., n, K) [rad, m], has the displacements of K bristles per motor, whose energy is
+    part of H. Without z, dry friction depends on velocity.
 
     Args:
         motor_speeds: rows of the matrix C, (n, n), for which C qd are the motor speeds; friction, z and

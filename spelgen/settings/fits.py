@@ -70,8 +70,9 @@ class GaussianPrior(Group):
         shared_friction: Common factor of all friction of all joints.
         friction_compensation: Friction compensation of a drive, divided by typical friction per typical speed, if the
             logs show any.
-        degrees_of_freedom: Degrees of freedom of the Student-t prior of each body. When a standard deviation is
-            estimated, this number is also the weight of its initial value, as a number of parameters.
+        degrees_of_freedom: Weight of the initial value of an estimated standard deviation, as a number of parameters.
+            The standard deviation of each single body is estimated with the same weight, so that the prior of a body is
+            a Student-t distribution with these degrees of freedom.
     """
 
     bodies: Positive = 0.75

@@ -51,7 +51,7 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
 
 
 def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
-    """Write the settings of a URDF and return its arm, with angles rounded by the tolerance of ``arm``."""
+    """Write the settings of a URDF; return the arm of this URDF, with angles rounded by the tolerance of ``arm``."""
     write_text(path.with_suffix(".yaml"), yaml.safe_dump(settings, sort_keys=False, allow_unicode=True))
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
 

@@ -33,7 +33,7 @@ def rollout(
         dynamics: The arm, with friction.
         initial: State (2n,) at t[0].
         t: Times (T,) [s].
-        tau: Joint torques (T, n) [Nm; N]; tau[k] acts from t[k] to t[k+1].
+        tau: Joint torques (T, n) [Nm, N]; tau[k] acts from t[k] to t[k+1].
         tolerance_factor: Factor of the default relative and absolute tolerances.
     """
     n = tau.shape[1]

@@ -111,7 +111,7 @@ def prescribed(
 
 
 def friction_along(friction: DriveFriction, arm: Chain, motion: Motion, presliding: float) -> np.ndarray:
-    """Return the friction torque (T, n) [Nm; N] along a motion.
+    """Return the friction torque (T, n) [Nm, N] along a motion.
 
     Maxwell-slip model (Al-Bender, Lampaert, Swevers, IEEE TAC 50:1883, 2005): elements in parallel, each of which
     sticks up to its own breakaway displacement and then slips. The direction of dry friction is the mean normalised

@@ -1,4 +1,4 @@
-"""Functions and classes for all simulation protocols: friction, initial positions, desired motions, and logs."""
+"""Parts of all simulation protocols: friction model, sample times, range of positions, desired motions, and results."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def make_friction(arm: Chain, settings: Settings, speeds: np.ndarray | None = No
 
 
 def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest initial positions, (n,) each [rad; m].
+    """Return the lowest and the highest initial positions, (n,) each [rad, m].
 
     Raises SettingsError if neither the settings nor the URDF specify a range for a joint.
     """
@@ -123,8 +123,8 @@ def sines(
     """Return the motion middle + amplitude sin(2 pi frequency t + phase), (T, n).
 
     Args:
-        middle: Mean positions (n,) [rad; m].
-        amplitude: Amplitudes (n,) [rad; m].
+        middle: Mean positions (n,) [rad, m].
+        amplitude: Amplitudes (n,) [rad, m].
         frequency: Frequency of all joints [Hz].
         phase: Phases (n,) [rad].
         t: Times (T,) [s].
@@ -136,9 +136,9 @@ def sines(
 
 
 def _amplitude(arm: Chain, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the amplitudes of the sines, (n,) [rad; m].
+    """Return the amplitudes of the sines, (n,) [rad, m].
 
-    low, high: ranges of the joints, (n,) each [rad; m]. Raises SettingsError if the amplitude in the settings is larger
+    low, high: ranges of the joints, (n,) each [rad, m]. Raises SettingsError if the amplitude in the settings is larger
     than half the range of a joint.
     """
     amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()

@@ -60,7 +60,7 @@ def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
 
 
 def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return simulated positions (T, n) [rad; m]; the arm starts at rest at the first command.
+    """Return simulated positions (T, n) [rad, m]; the arm starts at rest at the first command.
 
     Method: semi-implicit Euler with dry friction as impulses. The impulse of a joint's dry friction stops it, within
     the bounds of Coulomb friction (projected Gauss-Seidel, as in physics engines: Catto, Iterative Dynamics with
@@ -71,7 +71,7 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
         settings: `joints` and `simulation.delay` are used. The default of a servo's gain kp is twice its torque limit
             per rad or m. The gain kd is always `TUNING.servo_lag` times kp.
         t: Times (T,) [s], at equal steps.
-        u: Commanded positions (T, n) [rad; m].
+        u: Commanded positions (T, n) [rad, m].
     """
     dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
     limit = np.array([coordinate.effort or TUNING.servo_effort for coordinate in arm.coordinates])
@@ -106,8 +106,8 @@ def _after_dry_friction(
     Args:
         qd: Velocity (n,) without dry friction.
         inverse: Inverse of the mass matrix, (n, n).
-        lower: Lower bounds of the impulses, given by Coulomb friction, (n,) [Nm s; N s].
-        upper: Upper bounds of the impulses, given by Coulomb friction, (n,) [Nm s; N s].
+        lower: Lower bounds of the impulses, given by Coulomb friction, (n,) [Nm s, N s].
+        upper: Upper bounds of the impulses, given by Coulomb friction, (n,) [Nm s, N s].
     """
     impulse = np.zeros_like(qd)
     for _ in range(TUNING.friction_sweeps):

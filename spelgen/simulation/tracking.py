@@ -44,8 +44,8 @@ class Recording:
     Attributes:
         t: Times, (T,) [s].
         states: True positions and velocities, (T, 2n) [rad, rad/s; m, m/s].
-        encoders: Positions rounded to steps of the encoders, (T, n) [rad; m].
-        tau: Motor torques, (T, n) [Nm; N]; tau[k] acts from t[k] to t[k+1].
+        encoders: Positions rounded to steps of the encoders, (T, n) [rad, m].
+        tau: Motor torques, (T, n) [Nm, N]; tau[k] acts from t[k] to t[k+1].
     """
 
     t: np.ndarray
@@ -98,7 +98,7 @@ def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
     """Return PID gains that place both poles of the position loop at the bandwidth.
 
     Args:
-        inertia: Inertias (n,) [kg m^2; kg] of the joints.
+        inertia: Inertias (n,) [kg m^2, kg] of the joints.
         bandwidth: Bandwidth of the position loop [Hz].
     """
     omega = 2 * np.pi * bandwidth
@@ -115,7 +115,7 @@ def computed_torque(
     velocity_error: np.ndarray,
     omega: float,
 ) -> np.ndarray:
-    """Return the joint torques (n,) [Nm; N] of inverse-dynamics control (Siciliano et al., Robotics, 2009, 8.5.2).
+    """Return the joint torques (n,) [Nm, N] of inverse-dynamics control (Siciliano et al., Robotics, 2009, 8.5.2).
 
         M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
 
@@ -125,7 +125,7 @@ def computed_torque(
         dynamics: The simulated arm; the controller uses its true parameters.
         friction: Friction of the drives.
         motion: Measured q, desired qd* and qdd*, (n,) each.
-        error: Position error e (n,) [rad; m].
+        error: Position error e (n,) [rad, m].
         velocity_error: Velocity error e' (n,).
         omega: Natural frequency of the error [rad/s].
     """
@@ -189,7 +189,7 @@ def record(
 
 
 def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
-    """Return the log of a recording: low-pass filtered positions, their central differences, and torques."""
+    """Return the log of a recording: low-pass filtered positions, velocities by central differences, and torques."""
     sample_rate = 1.0 / (recording.t[1] - recording.t[0])
     q = low_pass_regular(recording.encoders, sample_rate, tracking.cutoff)
     return Trajectory(recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau, name)

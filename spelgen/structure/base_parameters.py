@@ -51,7 +51,7 @@ def base_parameter_count(arm: Chain) -> int:
         points *= 2
 
 
-# The result is cached: least squares, checks of logs and closed forms need it for the same arm.
+# The base parameters of an arm are cached, since least squares, checks of logs and closed forms all need them.
 @lru_cache(maxsize=16)
 def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     """Return the base parameters of ``arm``, in the order of the bodies from the root."""

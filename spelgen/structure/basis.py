@@ -161,7 +161,7 @@ def _candidates(
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the functionals may depend on.
-        kernel: basis of the functionals that do not change with the positions of all other joints, (m, entries).
+        kernel: basis of m functionals that do not change with the positions of all other joints, (m, entries).
         bound: indices of the entries of M at the pivots of the echelon basis of the changes of M with these other
             joints. Each row of `kernel` is 1 at one entry that is not in `bound`, and 0 at all others not in `bound`.
         tried: indices of the entries that were candidates for a set of joints before; they are skipped. This function

@@ -51,7 +51,7 @@ class Nominal:
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
     """Return the nominal values of ``arm`` for the outputs and constants of its ``structure``."""
-    # The seed is fixed, because these numbers are part of the emitted module, which must be reproducible.
+    # The seed is fixed, because the nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = list(map(working_range, arm.coordinates))
     q = np.stack([rng.uniform(lower, upper, 512) for lower, upper in ranges], axis=-1)
@@ -117,7 +117,10 @@ def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
 
 
 def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
-    """Whether, for the inertials of the URDF, every joint moves a mass and M is positive definite at q (S, n)."""
+    """Whether, with the inertials of the URDF, every joint moves a mass and M is positive definite.
+
+    M is tested at S positions q, (S, n) [rad, m].
+    """
     mass, _ = float_energies(arm, q, nominal_inertias(arm, True))
     rows, columns = np.tril_indices(q.shape[1])
     lightest = mass.mean(axis=0)[rows == columns].min()
@@ -138,7 +141,7 @@ def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | 
 
 
 def _default_inertia(arm: Chain, index: int) -> list[float]:
-    """Return the inertial parameters (m, h, I) of a sphere of 1 kg about the origin of the body's joint.
+    """Return mass, first moment and inertia (m, h, I), about the origin of the body's joint, of a sphere of 1 kg.
 
     The centre of the sphere is half-way to the next joint. For the last body, or if the next joint is closer than
     0.2 m, the centre is at (0.1, 0, 0.1) m in the frame of the body's joint.
@@ -175,7 +178,7 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
 
 
 def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
-    """Return the root mean square over q (S, n) of the gravity torque dV/dq, (n,) [Nm, N]."""
+    """Return the root mean square over S positions q, (S, n), of the gravity torque dV/dq, (n,) [Nm, N]."""
     # [rad, m] Step of the central differences. Their relative error of 1e-8 is small enough for scales.
     step = 1e-4
     shifts = step * np.eye(q.shape[1])[:, None]
@@ -194,7 +197,7 @@ def _mass_changes(
 
     Args:
         arm: the arm.
-        q: sampled positions, (S, n) [rad, m].
+        q: S sampled positions, (S, n) [rad, m].
         inertias: ten inertial parameters of each body.
         mass: lower triangles of M at q, (S, n(n+1)/2).
         typical: magnitudes of the entries of M, (n(n+1)/2,), by which the changes are divided.
@@ -234,7 +237,10 @@ def _round(value: float, digits: int = 6, zero_below: float = 1e-12) -> float:
 
 
 def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
-    """Return pseudo-inertias J (..., 4, 4) of inertial parameters (m, h, I), (..., 10), ordered as ``Body.inertia``."""
+    """Return pseudo-inertias J, (..., 4, 4), of inertial parameters (m, h, I), (..., 10).
+
+    m: mass; h: first moment; I: inertia about the origin, in the order of ``Body.inertia``.
+    """
     values = np.asarray(parameters, dtype=float)
     tensor = np.zeros((*values.shape[:-1], 3, 3))
     rows, columns = np.triu_indices(3)
@@ -248,7 +254,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
 
 
 def parameters_of(pseudo: np.ndarray) -> np.ndarray:
-    """Return the inertial parameters (m, h, I), (..., 10), of pseudo-inertias (..., 4, 4)."""
+    """Return the inertial parameters (m, h, I), (..., 10), of pseudo-inertias (..., 4, 4); see `pseudo_inertia`."""
     second_moment = pseudo[..., :3, :3]
     tensor = _trace(second_moment) * np.eye(3) - second_moment
     mass, first_moment = pseudo[..., 3, 3:], pseudo[..., :3, 3]
@@ -264,7 +270,7 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the Cholesky factor of a consistent pseudo-inertia, and whether the parameters are consistent.
 
     Args:
-        parameters: (m, h, I) of a body, (10,) [kg, kg m, kg m2].
+        parameters: mass, first moment and inertia (m, h, I) of a body, (10,) [kg, kg m, kg m2].
 
     Returns:
         C (4, 4) with C C^T = J. If the parameters are inconsistent, the smallest eigenvalues of J are raised.

@@ -115,8 +115,8 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
     """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S).
 
-    values: (2 S,). The first half is for all blocks except for block ``index`` + 1, which gets the second half: only
-    there, this coordinate differs from block 0.
+    values: (2 S,). All blocks get the first S values except block ``index`` + 1, which gets the last S values: only in
+    that block, this coordinate differs from block 0.
     """
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
@@ -125,7 +125,7 @@ def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
 
 
 def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a batch of field elements, or an integer, broadcast to an array of this shape, such as (1 + n, S)."""
+    """Return a batch of field elements, or an integer, broadcast to an array of this shape."""
     if isinstance(element, Residues):
         return np.broadcast_to(element.values, shape)
     return np.full(shape, element % PRIME, dtype=np.uint64)
@@ -134,9 +134,9 @@ def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarr
 class Spans:
     """Spans of M and of its changes in the prime field.
 
-    A row has the n(n+1)/2 entries of the lower triangle of M. The rows of ``mass`` (S, entries) span W, the space of
-    all M(q); the rows of ``changes[k]`` (S, entries) span T_k, the changes of M if only coordinate k moves. U is the
-    sum of all T_k.
+    A row has the n(n+1)/2 entries of the lower triangle of M. The S rows of ``mass``, (S, entries), are samples that
+    span W, the space of all M(q); the S rows of ``changes[k]``, (S, entries), span T_k, the changes of M if only
+    coordinate k moves. U is the sum of all T_k. A basis has one row per dimension of the spanned space.
     """
 
     def __init__(self, arm: Chain, assume: Assume):
@@ -183,12 +183,12 @@ class Spans:
         return float_samples(self._arm, self._assume, 2 * self._count)
 
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
-        """Return rows (m, entries) that span the changes of M caused by ``joints``, in double precision."""
+        """Return rows (2 S joints, entries) that span the changes of M caused by ``joints``, in double precision."""
         base = self.floats[0]
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
 
     def outside(self, joints: frozenset[int]) -> np.ndarray:
-        """Return an echelon basis of the changes of M with the positions of joints not in ``joints``, (m, entries).
+        """Return an echelon basis of the changes of M caused by all joints except ``joints``, (dimension, entries).
 
         The entries of M are in the order ``order``.
         """
@@ -200,17 +200,17 @@ class Spans:
 
     @cached_property
     def _nearer_root(self) -> list[np.ndarray]:
-        """Echelon basis, for each joint, of the changes of M caused by joints nearer the root, (m, entries)."""
+        """Echelon basis, for each joint, of the changes of M caused by joints nearer the root, (dimension, entries)."""
         return _sums(self.change_bases)
 
     @cached_property
     def _nearer_tip(self) -> list[np.ndarray]:
-        """Echelon basis, for each joint, of the changes of M caused by joints nearer the tip, (m, entries)."""
+        """Echelon basis, for each joint, of the changes of M caused by joints nearer the tip, (dimension, entries)."""
         return _sums(self.change_bases[::-1])[::-1]
 
 
 def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return a list of echelon bases, (m, entries) each; element k spans the sum of the spans of ``bases[:k]``."""
+    """Return a list of echelon bases, (dimension, entries) each; element k spans the sum of ``bases[:k]``."""
 
     def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
         return field.row_basis(np.concatenate([rows, basis]))

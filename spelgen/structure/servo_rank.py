@@ -68,7 +68,7 @@ def servo_rank(arm: Chain) -> ServoRank:
 
 
 def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-    """Return the torque regressor Y (S, n, 10 B) of B bodies from Lagrange's equations.
+    """Return the torque regressor Y, (S, n, 10 B), of B bodies at S states, from Lagrange's equations.
 
     Args:
         arm: the arm.
@@ -81,7 +81,7 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     """
     samples, n = q.shape
     step = 1e-30
-    # Directions of the derivatives with respect to q: each coordinate, and, for d/dt, the velocity qd.
+    # n + 1 directions of the derivatives with respect to q: the n coordinate axes, for d/dq, and last qd, for d/dt.
     directions = np.concatenate([np.tile(np.eye(n), (samples, 1, 1)), qd[:, None]], axis=1)  # (S, n + 1, n)
     inertias = np.split(np.eye(10 * len(arm.bodies)), len(arm.bodies))
     shifted = q[:, None, None] + 1j * step * directions[:, :, None]
@@ -89,8 +89,8 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     mass = np.zeros((*potential.shape, n, n), dtype=complex)  # (S, n + 1, 10 B, n, n)
     for entry, (row, column) in enumerate(triangle(n)):
         mass[..., row, column] = mass[..., column, row] = triangles[..., entry]
-    # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq. For d/dt (M qd), M is differentiated along the last direction,
-    # qd, and qd itself changes at the rate qdd.
+    # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq. In time `step`, q changes by step qd (the last direction) and qd
+    # changes by step qdd, so the imaginary part of `momentum` is step d/dt (M qd).
     momentum = np.einsum("spij,sj->sip", mass[:, n], qd + 1j * step * qdd)
     kinetic = np.einsum("skpij,si,sj->skp", mass[:, :n], qd, qd) / 2
     return np.asarray((momentum - kinetic + potential[:, :n]).imag / step)

@@ -35,8 +35,8 @@ class LinkShape:
             radius [m], "mesh" with the scale factors along x, y and z.
         pose: homogeneous transform (4, 4) of the shape in the frame of the link.
         file: name of the file of a mesh in the URDF.
-        mesh: scaled vertices (V, 3) [m] in the frame of the shape, and vertex indices (F, 3) of triangles; None for
-            other kinds.
+        mesh: scaled vertices (V, 3) [m] of a mesh in the frame of the shape, and vertex indices (F, 3) of the
+            triangles, with V vertices and F triangles; None for other kinds.
     """
 
     link: str

@@ -42,7 +42,7 @@ class MeshFolder:
 
 
 def main(faces: int, meshes: list[tuple[str, list[float]]], output: IO[bytes]) -> None:
-    """Write the arrays v0, f0, v1, f1, ...: vertices (V, 3) [m] and triangles (F, 3) of each mesh that can be read.
+    """Write the arrays v0, f0, v1, f1, ...: V vertices (V, 3) [m] and F triangles (F, 3) of each mesh that can be read.
 
     Args:
         faces: Largest number of triangles of each mesh; meshes with more triangles are simplified.

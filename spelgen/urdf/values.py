@@ -102,7 +102,7 @@ class Element:
         name = self.text("name")
         if not name or not name.strip():
             self.error("no name" if name is None else "an empty name", "a name", 'add name="..."')
-        # The length is bounded, because names occur in error messages, file names and the emitted module.
+        # The length of a name is bounded, because names occur in error messages, file names and the emitted module.
         elif len(name) > MAX_NAME:
             self.error(f"a name of {len(name)} characters", f"at most {MAX_NAME}")
         elif not self._is_unexpanded(name, "name"):

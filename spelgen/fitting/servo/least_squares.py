@@ -21,7 +21,11 @@ from spelgen.fitting.servo.windows import ServoWindows, body_load
 
 
 def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
-    """Set kp, kd, armature, friction and offset of the model to the least-squares solution of the command error."""
+    """Set kp, kd, armature, friction and offset of the model by linear regression of the command error u - q.
+
+    u - q, commanded minus measured position, is linear in the ratios of these parameters to kp (see the top of this
+    module).
+    """
     delay = 1 / windows.rate
     model.servo.delay.fill_(delay)
     friction, servo = model.friction, model.servo
@@ -66,7 +70,7 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         columns: (W, K, n, 5), regressors of each joint: velocity, acceleration, dry friction divided by its magnitude
             (-1 to 1), torque of the bodies, and 1.
-        errors: (W, K, n), command errors [rad, m] at the K intervals of each of W windows.
+        errors: (W, K, n), command errors u - q [rad, m] at the K intervals of each of W windows.
     """
     matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, W K, 5)
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
@@ -92,7 +96,7 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     # the four unknowns at a time.
     @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
-        """Return the mean command of each interval, (W, K-1, n)."""
+        """Return the mean command of each interval of W windows of K samples, (W, K-1, n) [rad, m]."""
         return windows.commands(delay).mean(dim=2).numpy()
 
     def delayed_error(delay: float) -> float:

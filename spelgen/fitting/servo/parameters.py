@@ -39,7 +39,7 @@ class ServoParameters:
     active: Tensor
 
     def after(self, step: Tensor) -> ServoParameters:
-        """Return the parameters after a step (k,); the delay remains at least zero."""
+        """Return the k parameters after a step (k,); the delay remains at least zero."""
         joints, bodies, delay = step.split([self.joints.numel(), len(self.bodies), 1])
         return replace(
             self,
@@ -50,13 +50,13 @@ class ServoParameters:
 
     @property
     def flat(self) -> Tensor:
-        """All parameters as one vector, (k,)."""
+        """All k parameters as one vector, (k,)."""
         delay = torch.tensor([self.delay], dtype=torch.float64)
         return torch.cat([self.joints.flatten(), self.bodies, delay])
 
 
 class ParameterMap:
-    """The map between `ServoParameters` and the tensors of a model, and the prior.
+    """The map between `ServoParameters` and the tensors of a model, and the prior of the k = p n + r + 1 parameters.
 
     Attributes:
         names: names of the p rows of `ServoParameters.joints`; a parameter with K values per joint has K rows of the
@@ -68,7 +68,7 @@ class ParameterMap:
 
     Args:
         model: the model, which `write` changes.
-        q: (M, n), positions of the logs [rad, m], from which the directions are computed.
+        q: (M, n), M positions of the logs [rad, m], from which the directions are computed.
     """
 
     def __init__(self, model: ArmModel, q: Tensor) -> None:
@@ -120,17 +120,17 @@ class ParameterMap:
             self._model.servo.delay.fill_(x.delay)
 
     def precision(self, x: ServoParameters) -> Tensor:
-        """Return the inverse variances of all parameters in the prior, (k,); in the prior, they are independent."""
+        """Return the inverse prior variances of all parameters, (k,); the parameters are independent in the prior."""
         joints = torch.where(x.active, self._deviations, TUNING.fixed)
         shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
         return torch.cat([joints.flatten(), shared]) ** -2
 
     def inertial(self, bodies: Tensor) -> Tensor:
-        """Return the inertial parameters of all bodies, (10 B,), at coordinates (r,) along the directions."""
+        """Return the inertial parameters of B bodies, (10 B,), at coordinates (r,) along the r `directions`."""
         return self._inertial(self._log_cholesky(bodies)).flatten()
 
     def _log_cholesky(self, bodies: Tensor) -> Tensor:
-        """Return the log-Cholesky parameters (B, 10) at coordinates (r,)."""
+        """Return the log-Cholesky parameters of B bodies, (B, 10), at coordinates (r,) along the r `directions`."""
         return self._mean_bodies + (self.directions @ bodies).view_as(self._mean_bodies)
 
     def _inertial(self, log_cholesky: Tensor) -> Tensor:

@@ -8,8 +8,6 @@ The first term is a Student-t likelihood with three degrees of freedom, which bo
 the arm is blocked, for example by a table. Each joint has one scale. Errors of neighbouring samples are correlated:
 samples_per_error samples count as one independent error. The second term is a Gaussian prior with mean m and precision
 P.
-
-Shapes in this module: W windows, K' samples of a window after the burn-in, n joints, k parameters.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from spelgen.fitting.servo.tuning import TUNING
 
 @dataclass(frozen=True, eq=False)
 class Likelihood:
-    """Student-t likelihood of position errors.
+    """Student-t likelihood of the position errors (W, K', n) of n joints: W windows, K' samples after the burn-in.
 
     scale: (n,), scale of the errors [rad, m]. samples_per_error: (n,), number of correlated samples that count as one
     independent error.
@@ -73,6 +71,8 @@ class Likelihood:
 @dataclass(frozen=True, eq=False)
 class ServoProblem:
     """A `LeastSquaresProblem`: negative log posterior of `ServoParameters` for a given load and likelihood.
+
+    Shapes: W windows, K' samples of a window after the burn-in, n joints, k parameters.
 
     noise: (n,), lower bound of the scale of the position errors [rad, m].
     """
@@ -130,13 +130,16 @@ class ServoProblem:
         return [x.after(step.clamp(-TUNING.max_step, TUNING.max_step))]
 
     def normal_equations(self, x: ServoParameters, errors: Tensor) -> NormalEquations:
-        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) of the cost; errors: (W, K', n)."""
+        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) of the cost at x.
+
+        errors: position errors at x, (W, K', n) [rad, m].
+        """
         return self.with_prior(self.window_equations(x, errors), x)
 
     def with_prior(self, windows: NormalEquations, x: ServoParameters) -> NormalEquations:
-        """Return the sum of normal equations of windows, plus the prior's: Hessian (k, k) and negative gradient (k,).
+        """Return the Hessian (k, k) and the negative gradient (k,) of the cost: sums over windows, plus the prior.
 
-        windows: normal equations of W windows at x, (W, k, k) and (W, k), without the prior.
+        windows: normal equations of each window at x, (W, k, k) and (W, k), without the prior.
         """
         precision = self.parameters.precision(x)
         descent = windows.descent.sum(dim=0) - precision * (x.flat - self.parameters.prior_mean.flat)
@@ -145,7 +148,7 @@ class ServoProblem:
     def window_equations(self, x: ServoParameters, errors: Tensor) -> NormalEquations:
         """Return the normal equations of each window at x, (W, k, k) and (W, k), without the prior.
 
-        errors: at x, (W, K', n).
+        errors: position errors at x, (W, K', n) [rad, m].
         """
         of_joints, of_shared = self.rollouts.jacobian(x)
         weights = self.likelihood.weights(errors)

@@ -109,19 +109,22 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
 
 
 def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
-    """Return the sums (B, ...) of terms (W, ...) over the windows of each block; numbers: (W,), block of a window."""
+    """Return the sums (B, ...) of terms of W windows, (W, ...), over the windows of each of B blocks.
+
+    numbers: index of the block of each window, (W,).
+    """
     return terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:]).index_add(0, numbers, terms)
 
 
 def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
-    """Return a mask (m,), True for parameters that the logs distinguish from all other parameters.
+    """Return a mask (m,) of m parameters, True for parameters that the logs distinguish from all other parameters.
 
     A parameter is distinguished if an upper bound of its variance inflation factor is below
     `ServoTuning.variance_inflation`. Example: dead zone and dry friction of a joint without gravity load are not
     distinguished, since the derivatives of the errors with respect to both are proportional.
 
     Args:
-        blocks: normal equations of B blocks, (B, k, k) and (B, k).
+        blocks: normal equations of B blocks with respect to all k parameters, (B, k, k) and (B, k).
         precision: (k,), precision of the prior.
         indices: (m,), indices of the m parameters.
     """
@@ -210,7 +213,7 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
             if ratio == "dead_zone" and not value:
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
-            # The bound 50 avoids an overflow of exp.
+            # The logarithm is limited to 50, so that exp does not overflow.
             factor = math.exp(min(half, 50.0))
             # The static error, a sum of dry friction and dead zone, may be determined even if its two terms are not.
             determined = factor < TUNING.max_factor and (distinct[joint] or ratio not in ("dry", "dead_zone"))

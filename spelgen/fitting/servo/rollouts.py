@@ -27,6 +27,9 @@ class ServoRollouts:
     joints. A parameter that joints share (body parameters, delay) needs a rollout of its own. All these rollouts form
     one batch.
 
+    Shapes: P sets of parameters, W windows of K samples, K' samples of a window after the burn-in, S integration steps
+    per sample interval, n joints, p parameters per joint, r coordinates of the bodies (see `ServoParameters`).
+
     Attributes:
         motion: the fixed motion.
         load: load along this motion for x0.

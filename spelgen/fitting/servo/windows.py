@@ -24,7 +24,10 @@ from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split
 
 
 class MidpointMotion(NamedTuple):
-    """Positions q, velocities qd and accelerations qdd, (W, K-1, n) each, at the midpoints between samples."""
+    """Motion of W windows of K samples at the K-1 midpoints between samples, (W, K-1, n) each.
+
+    q: positions [rad, m]. qd: velocities [rad/s, m/s]. qdd: accelerations [rad/s^2, m/s^2].
+    """
 
     q: Tensor
     qd: Tensor
@@ -35,10 +38,12 @@ class MidpointMotion(NamedTuple):
 class ServoWindows:
     """W windows of K samples, cut from logs of commanded and measured positions.
 
+    The commands depend on the delay; `commands` computes them from the logs.
+
     Attributes:
         rows: (log, slice of its samples) of each window.
-        q: (W, K, n) [rad, m].
-        qd: (W, K, n) [rad/s, m/s], smoothed.
+        q: measured positions, (W, K, n) [rad, m].
+        qd: smoothed derivatives of the measured positions, (W, K, n) [rad/s, m/s].
         dt: (W, K-1), sample intervals [s].
         burn_in: number of samples at the start of each window whose errors are ignored, since the initial friction
             state is unknown.
@@ -103,7 +108,7 @@ class ServoWindows:
 
 
 def _midpoints(x: Tensor) -> Tensor:
-    """Return the means (W, K-1, n) of each two successive samples of x (W, K, n)."""
+    """Return the means of each two successive samples, (W, K-1, n), of W windows x of K samples, (W, K, n)."""
     return x[:, 1:] / 2 + x[:, :-1] / 2
 
 
@@ -113,7 +118,7 @@ def servo_windows(
     """Return at most ``count`` windows, evenly spread over the logs.
 
     The windows have the length `TUNING.length` or, if all segments between gaps are shorter, the length of the longest
-    segment. Raises LogError if it has fewer than `TUNING.min_samples` samples.
+    segment. Raises LogError if a window would have fewer than `TUNING.min_samples` samples.
     """
     segments: list[Trajectory] = []
     for log in logs:
@@ -141,7 +146,7 @@ def servo_windows(
 
 
 class BodyLoad(NamedTuple):
-    """The load of the bodies on the drives, at the midpoints between the samples of windows.
+    """The load of the bodies on the drives, at the K-1 midpoints between the samples of W windows of K samples.
 
     Attributes:
         inertia: (W, K-1, n), diagonal of M without armature [kg m^2, kg].
@@ -159,7 +164,7 @@ class BodyLoad(NamedTuple):
 
 
 def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
-    """Return the load of the model's bodies along a motion, whose arrays are (W, K-1, n)."""
+    """Return the load of the model's bodies along a motion of W windows of K samples, (W, K-1, n)."""
     batches: list[BodyLoad] = []
     with torch.no_grad():
         prepared, armature = model.prepare(), model.armature

@@ -21,7 +21,7 @@ from spelgen.identification.intervals import (
 class Jackknife(NamedTuple):
     """Covariance and held-out residual of a torque fit.
 
-    covariance: (K, K), covariance of the parameters x; zero for fixed parameters. held_out: (blocks, n) [Nm^2, N^2],
+    covariance: (K, K), covariance of the K parameters x; zero for fixed parameters. held_out: (blocks, n) [Nm^2, N^2],
     sum of the squared torque residual of each block after a fit to all other blocks.
     """
 
@@ -78,7 +78,7 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
 
 
 def _products(jacobian: TorqueJacobian, x: torch.Tensor) -> torch.Tensor:
-    """Return the Gram matrix of [J, residual] of each joint, (n, K + 1, K + 1), at parameters x (K,).
+    """Return the Gram matrix of [J, residual] of each joint, (n, K + 1, K + 1), at the K parameters x (K,).
 
     J is the Jacobian of the torque with respect to theta (see `TorqueJacobian.joint_rows`).
     """

@@ -67,7 +67,7 @@ class TorqueSolution:
         steps: number of accepted steps of the Levenberg-Marquardt solver.
         cost: final cost.
         prior: prior with the estimated standard deviations.
-        covariance: covariance of the parameters x, (K, K).
+        covariance: covariance of the K parameters x, (K, K).
         torque_std: root mean square torque error of held-out blocks, (n,) [Nm, N].
         compensated: joints whose drives compensate friction, (n,).
         correlation_time: correlation time of the torque errors, (n,) [s].

@@ -32,7 +32,7 @@ class _RegressorBlock(NamedTuple):
 
     Attributes:
         speed, acceleration: speeds and accelerations of the drives, (T, n).
-        regressor: of the joint torque, (T, n, 10 B).
+        regressor: regressor of the joint torque with respect to the inertial parameters of B bodies, (T, n, 10 B).
         load_regressor: regressor of the gravity torque on the drives, (T, n, 10 B).
         residual_torque: torque of the residual terms, (T, n) [Nm, N].
         friction_factor: factor of the residual terms on friction, (T, n).
@@ -58,9 +58,9 @@ class ResidualSamples(NamedTuple):
 
 
 class TorqueJacobian:
-    """Torque residual of a model on samples, and its derivatives with respect to the parameters x (K,).
+    """Torque residual of a model on T samples, and the derivatives of the residual with respect to parameters x (K,).
 
-    x contains the parameters of bodies, drives and friction (`ParameterVector`). The modelled joint torque is
+    x contains the K parameters of bodies, drives and friction (`ParameterVector`). The modelled joint torque is
 
         Y(q, qd, qdd) pi + C^T (friction(C qd) + armature C qdd) + torque of the residual terms,
 
@@ -303,18 +303,20 @@ class TorqueJacobian:
     def _compressed_jacobian(
         self, parameters: NamedTensors, block: _RegressorBlock
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-        """Return the torque residual times `logged_scale`, and minus its derivatives, compressed over joints.
+        """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
 
         Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive may
-        have the same colour. Each parameter then affects at most one joint of a colour. Therefore the gradient of the
-        sum of the torques of one colour contains the Jacobian rows of all its joints. One reverse pass per colour (most
+        have the same colour. A drive then acts on at most one joint of a colour, so that each parameter of a drive, and
+        each gravity torque on a drive, affects at most one joint of a colour. Therefore the gradient of the sum of the
+        torques of one colour contains the Jacobian rows of all joints of this colour. One reverse pass per colour (most
         arms have one colour) replaces n passes. Each sample has its own copy of the parameters, so that a pass computes
         the gradients of all samples.
 
         Returns:
-            Residual, (T, n) [Nm, N]. Two lists with one matrix per colour: derivatives with respect to the K'
-                parameters that are not of bodies, (T, K'), and with respect to the gravity torques on the drives,
-                (T, n).
+            The scaled residual, (T, n) [Nm, N].
+            A list of matrices (T, K'), one per colour: derivatives with respect to the K' parameters of drives and
+                friction, that is, to all parameters except body parameters.
+            A list of matrices (T, n), one per colour: derivatives with respect to the gravity torques on the drives.
         """
         copies = {}
         for name, tensor in parameters.items():

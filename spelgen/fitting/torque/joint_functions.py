@@ -38,9 +38,9 @@ LOG_FACTOR_LIMIT = 0.99 * LARGEST
 class JointFunction:
     """A residual term of one joint, as a linear model of P = L + W weights on T samples.
 
-    The parameter of the term has W entries for the joint, for example spline coefficients, divided by `scale`. The last
-    W weights of the linear model are changes of single entries. The first L weights are coefficients of trends, for
-    example of a straight line over all spline coefficients.
+    The term has W entries for the joint, for example spline coefficients; the parameter in the model is the entries
+    divided by `scale`. The last W weights of the linear model are changes of single entries. The first L weights are
+    coefficients of trends, for example of a straight line over all spline coefficients.
 
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].

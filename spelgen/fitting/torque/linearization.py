@@ -26,7 +26,7 @@ class JointRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LinearTerms:
-    """Linear terms of one joint's torque, whose weights are eliminated by variable projection.
+    """Linear terms of one joint's torque, whose P weights are eliminated by variable projection.
 
     features: F, (T, P), torques per unit weight. penalty: diagonal of D, (P,), the penalty on squared weights.
 
@@ -79,7 +79,7 @@ class RigidProjection(NamedTuple):
     posterior_gain: tuple[torch.Tensor, ...]
 
     def orthogonalize(self, joint: int, torque: torch.Tensor) -> torch.Tensor:
-        """Return the part of torques (T, P) on a joint that the rigid-body and friction model cannot absorb."""
+        """Return the part of P torques (T, P) on a joint that the rigid-body and friction model cannot absorb."""
         jacobian = self.jacobian[joint]
         return torque - jacobian @ (self.posterior_gain[joint] @ (jacobian.mT @ torque))
 
@@ -118,7 +118,7 @@ def concatenate_blocks(rows: Iterable[JointRows], joints: int) -> list[JointRows
 def normal_equations(
     rows: Iterable[JointRows], noise: torch.Tensor, count: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return J^T W J (K, K) and J^T W r (K,) for Jacobian J, torque residual r and W = 1 / noise^2.
+    """Return J^T W J (K, K) and J^T W r (K,) for K parameters, with Jacobian J, torque residual r, W = 1 / noise^2.
 
     Args:
         rows: Jacobian rows of all joints and blocks.
@@ -143,7 +143,7 @@ def least_squares_residual(
     Args:
         rows: Jacobian rows of all joints and blocks.
         noise: (n,) standard deviations of the torque noise [Nm, N], which weight the joints.
-        free: (K,) mask of the parameters.
+        free: (K,) mask of the K parameters, True for parameters that are fitted.
     """
     curvature, descent = normal_equations(rows, noise, len(free))
     inverse = torch.zeros_like(curvature)
@@ -158,7 +158,7 @@ def least_squares_residual(
 
 
 def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
-    """Return the pseudo-inverse (K, K) of a curvature matrix (K, K).
+    """Return the pseudo-inverse (K, K) of the curvature matrix (K, K) of K parameters.
 
     The matrix is first scaled to a unit diagonal, since the parameters have different units. Small eigenvalues of the
     scaled matrix are treated as zero.
@@ -196,7 +196,7 @@ class BayesianRidge(NamedTuple):
 def bayesian_ridge(
     products: torch.Tensor, count: int, groups: torch.Tensor, correlation_length: float
 ) -> BayesianRidge:
-    """Fit a linear model, target = features @ coef + noise, with one prior precision per group of weights.
+    """Fit a linear model, target = features @ coef + noise, with one prior precision per group of its P weights.
 
     The noise precision alpha and the precisions lambda of the weights maximize the marginal likelihood (MacKay,
     Bayesian Interpolation, Neural Computation 4:415, 1992). The names are as in scikit-learn's `BayesianRidge`.
@@ -237,5 +237,5 @@ def bayesian_ridge(
 
 
 def append_target(features: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Return features (T, P) with the target (T,) as the last column, (T, P + 1)."""
+    """Return P features (T, P) with the target (T,) as the last column, (T, P + 1)."""
     return torch.cat([features, target.unsqueeze(-1)], dim=1)

@@ -39,7 +39,7 @@ NEGLIGIBLE = -30.0  # logarithm of a negligible friction coefficient, relative t
 
 
 class ParameterVector:
-    """Map from the parameters of bodies, drives, servos and friction of a model to one vector x (K,), and back.
+    """Map from the K parameters of bodies, drives, servos and friction of a model to one vector x (K,), and back.
 
     groups: {name of a parameter: its group}. initial: {name: values when this object was created}.
     """
@@ -108,7 +108,7 @@ def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
 
 
 def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
-    """Limit the nominal friction of each drive to the standard deviation of its torque in the samples.
+    """Limit the nominal friction of each drive to the standard deviation of the drive's torque in the samples.
 
     Nominal friction is derived from the effort limits of the URDF, which are placeholders in many files. The prior
     width of torque offsets is proportional to nominal friction. If nominal friction is far too large, offsets may
@@ -194,7 +194,7 @@ SHARED = {
 
 @dataclass(frozen=True, eq=False)
 class ParameterPrior:
-    """Prior of the parameters x: Student's t for the parameters of each body, Gaussian for all others.
+    """Prior of K parameters x: Student's t for the parameters of each body, Gaussian for all others.
 
     The links of a URDF are not equally wrong. With one Gaussian prior for all links, a link with placeholder values
     would keep wrong values, or would widen the prior of all links. The t distribution is represented as a Gaussian with
@@ -280,7 +280,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
 
     Args:
         prior: current prior.
-        x: (K,) MAP estimate.
+        x: (K,) MAP estimate of the K parameters.
         covariance: (K, K) posterior covariance of x.
     """
     current, initial = dict(prior.widths), dict(prior.hyperprior)

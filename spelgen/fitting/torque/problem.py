@@ -59,7 +59,7 @@ class NoiseEstimator:
     def of(cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor) -> NoiseEstimator:
         """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
-        # The lower bound avoids divisions by zero at joints of constant torque.
+        # The standard deviation has a lower bound, which avoids divisions by zero at joints of constant torque.
         torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
         return cls(jacobian.samples.count, correlation_length, torque_std)
 
@@ -100,7 +100,7 @@ class NoiseEstimator:
 
 @dataclass(frozen=True, eq=False)
 class TorqueProblem:
-    """Negative log posterior of x (K,) for a given noise and prior: a `LeastSquaresProblem`.
+    """Negative log posterior of K parameters x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
     Attributes:
         noise: (n,) [Nm, N], scaled such that the errors of all samples can be treated as independent (see
@@ -187,7 +187,7 @@ class TorqueProblem:
     def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
         """Yield two candidates (K,) for the parameters: x + step, then `TorqueJacobian.curved_step` of x and step.
 
-        step: (k,), step of the free parameters.
+        step: (k,), step of the k free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
         # x + step needs less time and is as good near the optimum. Far from the optimum, the curved step may have a
@@ -242,8 +242,8 @@ class TorqueProblem:
 class TorqueEstimate:
     """MAP estimate: the problem with its noise and prior, and the last state of the solver.
 
-    covariance: (K, K), posterior covariance of x. After `alternate`, it is the covariance for the noise and the prior
-    before their last update; `with_current_covariance` recomputes it.
+    covariance: (K, K), posterior covariance of the K parameters. After `alternate`, it is the covariance for the noise
+    and the prior before their last update; `with_current_covariance` recomputes it.
     """
 
     problem: TorqueProblem

@@ -60,13 +60,16 @@ def _regression(
     motors, reach = motors_of(model).numpy(), bristle_reach(model).values
 
     def columns(x: SampleBlock) -> np.ndarray:
-        """Return the regressor of inertial parameters, armatures, friction and offsets, (T, n, K)."""
+        """Return the regressor of K inertial parameters, armatures, friction coefficients and offsets, (T, n, K)."""
         bent = x.z.numpy() / reach if friction.memory and x.z is not None else None
         drives = friction.columns(x.qd.numpy(), x.qdd.numpy(), bent, motors)
         return np.concatenate([regressor_of(model.chain, x.q, x.qd, x.qdd).numpy(), drives], axis=2)
 
     def products(x: SampleBlock) -> np.ndarray:
-        """Return the Gram matrix (K + 1, K + 1) of the regressor and the torque, divided by `torque_std` per joint."""
+        """Return the Gram matrix (K + 1, K + 1) of the K columns of the regressor and the torque.
+
+        Both are first divided by `torque_std` per joint.
+        """
         rows = np.concatenate([columns(x), joint_torque(model, x).numpy()[..., None]], axis=2)
         rows = (rows / torque_std[:, None]).reshape(-1, rows.shape[2])
         return np.asarray(rows.T @ rows)
@@ -78,7 +81,7 @@ def _regression(
     grams, total = (gram / np.outer(scale, scale) for gram in (grams, total))
 
     def solution(gram: np.ndarray, penalty: float) -> np.ndarray:
-        """Return (..., K + 1): the weights of the scaled columns, then -1 as the weight of the torque.
+        """Return (..., K + 1): the weights of the K scaled columns, then -1 as the weight of the torque.
 
         The quadratic form of a Gram matrix with this vector is the squared residual.
         """
@@ -99,10 +102,11 @@ def _regression(
 def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) -> None:
     """Set the bodies of a model to physically consistent bodies that approximate a regression.
 
-    They are fitted to the torques that the regression predicts, with a wide prior about bodies of 1 kg. The URDF is not
-    the prior mean: a wrong URDF, for example with centres of mass in mm, is why a fit is worse than a regression.
-    Friction and drives of this fit are discarded: a regression may have negative friction, which the fit would explain
-    by drives that compensate friction.
+    The bodies are a fit to the torques that the regression predicts, with a wide prior about bodies of 1 kg. The
+    inertias of the URDF are not used as the prior mean: this function is called if a fit with this prior mean has a
+    larger held-out error than the regression, and the probable reason is a wrong URDF, for example with centres of mass
+    in mm. The friction and the drives of this fit are discarded: friction coefficients of a regression may be negative,
+    which the fit would explain by drives that compensate friction.
     """
     with torch.no_grad():
         body = pseudo_inertia(torch.tensor([DEFAULT_BODY]).double())

@@ -80,7 +80,8 @@ def _warning(code: str, message: str, element: str = "logs") -> Diagnostic:
 
 def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
     """Return a note with the estimated prior width of the bodies, or a warning if the width is implausibly large."""
-    # A log-Cholesky parameter is the logarithm of the mass, so exp(width) is a factor of the mass.
+    # `prior.bodies` is the standard deviation of each log-Cholesky parameter. One of the ten parameters of a body is
+    # the logarithm of the mass, so exp(standard deviation) is a factor of the mass.
     factor = float(np.exp(solution.prior.bodies))
     message = f"prior standard deviation of URDF masses: factor {factor:.2g}"
     if factor <= TUNING.wrong_urdf:

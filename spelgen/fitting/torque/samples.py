@@ -1,4 +1,4 @@
-"""Samples of all logs to which a model is fitted, as tensors; they can be divided into blocks to limit the memory."""
+"""Samples of all logs to which a model is fitted, as tensors, and their division into blocks to limit the memory."""
 
 from __future__ import annotations
 

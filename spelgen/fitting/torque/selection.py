@@ -70,7 +70,10 @@ def _gap(correlation_length: float) -> int:
 
 
 def within_range(position: torch.Tensor, fitted: torch.Tensor) -> torch.Tensor:
-    """Return a mask (T, ...), True for positions within the range of the fitted positions (T', ...)."""
+    """Return a mask (T, ...), True for the T positions that are within the range of the fitted positions.
+
+    fitted: T' positions, (T', ...).
+    """
     return (position >= fitted.amin(dim=0)) & (position <= fitted.amax(dim=0))
 
 
@@ -159,8 +162,8 @@ def _best(
         if reduction is None and reduction_within is None:
             continue
         weights = candidate.fit(target, correlation_length, first).coef
-        # An implausibly large torque is probably a model error that repeats with the motion and not a torque of the
-        # joint.
+        # A candidate whose torque is implausibly large is rejected: it probably fits a model error that repeats with
+        # the motion, and not an effect in the joint, such as a spring.
         if limits and candidate.torque(weights).std() > limits[candidate.parameter][candidate.joint]:
             continue
         before, after = target[last].square(), (target - candidate.torque(weights))[last].square()

@@ -74,7 +74,7 @@ def _least_squares_noise_fit(problem: TorqueProblem, state: State) -> tuple[Torq
 
 
 def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
-    """Return the joints (n,) whose residual at x (K,) shows a friction compensation that is not modelled yet.
+    """Return a mask (n,), True if the residual at x shows a friction compensation of the joint that is not modelled.
 
     A drive may add a torque that compensates friction after the torque was measured. The residual then decreases with
     velocity, which friction cannot explain. Criteria for a joint:
@@ -159,7 +159,7 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
 
 
 def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
-    """Return a refit in which the friction coefficients at the given indices (k,) of x are negligible."""
+    """Return a refit in which some friction coefficients are negligible. indices: their indices in x."""
     problem, x, mean = estimate.problem, estimate.state.x.clone(), estimate.problem.prior.mean.clone()
     # The prior mean is changed, too: otherwise the prior would restore the coefficients.
     mean[indices] = x[indices] = NEGLIGIBLE
