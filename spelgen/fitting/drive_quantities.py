@@ -22,7 +22,7 @@ class DriveQuantity(NamedTuple):
     joints: tuple[int, ...]
 
 
-CONSTANTS = {
+TORQUE_UNITS = {
     "armature": "{0.inertia}",
     "viscous": "{0.torque} s/{0.position}",
     "coulomb": "{0.torque}",
@@ -30,7 +30,7 @@ CONSTANTS = {
     "gain": "",
 }
 """Unit of each constant of drives that are given torques."""
-RATIOS = {
+SERVO_UNITS = {
     "kp": "{0.torque}/{0.position}",
     "kd/kp": "s",
     "lag": "s",
@@ -54,7 +54,9 @@ def drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[Ar
     line, servos = friction_line(model), model.input_quantity == "position"
     gains = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
     signed, every = ("viscous", "offset", "offset/kp"), tuple(range(model.n))
-    units = RATIOS if servos else {name: x for name, x in CONSTANTS.items() if gains or name != "gain"}
+    units = (
+        SERVO_UNITS if servos else {name: x for name, x in TORQUE_UNITS.items() if gains or name != "gain"}
+    )
     quantities = [
         DriveQuantity(name, unit, name not in signed, tuple(gains) if name == "gain" else every)
         for name, unit in units.items()
