@@ -82,8 +82,8 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     - The residual is regressed on velocity. The slope is negative and significant.
     - Before this, both are regressed on position: in a motion that does not return to its first position, the torque
       of a spring is correlated with velocity.
-    - The torque of the regression line exceeds the lower bound of the noise: in samples without noise, a delay of some
-      milliseconds between torque and motion causes a negative slope that is significant, but negligible.
+    - The torque of the regression line is a visible part of the measured torque: a delay of some milliseconds between
+      torque and motion causes a smaller negative slope.
 
     The drives of an arm are similar. If one of them is known to compensate friction, a negative slope of more than one
     standard deviation, without the regression on position, suffices for the others: their parameters may have absorbed
@@ -105,7 +105,7 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     if not first:
         return decreasing
     amplitude = (slope * products / estimator.count).sqrt()
-    visible = amplitude > TUNING.min_noise * estimator.torque_std
+    visible = amplitude > TUNING.min_compensation * estimator.torque_std
     return decreasing & (deviations > TUNING.min_significance) & visible
 
 

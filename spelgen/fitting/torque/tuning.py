@@ -70,6 +70,9 @@ class TorqueTuning:
     min_noise: float = 1e-4
     # [1] Number of standard deviations by which the slope of a friction compensation must differ from zero.
     min_significance: float = 4.0
+    # [1] Smallest standard deviation of a friction compensation, as a fraction of the torque's standard deviation.
+    # Delays of milliseconds have a similar but smaller effect.
+    min_compensation: float = 0.05
     # [1] Number of samples per block: a block and its derivatives need some 100 MB of memory for seven joints.
     block: int = 2**13
     # [B] Memory of the regressors, which limits the number of samples to 70,000 for six joints. Larger logs are
