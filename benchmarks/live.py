@@ -29,9 +29,9 @@ from real_logs import LOADED, OUTSIDE, TESTS, TRAINING, after, first
 from recordings import folder_of, panda_urdf
 
 import spelgen
-from spelgen.baselines.registry import arm_of_model
 from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.dynamics.bristles import bristle_reach
+from spelgen.emission.specify import arm_of_spec
 from spelgen.evaluation.torque import mean_nmse, predicted_torques
 from spelgen.fitting.fitted import Fit
 from spelgen.live.estimator import torque_model
@@ -64,7 +64,7 @@ class Case:
     def compiled(self) -> CompiledEstimator:
         """The estimator in C."""
         assert self.fit.urdf is not None
-        return CompiledEstimator(self.fit.model, arm_of_model(self.fit.model, self.fit.urdf), self.levels)
+        return CompiledEstimator(self.fit.model, arm_of_spec(self.fit.model.spec, self.fit.urdf), self.levels)
 
     def run(self, log: Trajectory, tau: np.ndarray | None = None) -> Columns:
         """Run a new estimator along a log, with other torques (T, n)."""

@@ -12,6 +12,9 @@ LEAST_SQUARES = "least squares"
 LEAST_SQUARES_WITH_MEMORY = "least squares with memory"
 LINEAR_SERVOS, DELAYED_COMMAND = "linear servo", "delayed command"
 
+LAST_PART = " (last part)"
+"""Suffix of a trajectory's name for its last part, which is used for validation, while the first part is fitted."""
+
 
 @dataclass(frozen=True)
 class Units:

@@ -5,6 +5,7 @@ that prints it; `pytest --update` rewrites both. ```text blocks and indented one
 or no commands. A tutorial is a notebook as well, of the same cells.
 """
 
+import ast
 import contextlib
 import io
 import json
@@ -12,13 +13,17 @@ import re
 import shlex
 import shutil
 import sys
+from collections import Counter
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import settings_page
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
+from spelgen.settings.log_mapping import Accepted
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
@@ -130,10 +135,21 @@ def run_commands(block: str, folder: Path) -> str:
     return "\n".join(told)
 
 
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as both MkDocs and GitHub make them of plain words."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", heading.lower())) for heading in headings}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
-        assert target.startswith("http") or (page.parent / target).exists(), target
+    text = page.read_text(encoding="utf-8")
+    for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", text):
+        if target.startswith("http"):
+            continue
+        linked = page.parent / target if target else page
+        assert linked.exists(), target
+        assert not anchor or anchor in anchors(linked), f"{target}#{anchor}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -154,3 +170,47 @@ def test_the_changelog_of_a_version_is_short():
 def test_files_that_are_named_exist(page):
     for name in FILE.findall(page.read_text(encoding="utf-8")):
         assert any((folder / name).exists() for folder in (ROOT, ROOT / "spelgen")), name
+
+
+# Position of the code among the arguments of functions that make messages.
+CODE_ARGUMENTS = {"Diagnostic": 1, "warn": 1, "Check": 0, "_warning": 0, "_note": 0, "_remark": 0}
+
+
+def codes_of_messages() -> set[str]:
+    """The codes of all remarks, warnings and accepted errors in the source text of the package."""
+    constants: dict[str, ast.expr] = {}
+    codes = set(get_args(Accepted))
+    for path in sorted((ROOT / "spelgen").rglob("*.py")):
+        found, nodes = [], list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        for target, value in ((x.targets[0], x.value) for x in nodes if isinstance(x, ast.Assign)):
+            parallel = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
+            for name, x in zip(target.elts, value.elts, strict=True) if parallel else [(target, value)]:
+                constants[getattr(name, "id", "")] = x
+                if getattr(name, "id", "") in ("code", "SEEN", "ELASTIC", "GEOMETRY_CODES", "WARNINGS"):
+                    found += getattr(x, "elts", [x])
+        for node in nodes:
+            if isinstance(node, ast.Call):
+                place = CODE_ARGUMENTS.get(getattr(node.func, "attr", getattr(node.func, "id", "")))
+                found += [] if place is None else node.args[place : place + 1]
+            elif isinstance(node, ast.Yield) and len(getattr(node.value, "elts", ())) == 4:
+                found += node.value.elts[:1]  # findings of spelgen/urdf/lint.py
+        resolved = [constants.get(x.id, x) if isinstance(x, ast.Name) else x for x in found]
+        codes |= {x.value for x in resolved if isinstance(x, ast.Constant) and isinstance(x.value, str)}
+    return codes
+
+
+def test_every_code_is_explained_once():
+    """Each code of a message is in one row of docs/messages.md, and each code of this page exists."""
+    page = (ROOT / "docs" / "messages.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`[^|]*) \|", page, re.MULTILINE)
+    explained = Counter(code for row in rows for code in re.findall(r"`([a-z-]+)`", row))
+    assert explained == Counter(dict.fromkeys(codes_of_messages(), 1))
+
+
+def test_every_option_is_explained():
+    """Each command has a section in docs/cli.md or docs/cli_runs.md, and each of its options is on a page."""
+    pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    for name, command in get_command(app).commands.items():
+        assert f"\n## {name}\n" in pages
+        for option in (x for parameter in command.params for x in parameter.opts if x.startswith("--")):
+            assert re.search(rf"{option}\b", pages), f"{name} {option}"

@@ -134,7 +134,7 @@ def licence(package: str) -> str | None:
     ]
     short = (about.get("License") or "").strip()
     first = about.get("License-Expression") or ", ".join(dict.fromkeys(named)) or short.split("\n")[0]
-    return first[:80] or "not said"
+    return first[:80] or "not stated"
 
 
 def test_licences_of_dependencies_are_listed(request):

@@ -103,7 +103,7 @@ def test_replay_of_another_motion_beats_the_baselines(fitted, logs, results):
 
 def test_a_standalone_module_of_servos(arm, tmp_path):
     source = spelgen.generate(arm, "closed-form", standalone=True)
-    assert "the energy 1/2 kp d(q - u)^2" in source
+    assert "stores the energy 1/2 kp d(q - u)^2" in source
     model = import_source(source, tmp_path / "servo.py").Model()
     q, u = torch.tensor([[0.1, -0.2]]).double(), torch.tensor([[0.3, -0.2]]).double()
     with torch.no_grad():

@@ -43,6 +43,20 @@ class Coordinate(NamedTuple):
             return None
         return self.lower, self.upper
 
+    @property
+    def working_range(self) -> tuple[float, float]:
+        """Lower and upper end of the range for random positions [rad, m].
+
+        The range is given by the limits, cut at +-2 pi for a revolute joint. Without usable limits it is one
+        revolution, or 1 m, about zero.
+        """
+        is_revolute, limits = self.joint_type == "revolute", self.limits
+        # Huge or equal limits are not usable: exporters write +-1e16, or equal limits, for a joint without limits.
+        if limits is None or not 0 < limits[1] - limits[0] < 1e3:
+            half_range = pi if is_revolute else 0.5
+            return -half_range, half_range
+        return (max(limits[0], -2 * pi), min(limits[1], 2 * pi)) if is_revolute else limits
+
 
 @dataclass(frozen=True)
 class Body:

@@ -8,14 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from spelgen.arm.configured_arm import Arm, load_arm
-from spelgen.baselines.linear_servos import DelayedCommand, LinearServos
+from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.predictor import CommandFollower, Predictor, States, of_dynamics
 from spelgen.dynamics.friction import FrictionModel
-from spelgen.emission.assemble import spec_of
+from spelgen.dynamics.regressor_dynamics import identified_dynamics
 from spelgen.errors import Diagnostic, LogError, in_one_line
-from spelgen.identification.identification import LeastSquares, identified_dynamics
-from spelgen.identification.identify import identify_by
 from spelgen.labels import (
     CONSTANT_VELOCITY,
     DELAYED_COMMAND,
@@ -28,7 +25,6 @@ from spelgen.labels import (
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, coverage, require_torques
 from spelgen.logs.windows import Windows
-from spelgen.spec import Options
 
 FittedBaselines = dict[str, Any]
 """Content of least_squares.json: the fitted baselines, and the range of motion of the training logs."""
@@ -55,13 +51,6 @@ class EvaluatedArm:
     fitted_arm: Arm | None
     probe: Windows
     notes: list[Diagnostic]
-
-
-def arm_of_model(model: object, urdf: Path) -> Arm:
-    """Return the arm that a model was built from, read from its URDF. Raises UrdfError, ArmError or SettingsError."""
-    spec = spec_of(model)
-    options = Options() if spec is None else spec.options
-    return load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
 
 
 def constant_velocity(arm: EvaluatedArm) -> list[Predictor]:
@@ -154,6 +143,10 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
 
     preprocessing: preprocessing of the fit, in which all default values are resolved.
     """
+    # Imported here: evaluation reads the fitted baselines.
+    from spelgen.identification.identification import LeastSquares
+    from spelgen.identification.identify import identify_by
+
     # The coverage is stored for the assessment of an evaluation, which compares the motion in test logs with it.
     fitted: FittedBaselines = {"coverage": coverage(logs)}
     methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
@@ -182,5 +175,7 @@ def command_followers(
         message = "no linear servos to compare with: they are fitted by `train`"
         notes.append(Diagnostic("info", "no-linear-servos", "logs", None, message))
         return {}
+    from spelgen.baselines.linear_servos import DelayedCommand, LinearServos
+
     servos = LinearServos(**linear_servos)
     return {LINEAR_SERVOS: servos, DELAYED_COMMAND: DelayedCommand(servos.late)}

@@ -115,8 +115,8 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
     adapted run gets a copy of the noise levels of `source`. The payload is estimated only for `adapt=load`, by the
     model and the noise levels of `source`; otherwise, or if `source` has no noise levels, the result is None.
     """
-    from spelgen.live.levels import cross_validated_levels, keep_levels, stored_levels
-    from spelgen.live.replay import carried_payload
+    from spelgen.live.levels import cross_validated_levels
+    from spelgen.live.noise import keep_levels, stored_levels
     from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
     if source is None:
@@ -127,6 +127,7 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
             note(f"info: no estimator: {error}")
         return None
     from spelgen.fitting.fitted import load_run
+    from spelgen.live.replay import carried_payload
 
     original = load_run(source)
     levels = stored_levels(original)
@@ -169,15 +170,17 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
 
 def _outcome(fit: Fit) -> tuple[str, str]:
     """Return two sentences: the status of a fit with its reason, and the result of the fit."""
-    from spelgen.fitting.servo.report import servo_summary
-
     config, result = fit.config, fit.result
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
     # Only fits with the rollout objective have epochs, which the sentences below state.
     if not isinstance(config, Rollout):
-        summary = servo_summary(fit.record.servo)
+        summary = None
+        if fit.record.servo is not None:
+            from spelgen.fitting.servo.report import servo_summary
+
+            summary = servo_summary(fit.record.servo)
         if summary is not None:
             result = summary.text
         elif not fit.record.validation_windows:

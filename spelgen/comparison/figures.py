@@ -24,7 +24,6 @@ from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, 
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import DEFAULTS, Rollout
-from spelgen.structure.nominal import working_range
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -92,7 +91,7 @@ def simulated_figures(
     # `low` and `high` are the joint limits, between which M must be positive definite. The error of M is computed only
     # at logged positions.
     joints = fit.record.joints
-    ranges = list(map(working_range, load_arm(truth, joints).chain.coordinates))
+    ranges = [x.working_range for x in load_arm(truth, joints).chain.coordinates]
     low, high = torch.tensor(ranges, dtype=torch.float64).T
     visited = far.q[:, 0]
     example = predict_example(of_dynamics("", model, far), testing, steps, decimation)

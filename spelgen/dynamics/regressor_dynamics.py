@@ -11,8 +11,9 @@ from torch import Tensor
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.body_regressor import chain_regressor, pseudo_inertia
-from spelgen.dynamics.bristles import moved_bristles
+from spelgen.dynamics.bristles import moved_bristles, reach_of
 from spelgen.dynamics.equations import MotionEquations
+from spelgen.dynamics.friction import FrictionModel
 from spelgen.runtime.body_chain import BodyChain, ChainConfiguration
 from spelgen.runtime.parts import Row
 from spelgen.runtime.port_hamiltonian import applied
@@ -166,3 +167,18 @@ class RegressorDynamics:
         """Return the friction state z, (..., n, K), after a monotonic displacement of the joints, (..., n) [rad, m]."""
         moved = displacement @ self.motors.mT.to(displacement)
         return moved_bristles(z, moved.unsqueeze(-1), self.bristle_reach)
+
+
+def identified_dynamics(
+    arm: Chain, friction: FrictionModel, parameters: np.ndarray, drives: Drives
+) -> RegressorDynamics:
+    """Return the dynamics of an arm with these parameters (K,): bodies, then friction and rotor inertias."""
+    n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
+    constants = parameters[inertial:].reshape(-1, n)
+    reach = reach_of(arm.joint_types).values if friction.memory else None
+
+    def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+        deflection = None if z is None or reach is None else z / reach
+        return friction.torque(constants, qd, deflection, drives.speeds)
+
+    return RegressorDynamics(arm, parameters[:inertial], constants[0], torque, drives, reach)

@@ -92,9 +92,10 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     spring = servo.kp * beyond(u - q, servo.dead_zone)
     torque = spring - servo.kd * qd
     # `free` is 0 if the servo is saturated: its torque is then constant, without stiffness and damping.
-    free = (torque.abs() < servo.limit).to(q)
+    within = torque.abs() < servo.limit
+    free = within.to(q)
     servo_stiffness = free * servo.kp * (spring != 0)
-    torque = torch.where(free > 0, spring, servo.limit * torque.sign())
+    torque = torch.where(within, spring, servo.limit * torque.sign())
     force = torque - drives.offset - load.bias - (strength * z).sum(dim=0)
     damping = free * servo.kd + drives.friction.viscosity(qd)
     inertia = load.inertia.diagonal(dim1=-2, dim2=-1) if load.coupled else load.inertia
@@ -103,8 +104,9 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     theta = (3 + decay) / (6 + decay)
     # The springs of the servos are evaluated after the fraction theta of the step; the bristles, which are stiffer, at
     # its end.
-    impulse, bristle_stiffness = theta * h * force, theta * h * h * strength
-    damping = theta * h * (damping + h * theta * servo_stiffness)
+    part = theta * h
+    impulse, bristle_stiffness = part * force, part * h * strength
+    damping = part * (damping + part * servo_stiffness)
     # The unknown is the mean velocity of the step, so displacements are divided by h.
     bent, reach = z / h, drives.reach / h
     velocity = slipped(inertia * qd + impulse, inertia + damping, bristle_stiffness, bent, reach)

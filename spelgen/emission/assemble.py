@@ -13,16 +13,15 @@ from torch import Tensor
 
 from spelgen import runtime
 from spelgen.dynamics.parameters import parameter_count
-from spelgen.dynamics.prepared import PreparedModel
 from spelgen.emission.parts import Sums, base_class, entry_sums, model_parts
 from spelgen.emission.source import Call, Code
-from spelgen.emission.text import header, read_source, require_unedited
 from spelgen.errors import ModuleError
 from spelgen.labels import printable
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.spec import ModelSpec
 
 if TYPE_CHECKING:
+    from spelgen.dynamics.prepared import PreparedModel
     from spelgen.dynamics.tip import TipKinematics
 
 
@@ -39,6 +38,8 @@ class ArmModel(PortHamiltonian):
         self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
     ) -> PreparedModel:
         """Return a copy with constant parameters for many calls; see ``PreparedModel``."""
+        from spelgen.dynamics.prepared import PreparedModel
+
         return PreparedModel(self, tip, dtype=dtype)
 
     def __repr__(self) -> str:
@@ -46,6 +47,8 @@ class ArmModel(PortHamiltonian):
         return f"<Model of {printable(self.spec.robot)!r} ({self.spec.options.preset}): {sizes}>"
 
     def _repr_html_(self) -> str:
+        from spelgen.emission.text import header
+
         return f"<pre>{escape(header(self.spec))}</pre>"
 
 
@@ -81,6 +84,8 @@ def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
     module: path of the module, or its text. Raises ModuleError if the module was edited, or is not from `spelgen
     build`.
     """
+    from spelgen.emission.text import read_source, require_unedited
+
     is_text = isinstance(module, str) and "\n" in module
     file = None if is_text else Path(module)
     text = str(module) if file is None else read_source(file)

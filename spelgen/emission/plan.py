@@ -33,7 +33,6 @@ from spelgen.structure.nominal import (
     nominal,
     parameters_of,
     reference_factor,
-    working_range,
 )
 from spelgen.structure.structure import Structure, derive
 
@@ -138,7 +137,7 @@ def _joint(
     min_armature: armature if the rotor inertia is unknown [kg m^2, kg].
     """
     # The inputs of networks are scaled with a working range, which exists even if the URDF has no limits.
-    low, high = working_range(coordinate)
+    low, high = coordinate.working_range
     lower, upper = (None if x is None else rounded(x) for x in (coordinate.lower, coordinate.upper))
     effort = _plausible(coordinate.effort, TUNING.largest_effort)
     speed = _plausible(coordinate.velocity, TUNING.largest_speed)

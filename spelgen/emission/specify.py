@@ -6,8 +6,6 @@ from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.design import PRESET_NAMES, Design, load_design
-from spelgen.emission.plan import derive_spec
-from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
 from spelgen.spec import ModelSpec, Options
 from spelgen.urdf.robot import Assume
@@ -30,6 +28,8 @@ def generate(
         module: path of the file that the source will be written to; the source has the URDF's path relative to this
             file.
     """
+    from spelgen.emission.text import module_text
+
     spec = make_spec(arm, preset, width=width, depth=depth, assume=assume, module=module)
     return module_text(spec, standalone=standalone)
 
@@ -44,6 +44,9 @@ def make_spec(
     module: Path | None = None,
 ) -> ModelSpec:
     """Return the specification of the model of an arm; arguments and errors as for ``generate``."""
+    # Imported here: commands that have a specification do not derive one.
+    from spelgen.emission.plan import derive_spec
+
     arm = arm if isinstance(arm, Arm) else load_arm(arm)
     name, design = str(preset), None
     # The options contain the content of a user's design file, so that the module can be rebuilt without the
@@ -66,9 +69,13 @@ def make_spec(
     return spec if module is None else replace(spec, urdf=_path_of_urdf(module, arm.robot.path))
 
 
-def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> Arm:
-    """Return the arm of a specification, read from this URDF with the options in the specification."""
-    return load_arm(urdf, spec.options.joints, spec.options.tip, spec.options.angle_tolerance)
+def arm_of_spec(spec: ModelSpec | None, urdf: str | Path) -> Arm:
+    """Return the arm of a specification, read from this URDF with its options; None: with the default options.
+
+    Raises UrdfError, ArmError or SettingsError.
+    """
+    options = Options() if spec is None else spec.options
+    return load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
 
 
 def find_urdf(module: Path, name: str) -> Path:

@@ -8,9 +8,10 @@ from pathlib import Path
 import torch
 
 from spelgen.arm.configured_arm import Arm, urdf_path
-from spelgen.baselines.registry import FittedBaselines, LinearServoRecord, arm_of_model
+from spelgen.baselines.registry import FittedBaselines, LinearServoRecord
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
+from spelgen.emission.specify import arm_of_spec
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tuning import TUNING
 from spelgen.evaluation.verdict import verdict
@@ -76,7 +77,7 @@ class Subject:
         """Arm of the fitted baselines; None if there are none. Raises UrdfError, ArmError or SettingsError."""
         if self.fitted_urdf is None or not self.baselines:
             return None
-        return arm_of_model(self.model, self.fitted_urdf)
+        return arm_of_spec(self.spec, self.fitted_urdf)
 
     def assessed(self, results: Results) -> Results:
         """Return the results of the evaluation of this model, with the assessment added."""

@@ -15,7 +15,7 @@ from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
 from spelgen.listing import Listing
-from spelgen.live.levels import stored_levels
+from spelgen.live.noise import stored_levels
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel

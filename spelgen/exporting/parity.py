@@ -13,13 +13,11 @@ import torch
 from torch import Tensor
 
 from spelgen.arm.arm import Coordinate
-from spelgen.dynamics.prepared import batched_jacobians
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.tuning import TUNING
-from spelgen.structure.nominal import working_range
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -128,7 +126,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
     random = np.random.default_rng(0)
     # Velocities are mostly within the limits, because friction at higher speeds is extrapolated.
     speed = nominal_speeds(coordinates)
-    q = np.stack([random.uniform(*working_range(joint), states) for joint in coordinates], axis=-1)
+    q = np.stack([random.uniform(*joint.working_range, states) for joint in coordinates], axis=-1)
     return {
         "q": q,
         "qd": 0.5 * speed * random.standard_normal(q.shape),
@@ -173,6 +171,8 @@ def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> V
             arguments.append(value.unflatten(-1, (model.n, -1)))
     outputs: Sequence[Tensor]
     if name.endswith("_derivatives"):
+        from spelgen.dynamics.prepared import batched_jacobians
+
         function = partial(_REFERENCES[name.removesuffix("_derivatives")], model)
         outputs = batched_jacobians(function, len(entry.outputs), *arguments)
     elif name.startswith("tip_"):

@@ -19,17 +19,15 @@ from spelgen.exporting.rigid_body_projection import (
 from spelgen.urdf.document import read_document
 
 _LAW = (
-    "viscous qd + saturation turned(qd, saturation_velocity) + dry direction, with "
+    "factor (viscous qd + saturation s(qd, saturation_velocity) + dry direction), with "
+    "s(x, w) = x / sqrt(x^2 + w^2); "
     "dry = coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + "
-    "load_dependence sqrt(gravity torque^2 + min_load^2), v = |qd| / stribeck_velocity, r = stribeck_rounding "
-    "and turned(x, width) = x / sqrt(x^2 + width^2); direction: memoryless turned(qd, coulomb_smoothing_velocity) "
-    "plus the sum of bristle_fractions z / bristle_reach, with z' = qd up to |z| = bristle_reach; "
-    "all of it times a factor that goes with the joint's position, between the two numbers of "
-    "position_factor, or one where there are none"
+    "load_dependence sqrt(gravity torque^2 + min_load^2), v = |qd| / stribeck_velocity, r = stribeck_rounding; "
+    "direction = memoryless s(qd, coulomb_smoothing_velocity) + sum of bristle_fractions z / bristle_reach, with "
+    "the deflections z of the bristles: z' = qd, limited to |z| <= bristle_reach; "
+    "factor = 1, or a function of the joint's position with the range position_factor"
 )
-_SERVO = (
-    "clip(kp d - kd qd, -limit, limit), d what u - q is beyond the dead zone, u commanded `delay` [s] before"
-)
+_SERVO = "clip(kp d - kd qd, -limit, limit), with d = u - q less the dead zone, and u the command `delay` [s] earlier"
 
 
 def export_urdf(trained: Trained) -> Exported:

@@ -1,18 +1,19 @@
 """Fit a model to logs in memory. The command `spelgen train` reads model and logs from files and calls `fit`."""
 
+import pkgutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm, urdf_path
-from spelgen.baselines.registry import FittedBaselines, arm_of_model, fit_baselines
-from spelgen.emission.assemble import ArmModel
+from spelgen.baselines.registry import FittedBaselines, fit_baselines
+from spelgen.emission.assemble import ArmModel, spec_of
+from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import Diagnostic, OptionError, RunError, SettingsError, SpelgenError
 from spelgen.files import write_json
 from spelgen.fitting.dataset import FitRequest, RunOptions
 from spelgen.fitting.fitted import Fit, load_run, required_spec
-from spelgen.fitting.momentum_objective import MomentumObjective
 from spelgen.fitting.objective import Objective, Status, new_record
 from spelgen.fitting.process import (
     TrainingProgress,
@@ -21,11 +22,8 @@ from spelgen.fitting.process import (
     termination_as_interrupt,
     threads_of_torch,
 )
-from spelgen.fitting.rollout_objective import RolloutObjective
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import Checkpoint
-from spelgen.fitting.servo.objective import ServoObjective
-from spelgen.fitting.torque.objective import TorqueObjective
 from spelgen.logs.dynamics_samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -37,8 +35,13 @@ __all__ = ["Fit", "RunOptions", "fit", "load_run"]
 
 AUTOMATIC = Preprocessing()
 QUIET = RunOptions()
-ALL: tuple[type[Objective], ...] = (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
-OBJECTIVES = {objective.name: objective for objective in ALL}
+OBJECTIVES = {
+    "torque": "spelgen.fitting.torque.objective:TorqueObjective",
+    "momentum": "spelgen.fitting.momentum_objective:MomentumObjective",
+    "rollout": "spelgen.fitting.rollout_objective:RolloutObjective",
+    "servo": "spelgen.fitting.servo.objective:ServoObjective",
+}
+"""Name of an objective -> its class, which is imported when a fit uses it."""
 Rates = Callable[[], Sequence[float]]
 """Function that returns the sample rates of the logs [Hz]. It may read all logs, and is called only if necessary."""
 
@@ -217,7 +220,7 @@ class _Fitting:
         if self.baselines or request.urdf is None or not request.urdf.exists():
             return None
         try:
-            return arm_of_model(request.model, request.urdf)
+            return arm_of_spec(spec_of(request.model), request.urdf)
         except SpelgenError as error:
             message = f"no least squares to compare with: {error}"
             self.notes.append(Diagnostic("warning", "no-baselines", "run", None, message))
@@ -227,7 +230,7 @@ class _Fitting:
 def objective_of(request: FitRequest) -> Objective:
     """Return the objective of a request. Raises OptionError if it does not apply to the model."""
     name = request.config.objective
-    objective = OBJECTIVES[name]
+    objective: type[Objective] = pkgutil.resolve_name(OBJECTIVES[name])
     under = request.model.input_quantity
     if objective.input != under:
         message = (
@@ -243,8 +246,8 @@ def default_objective(model: ArmModel, rates: Rates) -> str:
     The default is "servo" for an arm with position servos, "torque" for rigid bodies if a log is sampled densely enough
     for accelerations, and otherwise "rollout".
     """
-    if model.input_quantity == ServoObjective.input:
-        return ServoObjective.name
+    if model.input_quantity == "position":
+        return "servo"
     if isinstance(model, RigidBodyDynamics) and any(map(shows_accelerations, rates())):
         return "torque"
     return "rollout"

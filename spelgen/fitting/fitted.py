@@ -1,12 +1,14 @@
 """The result of a fit, in memory or from a run folder."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, overload
+from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 import torch
@@ -14,11 +16,8 @@ import torch
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.parameters import used_parameter_count
 from spelgen.emission.assemble import ArmModel
-from spelgen.errors import Diagnostic, LogError, RunError
+from spelgen.errors import LogError, RunError
 from spelgen.files import write_json
-from spelgen.fitting.objective import Status
-from spelgen.fitting.posterior import Posterior, Uncertain, posterior_of
-from spelgen.fitting.process import locked
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Checkpoint, Content, Record
 from spelgen.listing import Listing
@@ -30,6 +29,11 @@ from spelgen.logs.tuning import SLOWEST
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import FitConfig
 from spelgen.spec import ModelSpec
+
+if TYPE_CHECKING:
+    from spelgen.errors import Diagnostic
+    from spelgen.fitting.objective import Status
+    from spelgen.fitting.posterior import Posterior, Uncertain
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -131,6 +135,9 @@ class Fit:
 
         Raises RunError unless rigid bodies were fitted to torques, or to positions under position servos.
         """
+        # Imported here, because evaluation needs no posterior.
+        from spelgen.fitting.posterior import posterior_of
+
         delay = self.record.preprocessing.torque_delay or 0.0
         file = None if self.folder is None else RunFolder(self.folder).checkpoint
         return posterior_of(self.model, self.checkpoint.posterior, delay, file)
@@ -149,6 +156,8 @@ class Fit:
             trajectory: trajectory of the arm.
             std: if True, return the pair `Uncertain` of torques and standard deviations (see `Posterior.torque`).
         """
+        from spelgen.fitting.posterior import Uncertain
+
         reach = bristle_reach(self.model)
         tau, deviation = np.full_like(trajectory.q, np.nan), np.full_like(trajectory.q, np.nan)
         for start, stop in pairwise(gap_ends(trajectory.t, self.preprocessing.gap)):
@@ -196,6 +205,8 @@ class Fit:
 
         Raises RunError if there is a run in the folder, unless ``force``.
         """
+        from spelgen.fitting.process import locked
+
         spec = required_spec(self.model)
         run = RunFolder(folder)
         with locked(run.path):

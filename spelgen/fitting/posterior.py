@@ -24,16 +24,11 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
 from spelgen.fitting.drive_quantities import SUMS, drive_quantities
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import ParameterVector
-from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.identification.intervals import Interval, base_unit, interval_listing
+from spelgen.identification.intervals import PRECISE, Interval, base_unit, interval_listing
 from spelgen.labels import UNITS, parameter_name
 from spelgen.listing import Listing
-from spelgen.logs.dynamics_samples import DynamicsSamples
 
-PRECISE = ("firm", "fair")
-"""Classes of intervals that the logs determine to 20 % or better."""
 PER_KP = "/kp"
 """Ending of the names of base parameters that are ratios to kp of `Posterior.scale_joint`."""
 
@@ -123,6 +118,11 @@ class Posterior:
         """
         if self.torque_std is None:
             raise RunError("intervals of torques", expected="a fit to logs with torques, not to commands")
+        # Imported here, because intervals of parameters need no samples.
+        from spelgen.fitting.torque.jacobian import TorqueJacobian
+        from spelgen.fitting.torque.samples import TorqueSamples
+        from spelgen.logs.dynamics_samples import DynamicsSamples
+
         q, *motion_and_state = (torch.as_tensor(np.ascontiguousarray(x)) for x in motion)
         model, root, of_bodies = self.model, self._root.clone(), self._vector.mask("bodies")
         root[of_bodies] = self._constants.root[: int(of_bodies.sum())]

@@ -18,8 +18,8 @@ from pydantic import (
 )
 
 from spelgen.errors import RunError, SettingsError, SpelgenError
+from spelgen.labels import LAST_PART
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.windows import LAST_PART
 from spelgen.settings.fits import CONFIGS, FitConfig, Objective, Substeps
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.values import Count, NonNegative, Positive, Whole

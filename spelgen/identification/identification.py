@@ -11,9 +11,8 @@ import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
-from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.friction import FrictionModel
-from spelgen.dynamics.regressor_dynamics import RegressorDynamics
+from spelgen.dynamics.regressor_dynamics import RegressorDynamics, identified_dynamics
 from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import BaseParameters
 from spelgen.identification.intervals import DETERMINED, Interval, base_unit, interval_listing
@@ -192,21 +191,6 @@ class Identification:
         counts = Counter(x.determined for x in self.intervals)
         sure = ", ".join(f"{counts[word]} {word}" for word in DETERMINED if word in counts)
         return textwrap.fill(conditioned, WIDTH) + f"\nParameters: {sure}."
-
-
-def identified_dynamics(
-    arm: Chain, friction: FrictionModel, parameters: np.ndarray, drives: Drives
-) -> RegressorDynamics:
-    """Return the dynamics of an arm with these parameters (K,): bodies, then friction and rotor inertias."""
-    n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
-    constants = parameters[inertial:].reshape(-1, n)
-    reach = reach_of(arm.joint_types).values if friction.memory else None
-
-    def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        deflection = None if z is None or reach is None else z / reach
-        return friction.torque(constants, qd, deflection, drives.speeds)
-
-    return RegressorDynamics(arm, parameters[:inertial], constants[0], torque, drives, reach)
 
 
 def _finite(value: float) -> float | None:

@@ -1,4 +1,4 @@
-"""Noise levels of a fit, which are read from the run folder or estimated by cross-validation on the training logs.
+"""Estimation of the noise levels of a fit by cross-validation on the training logs.
 
 The noise is estimated from the torque residual of a model that was fitted to other logs: the residual of the logs to
 which a model was fitted would be too small.
@@ -10,17 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spelgen.baselines.registry import arm_of_model
 from spelgen.dynamics.bristles import bristle_reach, encoder_step
 from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.dynamics.tip_frame import tip_frame
-from spelgen.emission.assemble import assemble
+from spelgen.emission.assemble import assemble, spec_of
+from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import LogError, RunError
-from spelgen.files import read_json, write_json
 from spelgen.fitting.fitted import Fit, required_spec
-from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.run_record import require
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING as TORQUE
@@ -28,7 +25,7 @@ from spelgen.live.contact import ContactObserver
 from spelgen.live.filters import Block, Blocks, JointFilters, LoadFilter
 from spelgen.live.intake import Intake, balance_along
 from spelgen.live.momentum import Balance
-from spelgen.live.noise import BlockNoise, NoiseLevels
+from spelgen.live.noise import BlockNoise, NoiseLevels, keep_levels, stored_levels
 from spelgen.live.payload import NO_REPORT
 from spelgen.live.tuning import TUNING
 from spelgen.logs.dynamics_samples import dynamics_samples
@@ -50,20 +47,6 @@ def noise_levels(fit: Fit) -> NoiseLevels:
     return levels
 
 
-def keep_levels(fit: Fit, levels: NoiseLevels) -> None:
-    """Write noise levels into the run folder of a fit, if it has one."""
-    if fit.folder is not None:
-        write_json(RunFolder(fit.folder).estimator, levels.model_dump(mode="json"))
-
-
-def stored_levels(fit: Fit) -> NoiseLevels | None:
-    """Return the noise levels in the run folder of a fit; None if there are none."""
-    file = None if fit.folder is None else RunFolder(fit.folder).estimator
-    if file is None or not file.exists():
-        return None
-    return require(NoiseLevels, read_json(file, RunError), file)
-
-
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
     """Return the noise levels of a fit, estimated by cross-validation.
 
@@ -78,7 +61,7 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
     folds = [logs[k::count] for k in range(min(count, len(logs)))]
     effort, point = np.full(fit.model.n, np.inf), np.zeros(3)
     if fit.urdf is not None and fit.urdf.exists():
-        arm = arm_of_model(fit.model, fit.urdf)
+        arm = arm_of_spec(spec_of(fit.model), fit.urdf)
         effort, tip = np.array([joint.effort or np.inf for joint in arm.chain.coordinates]), tip_frame(arm)
         # The contact force is estimated at a point of the last body: at the tip or, if the tip is fixed to another
         # body, at the origin of the last body.

@@ -7,6 +7,11 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
 from scipy.special import stdtrit
 
+from spelgen.errors import RunError
+from spelgen.files import read_json, write_json
+from spelgen.fitting.fitted import Fit
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_record import require
 from spelgen.live.tuning import TUNING
 
 
@@ -128,3 +133,17 @@ class NoiseLevels(BaseModel):
         excess = self.peak_count * (odds ** (1 / self.peak_count) - 1)
         thresholds: np.ndarray = np.maximum(self.peak_start + self.peak_scale * excess, 1.0)
         return thresholds
+
+
+def keep_levels(fit: Fit, levels: NoiseLevels) -> None:
+    """Write noise levels into the run folder of a fit, if it has one."""
+    if fit.folder is not None:
+        write_json(RunFolder(fit.folder).estimator, levels.model_dump(mode="json"))
+
+
+def stored_levels(fit: Fit) -> NoiseLevels | None:
+    """Return the noise levels in the run folder of a fit; None if there are none."""
+    file = None if fit.folder is None else RunFolder(fit.folder).estimator
+    if file is None or not file.exists():
+        return None
+    return require(NoiseLevels, read_json(file, RunError), file)

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.log_checks.check_servo_logs import ServoLogs
 from spelgen.log_checks.check_torque_logs import COUPLED, CURRENT, WRONG_LINK, TorqueLogs
 from spelgen.log_checks.remedies import GEOMETRY_CODES
 from spelgen.log_checks.report import LogReport, joint_report
@@ -17,6 +16,7 @@ from spelgen.logs.trajectory import Trajectory, require_joints
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
+    from spelgen.log_checks.check_servo_logs import ServoLogs
     from spelgen.settings.log_mapping import LogMapping
 
 ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, CURRENT, WRONG_LINK, *GEOMETRY_CODES}
@@ -38,6 +38,8 @@ def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None 
     joints = arm.chain.joint_names
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
+        from spelgen.log_checks.check_servo_logs import ServoLogs
+
         checked = ServoLogs(arm)
     types = [
         "continuous" if x.joint_type == "revolute" and x.limits is None else x.joint_type

@@ -36,8 +36,8 @@ from spelgen.log_checks.robot_checks import (
     rounded_factor,
     torque_factors,
 )
-from spelgen.logs.bags import BAG
 from spelgen.logs.checks import Check, Findings, run_checks
+from spelgen.logs.formats import BAG
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_torques, split_at_gaps

@@ -19,7 +19,7 @@ from spelgen.errors import LogError, in_one_line
 from spelgen.files import limited_memory, require_regular_file
 from spelgen.labels import counted
 from spelgen.logs.joint_signals import mapping_line
-from spelgen.logs.tables import LogFormat, LogTable, table_layout
+from spelgen.logs.tables import LogTable, table_layout
 from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
@@ -311,6 +311,3 @@ def _text(data: bytes, start: int) -> str:
     """Return the text at the offset `start`; MCAP stores a text as its length (4 bytes) and its characters."""
     (length,) = struct.unpack_from("<I", data, start)
     return data[start + 4 : start + 4 + length].decode()
-
-
-BAG = LogFormat(read_bag, suffixes=(".mcap", ".db3", ROS1), marker="metadata.yaml", folder="a ROS 2 bag")

@@ -14,7 +14,7 @@ import pyarrow.csv
 
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
-from spelgen.logs.tables import LogFormat, LogTable, table_layout
+from spelgen.logs.tables import LogTable, table_layout
 from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
@@ -149,6 +149,3 @@ def _decoded_head(file: Path) -> tuple[str, str]:
         return "utf-8", codecs.getincrementaldecoder("utf-8")().decode(head, final=len(head) < size)
     except UnicodeDecodeError:
         return "latin-1", head.decode("latin-1")
-
-
-CSV = LogFormat(read_csv, suffixes=(".csv",), columns=csv_columns)

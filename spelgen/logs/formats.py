@@ -1,18 +1,15 @@
 """Formats of logs, and the search for logs at given paths.
 
-To add a format, write a module like `csv_files.py` and add its `LogFormat` to FORMATS.
+To add a format, write a module like `csv_files.py` and add a `LogFormat` to FORMATS.
 """
 
-from collections.abc import Iterable, Sequence
+import pkgutil
+from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
 from spelgen.errors import LogError, SpelgenError
 from spelgen.files import local, require_regular_file
-from spelgen.logs.bags import BAG
-from spelgen.logs.csv_files import CSV
-from spelgen.logs.npz import NPZ
-from spelgen.logs.parquet_files import LEROBOT, PARQUET
 from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
 
@@ -20,7 +17,23 @@ LogPaths = Path | str | Iterable[Path | str]
 """Paths of log files and of folders with logs, or their addresses (see `local`)."""
 
 UNPACK = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".xz": "unxz", ".bz2": "bunzip2"}
-FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
+
+
+def _lazy(name: str) -> Callable[..., list[LogTable]]:
+    """Return a function of a file of this folder that is imported at the first call: most users have one format."""
+    return lambda *arguments: pkgutil.resolve_name(f"spelgen.logs.{name}")(*arguments)
+
+
+PARQUET = LogFormat(
+    _lazy("parquet_files:read_parquet"), (".parquet",), _lazy("parquet_files:pa.parquet.read_table")
+)
+CSV = LogFormat(_lazy("csv_files:read_csv"), (".csv",), _lazy("csv_files:csv_columns"))
+NPZ = LogFormat(_lazy("npz:read_npz"), (".npz",), _lazy("npz:npz_columns"))
+BAG = LogFormat(
+    _lazy("bags:read_bag"), (".mcap", ".db3", ".bag"), marker="metadata.yaml", folder="a ROS 2 bag"
+)
+LEROBOT = LogFormat(_lazy("parquet_files:read_dataset"), marker="meta/info.json", folder="a LeRobot data set")
+FORMATS = [PARQUET, CSV, NPZ, BAG, LEROBOT]
 
 
 def format_of(path: Path) -> LogFormat | None:

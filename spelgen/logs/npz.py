@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.logs.tables import LogFormat, LogTable, missing_columns, stored_columns, table_layout
+from spelgen.logs.tables import LogTable, missing_columns, stored_columns, table_layout
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
@@ -158,6 +158,3 @@ def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str]) -> li
             expected = f"{joint} among the names of the {width} columns of {matrix}"
             raise arrays.error(JOINT_NAMES, f"the joints {', '.join(names)}", expected)
     return list(map(names.index, joints))
-
-
-NPZ = LogFormat(read_npz, suffixes=(".npz",), columns=npz_columns)

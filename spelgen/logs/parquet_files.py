@@ -12,7 +12,7 @@ import pyarrow.parquet
 
 from spelgen.errors import LogError, collect
 from spelgen.files import read_json, require_regular_file
-from spelgen.logs.tables import LogFormat, LogTable, reading, stored_columns, table_layout
+from spelgen.logs.tables import LogTable, reading, stored_columns, table_layout
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.yaml_document import YamlDocument, validated
 
@@ -146,7 +146,3 @@ def _motor_names(folder: Path, info: Any, feature: str) -> list[str]:
             f"no names of {feature} ({type(error).__name__})", file=folder / INFO,
             expected='"features", with the motors\' "names", as LeRobot 3 writes them',
         ) from error  # fmt: skip
-
-
-PARQUET = LogFormat(read_parquet, suffixes=(".parquet",), columns=pa.parquet.read_table)
-LEROBOT = LogFormat(read_dataset, marker=INFO, folder="a LeRobot data set")

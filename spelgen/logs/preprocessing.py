@@ -8,7 +8,6 @@ from math import inf
 
 from spelgen.errors import Diagnostic, SettingsError, SpelgenError, collect
 from spelgen.logs.filtering import low_pass
-from spelgen.logs.recording import earlier
 from spelgen.logs.trajectory import GAP, Trajectory, split_at_gaps
 from spelgen.logs.tuning import FAST, TUNING
 
@@ -101,4 +100,6 @@ class Preprocessing:
         # Most logs have no delay: the unchanged trajectories are returned, which need not be validated again.
         if not delay:
             return trajectories
+        from spelgen.logs.recording import earlier
+
         return [replace(x, tau=earlier(x.t, x.tau, delay)) for x in trajectories]

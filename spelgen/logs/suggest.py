@@ -15,8 +15,8 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
-from spelgen.logs.formats import FORMATS, format_of
-from spelgen.logs.parquet_files import LEROBOT, dataset_motors
+from spelgen.logs.formats import FORMATS, LEROBOT, format_of
+from spelgen.logs.parquet_files import dataset_motors
 from spelgen.logs.tables import names_joint, reading
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit

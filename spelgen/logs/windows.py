@@ -12,10 +12,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.errors import Diagnostic, LogError
+from spelgen.labels import LAST_PART
 from spelgen.logs.trajectory import Trajectory, set_aside
-
-LAST_PART = " (last part)"
-"""Suffix of a trajectory's name for its last part, which is used for validation, while the first part is fitted."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.certificate.inspection import Inspection, range_text
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.excitation.excitation import ADVICE, Excitation
-from spelgen.fitting.posterior import PRECISE
 from spelgen.fitting.run_record import Content
+from spelgen.identification.intervals import PRECISE
 from spelgen.labels import named_joints
 from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps

@@ -17,7 +17,6 @@ from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
 from spelgen.labels import MODEL, entry_name, joints_in_ranges
 from spelgen.render.scene import scene
-from spelgen.structure.nominal import working_range
 from spelgen.structure.structure import Structure
 from spelgen.templates import json_data
 
@@ -154,7 +153,7 @@ def _colour(error: np.ndarray) -> np.ndarray:
 def _sweep(arm: Chain) -> AnimatedMotion:
     """Return a motion of 12 s in which each joint moves sinusoidally about the middle of its range."""
     t = np.linspace(0, 12, 121)
-    low, high = np.array(list(map(working_range, arm.coordinates))).T
+    low, high = np.array([x.working_range for x in arm.coordinates]).T
     # Amplitudes are at most 1.2 rad and 0.3 m: some URDFs have limits of 100 revolutions, too fast for a picture.
     largest = [0.3 if coordinate.joint_type == "prismatic" else 1.2 for coordinate in arm.coordinates]
     joint = np.arange(len(low))

@@ -15,10 +15,10 @@ from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
 from spelgen.dynamics.regressor_dynamics import urdf_parameters
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
-from spelgen.fitting.posterior import PRECISE, Posterior
+from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.run_record import Content
 from spelgen.identification.base_parameters import base_parameters
-from spelgen.identification.intervals import Interval
+from spelgen.identification.intervals import PRECISE, Interval
 from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
 from spelgen.runtime.derived_mass import ConstantMass, DerivedMass

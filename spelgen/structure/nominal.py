@@ -11,11 +11,11 @@ RA-L 3:60, 2018).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import floor, isqrt, log10, pi
+from math import floor, isqrt, log10
 
 import numpy as np
 
-from spelgen.arm.arm import Chain, Coordinate
+from spelgen.arm.arm import Chain
 from spelgen.structure.basis import Term, row_of
 from spelgen.structure.sampling import float_energies
 from spelgen.structure.structure import Structure
@@ -53,7 +53,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
     """Return the nominal values of ``arm`` for the outputs and constants of its ``structure``."""
     # The seed is fixed, because the nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
-    ranges = list(map(working_range, arm.coordinates))
+    ranges = [x.working_range for x in arm.coordinates]
     q = np.stack([rng.uniform(lower, upper, 512) for lower, upper in ranges], axis=-1)
     from_urdf = arm.inertials_complete and _gives_usable_mass(arm, q)
     inertias = nominal_inertias(arm, from_urdf)
@@ -88,23 +88,6 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
         min_eigenvalue=_round(_min_eigenvalue(mass)),
         from_urdf=from_urdf,
     )
-
-
-def working_range(coordinate: Coordinate) -> tuple[float, float]:
-    """Return the lower and upper end of the range of a coordinate [rad, m].
-
-    The range is given by the limits, cut at +-2 pi for a revolute joint. Without usable limits it is one revolution, or
-    1 m, about zero.
-    """
-    lower, upper = coordinate.lower, coordinate.upper
-    is_revolute = coordinate.joint_type == "revolute"
-    # Huge or equal limits are not usable: exporters write +-1e16, or equal limits, for a joint without limits.
-    if lower is None or upper is None or not 0 < upper - lower < 1e3:
-        half_range = pi if is_revolute else 0.5
-        return -half_range, half_range
-    if is_revolute:
-        return max(lower, -2 * pi), min(upper, 2 * pi)
-    return lower, upper
 
 
 def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:

@@ -1,10 +1,12 @@
 """Objective torque: fit inverse dynamics to the torques of all logs, then validate the model on windows."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
@@ -21,7 +23,6 @@ from spelgen.fitting.torque.networks import BLOCK, adapt_networks, fit_networks
 from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
-from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.identification.drive_hints import Coupling
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
@@ -31,6 +32,9 @@ from spelgen.logs.tuning import SLOWEST
 from spelgen.logs.windows import thinned
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import TorqueFit
+
+if TYPE_CHECKING:
+    from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 
 SAMPLES = 5  # number of samples of a window for validation and loss scales
 FITTED = {
@@ -82,6 +86,8 @@ class TorqueObjective(Objective):
         regularizer = None
         # The fit of rigid-body models has a prior at the URDF, so they need no regularizer.
         if self.config.urdf_weight and not isinstance(model, RigidBodyDynamics):
+            from spelgen.fitting.urdf_regularizer import urdf_regularizer
+
             regularizer = urdf_regularizer(self.request.urdf, model, self.data.training, notes)
         fit_notes, solution = fit_torques(model, samples, self.config, regularizer)
         self.results = {"notes": [note.message for note in fit_notes]}

@@ -12,17 +12,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 
 from spelgen.dynamics.parameters import NamedTensors, parameter_table
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.torque.samples import SampleBlock
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.logs.tuning import SAMPLES
 from spelgen.runtime.body_chain import body_factor
 from spelgen.settings.fits import Adaptation, GaussianPrior
+
+if TYPE_CHECKING:
+    from spelgen.fitting.torque.samples import SampleBlock
 
 MIN_SPEED = SAMPLES.moving
 RIGID_GROUPS = (
