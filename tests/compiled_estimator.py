@@ -35,7 +35,7 @@ def nominal_levels(
     return NoiseLevels(
         drift=noise, load=noise, observer=white, peak_start=2.5 * ones, peak_scale=0.7 * ones, peak_count=40,
         load_variance=2.25, load_freedom=20, resting=0.6 * coulomb, resting_speed=0.01 * speed, speed=speed,
-        encoder=0 * ones, effort=effort, minutes=2.0, point=np.array([0.0, 0.0, 0.1]),
+        encoder=0 * ones, effort=effort, minutes=2.0, point=np.array([0.0, 0.0, 0.1]), delay=0.0,
     )  # fmt: skip
 
 

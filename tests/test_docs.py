@@ -40,6 +40,7 @@ SLOW = {"tutorial_servo.md"}  # a fit of half a minute: only `pytest --update` r
 SHORTER = {
     "control.md": {
         '("estimator", "learned", "URDF"):': '("estimator", "learned"):',
+        "PICKED, END = 3.0, 11.0": "PICKED, END = 3.0, 9.0",
         "END, dynamics=with_load": "END if estimator else 6.0, dynamics=with_load",
     }
 }

@@ -152,8 +152,8 @@ def test_a_joint_without_room_is_refused(robots, tmp_path):
     with pytest.raises(SpelgenErrors) as caught:
         excite(load_arm(tmp_path / "stuck.urdf"), **CHOICE, trials=1)
     assert str(caught.value).splitlines()[0] == (
-        "joint 'joint1': got the limits 1 .. 1, expected room to move; "
-        "correct them, or omit the joint by --joints"
+        "joint 'joint1': got the limits 1 .. 1, expected a range to move in; correct them, omit the joint "
+        "by --joints, or write 'simulation: {positions: {joint1: [LOWEST, HIGHEST]}}' into the robot's YAML"
     )
 
 

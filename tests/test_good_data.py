@@ -132,7 +132,7 @@ def test_messages_of_a_second_publisher_are_left_out_with_one_note(tmp_path):
     (log,) = read_logs(bag_of(mixed, tmp_path / "bag"), JOINTS)
     check_read(log)
     assert log.repairs == (
-        f"{len(zeros)} rows of another topic or publisher left out: without values, or with positions only",
+        f"{len(zeros)} rows left out, of another topic or publisher: without values, or with positions only",
     )
 
 
@@ -166,7 +166,7 @@ def test_rows_of_another_topic_are_left_out_and_a_cell_without_a_number_is_an_er
 
     (log,) = read_logs(write(mixed, tmp_path / f"log.{form}"), JOINTS)
     check_read(log)
-    assert log.repairs[0].startswith(f"{other.sum()} rows of another topic or publisher left out")
+    assert log.repairs[0].startswith(f"{other.sum()} rows left out, of another topic or publisher")
     mixed["tau_elbow"] = pa.array(columns["tau_elbow"][rows], mask=other | (np.arange(len(rows)) == 6))
     with pytest.raises(LogError, match="row 7, column tau_elbow: got no finite number"):
         read_logs(write(mixed, tmp_path / f"log.{form}"), JOINTS)
@@ -204,7 +204,11 @@ def test_times_of_a_coarse_clock_are_reconstructed_where_rows_are_evenly_spaced(
 def test_times_of_a_coarse_clock_are_an_error_where_rows_are_not_evenly_spaced(tmp_path):
     uneven = np.cumsum(np.where(np.sin(5 * T) > 0, 0.002, 0.02))
     pa.csv.write_csv(columns_of(np.floor(uneven / 0.02) * 0.02), tmp_path / "log.csv")
-    with pytest.raises(LogError, match=r"rows with the time of another row, but another state.*sample_rate"):
+    refused = pytest.raises(LogError, match=r"with the time of another row, but another state.*sample_rate")
+    with refused:
+        read_logs(tmp_path / "log.csv", JOINTS)
+    pa.csv.write_csv(columns_of(np.arange(400) // 10 * 1e-5), tmp_path / "log.csv")  # a rate that no arm has
+    with refused:
         read_logs(tmp_path / "log.csv", JOINTS)
 
 
@@ -275,6 +279,8 @@ def test_times_of_lerobot_are_reported_as_frame_numbers_until_a_rate_is_stated(t
     (log,) = read_logs(folder, JOINTS, degrees)
     assert log.sample_rate == pytest.approx(30, rel=1e-3)
     assert any("times are frame numbers at 30 frames per second and not measured" in x for x in log.remarks)
+    with pytest.raises(LogError, match="write 'input: position' into the YAML"):
+        read_logs(folder, JOINTS, {"units": {"q": "deg"}})
     (log,) = read_logs(folder, JOINTS, degrees | {"sample_rate": 60})
     assert log.sample_rate == pytest.approx(60, rel=1e-6)
     assert log.remarks == ()
@@ -291,6 +297,7 @@ NO_LIMITS = {
     "0": 'effort="0" velocity="0" lower="0" upper="0"',
     "absent": "",
     "inf": 'effort="inf" velocity="INF" lower="-inf" upper="+inf"',
+    "below 0": 'effort="-1" velocity="-1" lower="-1e16" upper="1e16"',
     "nan": 'effort="nan" velocity="NaN" lower="nan" upper="nan"',
     "1e16": 'effort="1e16" velocity="1e9" lower="-1e16" upper="1e16"',
     "largest": 'effort="1.7976931348623157e+308" velocity="1.7976931348623157e+308" '

@@ -146,6 +146,26 @@ def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, t
     assert "jumps" not in errors([decoded], arm)
 
 
+def test_sign_bits_and_outliers_of_half_a_turn_of_angles_without_limits(robots, tmp_path):
+    """A sign bit of whole turns is no wrap, and an outlier of half a turn does not shift the samples after it."""
+    text = (robots / "two_link.urdf").read_text().replace('type="revolute"', 'type="continuous"')
+    (tmp_path / "x.urdf").write_text(text)
+    arm = load_arm(tmp_path / "x.urdf")
+    columns = motion(arm, 3)
+    counts = np.round(columns["q_joint1"] * 4096 / (2 * np.pi))
+    words = columns | {"q_joint1": np.where(counts < 0, 32768 - counts, counts)}
+    base = {"units": {"q": "counts"}, "counts_per_turn": 4096}
+    stated = {"velocity": "differentiated", "joints": {"joint1": base}}
+    told = errors(read_logs(written(words, tmp_path / "words.csv"), arm, stated), arm)
+    assert "write 'joints: {joint1: {sign_bit: {q: 32768}}}'" in told
+    stated["joints"]["joint1"] |= {"sign_bit": {"q": 32768}}
+    (decoded,) = read_logs(tmp_path / "words.csv", arm, stated)
+    assert decoded.q[:, 0] == pytest.approx(counts * 2 * np.pi / 4096, abs=1e-9)
+    columns["q_joint2"][700] += np.pi
+    (kept,) = read_logs(written(columns, tmp_path / "half.csv"), arm, {"dropouts": "dropped"})
+    assert kept.q[:, 1] == pytest.approx(np.delete(columns["q_joint2"], 700), abs=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("form", ["sign bit", "unsigned"])
 def test_words_of_a_load_register_are_named_too(arm, tmp_path, form, seed):
@@ -172,7 +192,8 @@ def test_outliers_of_any_size_are_named_and_dropped_on_request(arm, tmp_path, fo
     for size in (0.3, 2 * np.pi, 1e5) if quantity == "q" else (1e2, 1e5):
         columns = motion(arm, int(random.integers(1000)))
         joint = joints[random.integers(len(joints))]
-        rows = np.sort(random.choice(np.arange(5, 1990, 20), 4, replace=False))
+        rows = np.sort(random.choice(np.arange(25, 1970, 20), 4, replace=False))
+        rows[[0, -1]] = random.choice([[0, 1999], [1, 1970], [25, 1998]])  # also at the ends of the recording
         name = f"{quantity}_{joint}"
         wrong = columns | {name: columns[name].copy()}
         wrong[name][rows] += size * random.choice([-1, 1], 4)

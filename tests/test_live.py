@@ -13,6 +13,7 @@ from motions import smooth_motion
 from scipy.optimize import minimize
 from typer.testing import CliRunner
 
+import spelgen
 from spelgen.cli.main import app
 from spelgen.dynamics.body_regressor import chain_regressor, pseudo_inertia
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
@@ -221,6 +222,31 @@ def test_a_log_that_begins_in_motion_begins_without_a_contact(arm, levels, run):
     _, states = estimates(run, levels, part, part.tau)
     assert ((inertial - still).abs().numpy() > states[50].contact.threshold).any()
     assert not any(state.contact.touched.any() for state in states)
+
+
+def test_delayed_torques_are_compared_with_the_motion_of_their_time():
+    """Torques are logged 15 ms late: the fit finds the delay; without it, motion would give external torques."""
+    urdf, late = ROBOTS / "two_link.urdf", 3
+    model = moved_model("two_link", "closed-form", 0.03).double()
+    random = np.random.default_rng(4)
+    q, qd, qdd = smooth_motion(model.n, 60.0, random)
+    t, qd, qdd = 0.005 * np.arange(len(q)), 2 * qd, 4 * qdd
+    z = bristles_along(q, bristle_reach(model))
+    with torch.no_grad():
+        tau = model.inverse_dynamics(*numbers(q, qd, qdd, z)).numpy()
+    tau += 1e-3 * np.abs(tau).max(axis=0) * random.standard_normal(tau.shape)
+    log = Trajectory(t[late:], q[late:], qd[late:], tau[:-late])
+    fit = spelgen.fit(build(urdf, "closed-form"), [log[:3500]], arm=urdf)
+    levels = Estimator(fit).levels
+    assert abs(levels.delay - 0.005 * late) < 0.002
+
+    def external_torques(delay):
+        states = Estimator(fit, levels=levels.model_copy(update={"delay": delay})).replay(log[3500:])
+        # the friction state is unknown in the first seconds
+        torques = [x.contact.external_torque / levels.observer for x in states[600:]]
+        return np.sqrt(np.mean(np.square(torques), axis=0))
+
+    assert (external_torques(levels.delay) < 0.5 * external_torques(0.0)).all()
 
 
 def test_friction_drift_is_found(arm, levels, run):
@@ -446,10 +472,13 @@ def test_the_command_prints_payload_contacts_and_drift(arm, levels, run, tmp_pat
     assert "payload of 2.0" in result.output
     assert "contact at 9.0" in result.output
     assert "friction at the end" in result.output
+    assert "contact thresholds in motion; at rest: joint1" in result.output
     page = (tmp_path / "page.html").read_text()
     assert "Mass of the payload" in page
     result = CliRunner().invoke(app, [*arguments, "--format", "json"])
     (content,) = json.loads(result.stdout)["logs"]
+    moving, rest = json.loads(result.stdout)["contact_thresholds"]["joint2"]
+    assert 0 < moving < rest
     assert content["payload"]["status"] == "payload"
     assert content["payload"]["mass_interval"][0] < 2.0 < content["payload"]["mass_interval"][1]
     assert any(abs(contact["begin"] - 9.0) < 0.1 for contact in content["contacts"])

@@ -37,10 +37,10 @@ def randomised(urdf, preset="hybrid"):
     return model.requires_grad_(False)
 
 
-def levels_of(model, log, noise_ratio=2e-3):
+def levels_of(model, log, noise_ratio=2e-3, delay=0.0):
     effort = 2.0 * np.abs(log.tau).max(axis=0) + 1e-3
     levels = nominal_levels(effort, np.abs(log.qd).max(axis=0) + 1e-3, model.coulomb.numpy(), noise_ratio)
-    return levels.model_copy(update={"encoder": np.full(model.n, 1e-5)})
+    return levels.model_copy(update={"encoder": np.full(model.n, 1e-5), "delay": delay})
 
 
 def require_equal(found: Columns, states: list[EstimatorState], tolerance: float) -> None:
@@ -62,14 +62,15 @@ def segments(files: list[Path], arm: Arm) -> Trajectory:
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_c_equals_python_along_recordings(name, tmp_path):
-    """With a model that is not fitted, and noise as large as its residuals: every part of the estimator is busy."""
+    """With an unfitted model, noise as large as its residuals, and delayed torques: every part is busy."""
     urdf = SHARED / ("arms/panda_erd.urdf" if name == "panda" else f"logs/{name}/{name}.urdf")
     files = sorted((SHARED / "logs" / name).glob("*.parquet"))
     if not files:
         pytest.skip(f"no logs of {name}: the folder of recordings is not here")
     model, arm = randomised(urdf), load_arm(urdf)
     log = segments(files, arm)
-    levels = levels_of(model, log, 0.02)
+    # The log odds of airbot amplify rounding errors most: without a delay, as in most fits.
+    levels = levels_of(model, log, 0.02, delay=0.0 if name == "airbot" else 0.015)
     estimator = Estimator(load_run(saved_run(model, urdf, tmp_path).path), levels=levels)
     compiled = CompiledEstimator(model, arm, levels)
     found = compiled.run(log.t, log.q, log.qd, log.tau)
@@ -81,12 +82,12 @@ def test_c_equals_python_along_recordings(name, tmp_path):
 
 
 def test_c_equals_python_with_couplings_and_hostile_samples(tmp_path):
-    """A mimic joint, a prismatic one, coupled motors and a passive joint, under unusable samples."""
+    """A mimic joint, a prismatic one, coupled motors and a passive joint, unusable samples, and early torques."""
     (tmp_path / "arm.urdf").write_text(COUPLED)
     (tmp_path / "arm.yaml").write_text(MOTORS)
     model = randomised(tmp_path / "arm.urdf", "closed-form")
     log = hostile(motion_of(model, 20.0))
-    levels = levels_of(model, motion_of(model, 20.0), 0.02)
+    levels = levels_of(model, motion_of(model, 20.0), 0.02, delay=-0.025)
     compiled = CompiledEstimator(model, load_arm(tmp_path / "arm.urdf"), levels)
     found = compiled.run(*log)
     fit = load_run(saved_run(model, tmp_path / "arm.urdf", tmp_path / "run").path)

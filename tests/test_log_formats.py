@@ -493,7 +493,8 @@ def test_of_several_topics_one_is_named(bag):
 
 def test_empty_fields_of_a_bag_are_missing_columns(bag):
     folder = bag([(topic, names, q, [], []) for topic, names, q, _, _ in STATES])
-    with pytest.raises(LogError, match=r"missing columns qd_shoulder, qd_elbow, tau_shoulder, tau_elbow"):
+    text = r"missing columns qd_shoulder, qd_elbow, tau_shoulder, tau_elbow.*; log them, torques for example as efforts"
+    with pytest.raises(LogError, match=text):
         read_logs([folder], JOINTS)
 
 
@@ -573,7 +574,7 @@ def text_log(separator: str = ",", decimal: str = ".", names: str = "{}") -> str
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
-@pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", ","), (";", "."), ("\t", ",")])
+@pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", ","), ("|", "."), ("\t", ",")])
 def test_csv_as_spreadsheets_write_it(tmp_path, separator, decimal, encoding):
     joints = tuple(f"{joint}°" for joint in JOINTS)
     (tmp_path / "x.csv").write_bytes(text_log(separator, decimal, "{}").encode(encoding))
@@ -776,9 +777,31 @@ def test_rows_out_of_order_repeated_rows_and_dates_are_mended(tmp_path):
     assert 0 <= log.t[0] < 1
     notes = [x.message for x in checks.check([log], ("a",), ("revolute",)) if x.code == "repaired"]
     assert notes == [
-        "1 times before that of the row above: the rows were sorted",
-        "2 rows with the time of the row before were left out",
+        "1 time before that of the row above: the rows were sorted",
+        "2 rows with the time of the row before left out",
     ]
+
+
+@pytest.mark.parametrize("rows", [range(30), range(100, 110), range(195, 200)])
+def test_rows_whose_times_are_years_from_the_others_are_left_out(tmp_path, rows):
+    t = 1.7e9 + 0.01 * np.arange(200)
+    stamps = np.where(np.isin(np.arange(200), rows), 0.0, t)
+    table = {"t": stamps, "q_a": np.sin(t), "qd_a": np.cos(t), "tau_a": -np.sin(t)}
+    (log,) = read_logs(parquet(tmp_path / "log.parquet", table), ("a",))
+    np.testing.assert_array_equal(log.q[:, 0], np.delete(np.sin(t), rows))
+    assert 0 <= log.t[0] < log.t[-1] < 3
+    assert log.repairs == (f"{len(rows)} rows left out, with times far from those of all other rows",)
+
+
+def test_rows_with_a_hole_are_an_error_until_dropouts_are_dropped(tmp_path):
+    t = 0.01 * np.arange(200)
+    tau = np.where(np.arange(200) % 5 == 0, np.nan, np.sin(t))
+    path = parquet(tmp_path / "log.parquet", {"t": t, "q_a": np.sin(t), "qd_a": np.cos(t), "tau_a": tau})
+    with pytest.raises(LogError, match=r"40 of 200 rows .*'dropouts: dropped' under 'logs'"):
+        read_logs(path, ("a",))
+    (log,) = read_logs(path, ("a",), {"dropouts": "dropped"})
+    np.testing.assert_array_equal(log.t, t[~np.isnan(tau)])
+    assert log.repairs == ("40 rows left out, with a signal without a number",)
 
 
 def test_dropouts_are_removed_on_request(tmp_path):

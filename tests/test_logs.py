@@ -1,5 +1,6 @@
 """Logs are read exactly, filtered without delay, split without leakage, and refused with one clear error."""
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -185,7 +186,7 @@ BAD = {
     "hole": (
         HEADER + "0,0,0,0\n0.1,0,,0\n0.2,0,0,nan\n",
         "{}:3: row 2, column qd_a: got no finite number (2 of 3 rows have such a gap, this is the first), "
-        "expected a number; remove those rows; a gap in t is understood",
+        "expected a number; 'dropouts: dropped' under 'logs' in the robot's YAML leaves out those rows",
     ),
     "time-back": (
         HEADER + "0,0,0,0\n0.1,1,0,0\n0.2,2,0,0\n0.05,3,0,0\n",
@@ -292,6 +293,18 @@ def test_a_velocity_that_is_no_derivative_is_a_warning():
         "trajectory x, joint 'b'",
     )
     assert note.message == "qd is not dq/dt: the best factor is 0.769, the correlation 1"
+
+
+def test_times_that_contradict_all_velocities_get_the_rate_of_the_velocities(tmp_path):
+    """Frames recorded at 100 Hz and stamped with another rate: the line in the error gives the velocities back."""
+    sound = swing()
+    write_logs(tmp_path / "x.csv", [replace(sound, t=2.5 * sound.t)], JOINTS)
+    with pytest.raises(LogError, match=r"'a', 'b': got q that changes 0.4 times as fast as qd") as caught:
+        check(read_logs([tmp_path / "x.csv"], JOINTS), JOINTS, ("revolute", "revolute"))
+    rate = float(re.search(r"write 'sample_rate: (\S+)'", str(caught.value))[1])
+    assert rate == pytest.approx(sound.sample_rate, rel=1e-3)
+    logs = read_logs([tmp_path / "x.csv"], JOINTS, {"sample_rate": rate})
+    assert check(logs, JOINTS, ("revolute", "revolute")) == []
 
 
 def changed(q=None, qd=None, tau=None) -> Trajectory:

@@ -46,7 +46,7 @@ def levels(arm):
     return NoiseLevels(
         drift=noise, load=noise, observer=2e-3 * effort, peak_start=3 * ones, peak_scale=0.3 * ones, peak_count=40,
         load_variance=1.0, load_freedom=20, resting=0.01 * effort, resting_speed=0.02 * ones, speed=2 * ones,
-        encoder=1e-5 * ones, effort=effort, minutes=10.0, point=np.zeros(3),
+        encoder=1e-5 * ones, effort=effort, minutes=10.0, point=np.zeros(3), delay=0.0,
     )  # fmt: skip
 
 

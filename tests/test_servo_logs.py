@@ -138,6 +138,15 @@ def test_commands_without_torques_ask_for_the_setting(tmp_path):
         spelgen.read_logs(tmp_path / "log.csv", arm)
 
 
+def test_counts_of_encoders_without_a_unit_are_not_called_milliradians(arm, logs):
+    counts = changed(
+        logs, q=lambda x: np.round(x.q * 4096 / (2 * np.pi) + 2048), u=lambda x: x.u * 652 + 2048
+    )
+    (error,) = (x for x in spelgen.check_logs(counts, arm).errors if "more than two turns" in str(x))
+    assert "whole numbers: counts of an encoder need 'counts_per_turn'" in str(error)
+    assert "mrad" not in str(error)
+
+
 DEGREES = LogMapping.model_validate({"input": "position", "units": {"q": "deg"}})
 
 

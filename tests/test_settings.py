@@ -97,8 +97,10 @@ def test_settings_do_not_change(urdf):
         ),
         (
             "gravity:\n  - 0\n  - 0\n  - up",
-            "arm.yaml:4: gravity.2: got 'up', expected a valid number, unable to parse string as a number",
+            "arm.yaml:4: gravity.2: got 'up', expected a number",
         ),
+        ("gravity: 9.81", "arm.yaml:1: gravity: got 9.81, expected a list"),
+        ("moving_joints: []", "arm.yaml:1: moving_joints: got [], expected a longer list"),
         ("simulation: {sample_rate: yes}", "arm.yaml:1: simulation.sample_rate: got True, expected a number"),
         (
             "simulation: {sample_rate: .nan}",
@@ -215,7 +217,7 @@ def test_an_error_in_the_settings_of_a_step_refuses_only_that_step(urdf):
     settings = load_settings(
         urdf("gravity: [0, 0, -1.6]\ntraining: {epochs: many}\nlogs: {units: {q: deg}}\n")
     )
-    message = "arm.yaml:2: training.epochs: got 'many', expected a valid integer, unable to parse string as an integer"
+    message = "arm.yaml:2: training.epochs: got 'many', expected a whole number"
     assert (settings.gravity[2], settings.logs.units.q) == (-1.6, "deg")
     assert [(each.severity, each.message) for each in settings.diagnostics] == [("warning", message)]
     with pytest.raises(SettingsError) as error:

@@ -9,7 +9,7 @@ from scipy.special import ellipj
 from spelgen.arm.arm import make_arm
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
-from spelgen.errors import RunError, SettingsError
+from spelgen.errors import ArmError, RunError, SettingsError
 from spelgen.settings.settings import JointSettings, Settings, load_settings
 from spelgen.simulation import integration
 from spelgen.simulation.integration import rollout
@@ -222,10 +222,11 @@ class TestProtocol:
         assert told == [(done, 6) for done in range(1, 7)]
 
     def test_a_joint_without_limits_needs_positions(self, settings):
-        with pytest.raises(SettingsError) as error:
+        with pytest.raises(ArmError) as error:
             random_inputs(slider(lower=None, upper=None), settings)
         assert str(error.value) == (
-            "simulation.positions.a: the joint has no range: give its lowest and highest initial position"
+            "joint 'a': got no position limits, expected a range to move in; "
+            "write 'simulation: {positions: {a: [LOWEST, HIGHEST]}}' into the robot's YAML"
         )
 
     def test_a_motion_without_finite_acceleration_ends_clearly(self, settings):

@@ -95,6 +95,21 @@ def test_parts_of_a_torque_get_a_gain_to_write(scara, tmp_path, unit, name):
     assert f'"tau": "{name}"' in text and text.count(f"gain: 1.0 # Nm per {name}") == 4
 
 
+@pytest.mark.parametrize("words", [("Zeit", "Winkel", "Geschwindigkeit", "Drehmoment"), ("t", "θ", "ω", "τ")])
+def test_words_of_other_languages(scara, tmp_path, words):
+    head = [words[0], *(f"{word} {k}" for word in words[1:] for k in range(4))]
+    rows = [[t, *q, *qd, *tau] for t, q, qd, tau in zip(T, Q, QD, TAU, strict=True)]
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+def test_cells_with_lists_and_names_as_texts(scara, tmp_path):
+    order, names = [3, 1, 0, 2], [x.name for x in scara.chain.coordinates]
+    texts = [str([names[k] for k in order])] * len(T)
+    lists = [[str(list(map(float, x[order]))) for x in values] for values in (Q, QD, TAU)]
+    rows = zip(T, texts, *lists, strict=True)
+    require_same(suggested(written(tmp_path / "log.csv", ["t", "name", "pos", "vel", "trq"], rows), scara)[0])
+
+
 def test_matrices_of_an_archive(scara, tmp_path):
     np.savez(tmp_path / "log.npz", time=T, positions=Q, velocities=QD, torques=TAU, image=np.zeros((3, 3)))
     require_same(suggested(tmp_path / "log.npz", scara)[0])

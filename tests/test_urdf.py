@@ -147,6 +147,10 @@ DOCUMENTS = {
         '<robot name="r">\n<link name="a">',
         "FILE:2: not well-formed XML (Premature end of data in tag link line 2)",
     ),
+    "pointer of Git LFS": (
+        "version https://git-lfs.github.com/spec/v1\nsize 3\n",
+        "FILE: got a pointer of Git LFS, expected a URDF document; run 'git lfs pull' first",
+    ),
     "merge conflict": (
         '<robot name="r">\n<<<<<<< HEAD\n</robot>',
         "FILE:2: got a merge-conflict marker, expected XML; resolve the merge conflict first",
@@ -353,6 +357,9 @@ class TestLint:
             ("non-unit-axis", LINKS + joint('<axis xyz="0 1 0.5"/>')),
             ("lower-above-upper", LINKS + joint('<limit lower="1" upper="0" effort="1" velocity="1"/>')),
             ("unlimited", LINKS + joint('<limit lower="0" upper="1"/>')),
+            ("degrees", LINKS + joint('<origin rpy="0 90 0"/>')),
+            ("degrees", LINKS + joint('<limit lower="-170" upper="170" effort="1" velocity="1"/>')),
+            ("millimetres", LINKS + joint('<origin xyz="0 0 330"/>')),
             ("unlimited", LINKS + JOINT.replace("<limit", "<limits")),
             ("repeated-element", LINKS + joint('<axis xyz="0 0 1"/><axis xyz="0 1 0"/>')),
             ("missing-inertial", LINKS + JOINT),

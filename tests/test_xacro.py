@@ -143,6 +143,10 @@ class TestExpansion:
 FAILURES = {
     "unknown macro": ("<xacro:gripper/>", "unknown macro name: xacro:gripper when processing file: "),
     "missing file": ('<xacro:include filename="none.xacro"/>', "No such file or directory: "),
+    "unknown package": (
+        '<xacro:include filename="$(find no_pkg)/x.xacro"/>',
+        "the package 'no_pkg' of $(find no_pkg) is neither",
+    ),
     "wrong expression": ('<link name="${1 / 0}"/>', "division by zero when evaluating expression '1 / 0'"),
     "unset argument": ('<link name="$(arg side)"/>', "Undefined substitution argument side"),
     "not well-formed": ("<link>", "mismatched tag: line 10, column 2"),

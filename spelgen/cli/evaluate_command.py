@@ -137,9 +137,17 @@ def estimate(
     record: dict[str, object] = {"run": str(run), "page": str(page)}
     record["supported_alarms_per_minute"] = rate = levels.supported_alarms
     record["logs"] = [result.to_dict() for result in results]
-    wanted = alarms or TUNING.alarms_per_minute
-    supported = (
-        f"contact thresholds: {wanted:g} false alarms per minute (training logs support >= {rate:.2g})"
+    alarm_rate = alarms or TUNING.alarms_per_minute
+    thresholds = dict(zip(joints, levels.contact_thresholds(alarm_rate).tolist(), strict=True))
+    record["contact_thresholds"] = thresholds
+    smallest = ", ".join(
+        f"{joint} {moving:.3g}; {resting:.3g}" for joint, (moving, resting) in thresholds.items()
+    )
+    supported = fill(
+        f"contact thresholds in motion; at rest: {smallest} Nm, N, for a rate of false alarms of {alarm_rate:g} per "
+        f"minute (training logs support >= {rate:.2g})",
+        WIDTH,
+        subsequent_indent="    ",
     )
     answer(format, record, *(result.text() for result in results), supported, f"wrote {page}")
 

@@ -79,19 +79,23 @@ def motion_bounds(
             speeds[k] = min(speeds[k], mimic.velocity / abs(factor))
     errors: list[SpelgenError] = []
     for coordinate, (low, high) in zip(arm.coordinates, limits, strict=True):
-        if np.isnan(low):
-            line = f"simulation: {{positions: {{{coordinate.name}: [LOWEST, HIGHEST]}}}}"
-            errors.append(ArmError(
-                "no position limits", element=f"joint {coordinate.name!r}", expected="a range to move in",
-                do=f"write '{line}' into the robot's YAML",
-            ))  # fmt: skip
-        elif not low < high:
-            errors.append(ArmError(
-                f"the limits {low:g} .. {high:g}", element=f"joint {coordinate.name!r}",
-                expected="room to move", do="correct them, or omit the joint by --joints",
-            ))  # fmt: skip
+        if not low < high:
+            errors.append(range_error(coordinate.name, None if np.isnan(low) else (low, high)))
     collect(errors)
     return MotionBounds(limits[:, 0], limits[:, 1], speed_fraction * speeds).narrowed(range_fraction)
+
+
+def range_error(joint: str, limits: tuple[float, float] | None) -> ArmError:
+    """Return the error about a joint without a range to move in; limits: [rad, m], None if there are none."""
+    line = f"write 'simulation: {{positions: {{{joint}: [LOWEST, HIGHEST]}}}}' into the robot's YAML"
+    if limits is None:
+        got, do = "no position limits", line
+    else:
+        got, do = (
+            f"the limits {limits[0]:g} .. {limits[1]:g}",
+            f"correct them, omit the joint by --joints, or {line}",
+        )
+    return ArmError(got, element=f"joint {joint!r}", expected="a range to move in", do=do)
 
 
 class Box(Group):

@@ -108,7 +108,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     for name, level in levels:
         if isinstance(level, BlockNoise):
             tables |= {f"{name}_{key}": row for key, row in level}
-        elif name not in ("minutes", "point", "peak_count", "load_freedom"):
+        elif name not in ("minutes", "point", "peak_count", "load_freedom", "delay"):
             tables[name] = np.ravel(level)
     values = {
         "name": model.name,

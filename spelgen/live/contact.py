@@ -30,6 +30,7 @@ class ContactObserver:
             of the arm, filtered at the bandwidth of the observer and at twice this bandwidth; 5 to 14: regressor of the
             payload.
         baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
+        jerk: Low-pass filtered squared change of dp/dt, (n,) [Nm^2, N^2].
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -42,21 +43,19 @@ class ContactObserver:
         self.inputs = self.low = np.zeros((15, len(self.levels.speed)))
         self.touched = np.zeros(len(self.levels.speed), dtype=bool)
 
-    def step(
-        self, t: float, qd: np.ndarray, at: Balance, payload: Payload, drift: np.ndarray
-    ) -> ContactState:
+    def step(self, t: float, at: Balance, payload: Payload, drift: np.ndarray) -> ContactState:
         """Return the external torques after a sample.
 
         Args:
             t: Time of the sample [s].
-            qd: Velocities, (n,) [rad/s, m/s].
             at: Terms of the momentum balance at the sample.
             payload: Estimated payload.
             drift: Estimates of the drift filter, (n, 2): friction scale minus one [1], and disturbance [Nm, N].
         """
         signal, variance = self.residual(t, at, payload, drift)
         noise = np.sqrt(variance + np.square(self.levels.observer))
-        threshold = self.levels.thresholds(self.alarms_per_minute) * noise + self.levels.resting_torque(qd)
+        threshold = self.levels.thresholds(self.alarms_per_minute) * noise
+        threshold += self.levels.resting_torque(at.velocity)
         self.touched = np.abs(signal) > threshold
         force = tip_force(at.jacobian, -signal, threshold) if self.touched.any() else np.zeros(3)
         return ContactState(-signal, threshold, self.touched, force)
@@ -79,23 +78,24 @@ class ContactObserver:
         # that occur in the training logs, and the excess is treated as contact.
         largest = TUNING.outlier * self.levels.drift.disturbance
         disturbance = np.clip(disturbance, -largest, largest)
+        step = 0.0 if self.t is None else t - self.t
+        gain = 1 - np.exp(-rate * step)
         if self.t is None:
             # The filters start in the states for which the torque residual is zero. In their steady state for constant
             # inputs, the residual of an accelerating arm would not be zero.
             self.low = inputs.copy()
             self.low[0], self.low[1], self.low[5:] = rate * at.momentum, 0.0, rate * at.load_momentum.T
-            self.baseline = disturbance
+            self.baseline, self.jerk = disturbance, np.zeros_like(disturbance)
         else:
-            step = t - self.t
-            gains = np.full((len(inputs), 1), 1 - np.exp(-rate * step))
+            gains = np.full((len(inputs), 1), gain)
             # Row 4 of `low` has twice the bandwidth of row 3. The difference between the two estimates of dp/dt
             # indicates how fast dp/dt changes.
             gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
             # The baseline of a joint in contact is not updated, because its estimated disturbance contains the contact
             # torque.
-            gain = np.where(self.touched, 0.0, 1 - np.exp(-step / TUNING.baseline))
-            self.baseline = self.baseline + gain * (disturbance - self.baseline)
+            adapted = np.where(self.touched, 0.0, 1 - np.exp(-step / TUNING.baseline))
+            self.baseline = self.baseline + adapted * (disturbance - self.baseline)
         self.t, self.inputs = t, inputs
         torque, friction, uncertainty, slow, fast = self.low[:5]
         # `regressor` is the filtered regressor of the payload, (n, 10). Its product with the inertial parameters of the
@@ -105,7 +105,10 @@ class ContactObserver:
             torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline
         )
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
-        variance = jerk**2 + TUNING.uncertainty * uncertainty**2
+        # Torques that lag behind the motion cause an error if dp/dt changes, and the filter of the residual retains
+        # this error.
+        self.jerk = self.jerk + gain * (jerk**2 - self.jerk)
+        variance = TUNING.jerk**2 * (jerk**2 + self.jerk) + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)
         return signal, variance
 

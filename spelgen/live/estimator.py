@@ -107,23 +107,23 @@ class Estimator:
     ) -> Iterator[EstimatorState]:
         """Process samples at times t (T,), with q, qd and tau (T, n); yield the estimates after each sample."""
         refusals, terms = balance_along(self.model, self.levels, self.intake, t, (q, qd, tau), self.prepared)
-        for now, speed, refusal, at in zip(t.tolist(), qd, refusals, terms, strict=True):
-            changed = at is not None and self._advance(now, speed, at, refusal)
+        for now, refusal, at in zip(t.tolist(), refusals, terms, strict=True):
+            changed = at is not None and self._advance(now, at, refusal)
             a, d = self.drift.x.T
             yield EstimatorState(now, refusal, self.contact, self.payload, changed, 1 + a, d)
 
-    def _advance(self, t: float, qd: np.ndarray, at: Balance, refusal: Refusal) -> bool:
+    def _advance(self, t: float, at: Balance, refusal: Refusal) -> bool:
         """Update all filters with a sample; return True if a changed load was detected.
 
-        t: time [s]. qd: velocities, (n,). at: terms of the momentum balance. refusal: result of the sample's check.
+        t: time [s]. at: terms of the momentum balance. refusal: result of the sample's check.
         """
         if refusal != "used":
             self.blocks.restart()
             self.half = None
             if refusal == "gap":
                 self.observer.restart()
-        self.contact = self.observer.step(t, qd, at, self.payload, self.drift.x)
-        block = None if refusal == "saturated" else self.blocks.add(t, qd, at)
+        self.contact = self.observer.step(t, at, self.payload, self.drift.x)
+        block = None if refusal == "saturated" else self.blocks.add(t, at)
         if block is not None:
             self.drift.update(block, block.y - block.load @ self.payload.parameters)
             if self.half is not None:
@@ -163,7 +163,7 @@ class Estimator:
                 it is longer than 0.3 s, the disturbance is omitted.
         """
         at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
-        z = torch.from_numpy((self.intake.low + self.intake.high) / 2)
+        z = torch.from_numpy(self.intake.bounds.mean(axis=0))
         past = (z,) if is_stateful(self.model) else ()
         with torch.no_grad():
             cache = self.model.at(*at, prepared=self.prepared)

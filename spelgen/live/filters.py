@@ -65,13 +65,13 @@ class Blocks:
 
     def restart(self) -> None:
         """Discard the samples of the current block, for example after a gap."""
-        self.samples: list[tuple[float, np.ndarray, Balance]] = []
+        self.samples: list[tuple[float, Balance]] = []
         self.duration = 0.0
 
-    def add(self, t: float, qd: np.ndarray, at: Balance) -> Block | None:
-        """Add a sample at time t [s], with velocities qd (n,) and terms `at`; return the block if it is complete."""
+    def add(self, t: float, at: Balance) -> Block | None:
+        """Add a sample at time t [s] with the terms `at`; return the block if it is complete."""
         step = t - self.samples[-1][0] if self.samples else 0.0
-        self.samples.append((t, np.abs(qd), at))
+        self.samples.append((t, at))
         # The duration is a sum of time steps, because the emitted C code computes it in this way. The difference of the
         # last and the first time has other rounding errors.
         self.duration += step
@@ -84,13 +84,14 @@ class Blocks:
         return block
 
     def _block(self, duration: float) -> Block:
-        t, speeds, terms = zip(*self.samples, strict=True)
+        t, terms = zip(*self.samples, strict=True)
         sums = [np.trapezoid(np.array(term), t, axis=0) / duration for term in zip(*terms, strict=True)]
-        _, torque, friction, uncertainty, _, load_torque, _ = sums
+        _, torque, friction, uncertainty, _, load_torque, *_ = sums
         first, last = terms[0], terms[-1]
         load = (last.load_momentum - first.load_momentum) / duration - load_torque
         y = torque - friction - (last.momentum - first.momentum) / duration
-        return Block(duration, y, load, friction, uncertainty, np.max(speeds[1:], axis=0) > self.rest_speed)
+        fastest = np.abs([term.velocity for term in terms[1:]]).max(axis=0)
+        return Block(duration, y, load, friction, uncertainty, fastest > self.rest_speed)
 
 
 class LoadFilter:

@@ -17,6 +17,27 @@ IGNORED: tuple[Refusal, ...] = ("not finite", "repeated", "reversed", "jump")
 """Reasons for which nothing of a sample is used."""
 
 
+class DelayLine:
+    """Delay of signals by a constant time, with linear interpolation between samples."""
+
+    def __init__(self, delay: float) -> None:
+        self.delay = delay
+        self.samples: list[tuple[float, np.ndarray]] = []
+
+    def step(self, t: float, values: np.ndarray) -> np.ndarray:
+        """Add values at time t [s]; return the values ``delay`` seconds before, or the oldest ones."""
+        samples, past = self.samples, t - self.delay
+        if not samples or t - samples[-1][0] >= self.delay / TUNING.delay_samples:
+            samples.append((t, values))
+        while len(samples) > 2 and samples[1][0] <= past:
+            del samples[0]
+        (begin, first), (end, second) = samples[0], samples[-1 if len(samples) == 1 else 1]
+        if past <= begin:
+            return first
+        weight = (past - begin) / (end - begin)
+        return (1 - weight) * first + weight * second
+
+
 class Intake:
     """Checks of samples one after the other, and bounds of the friction state.
 
@@ -25,8 +46,9 @@ class Intake:
 
     Attributes:
         counts: {result of the check: number of samples}.
-        low: Lower bound of the friction state of each of K bristles, (n, K) [rad, m].
-        high: Upper bound, (n, K) [rad, m].
+        bounds: Lower and upper bound of the friction state of each of K bristles, (2, n, K) [rad, m].
+        aligned: q, qd and tau of the last used sample, (3, n), at the same time: the motion is delayed if torques are
+            measured late, the torques if they are measured early.
     """
 
     def __init__(self, levels: NoiseLevels, bristles: BristleReach) -> None:
@@ -35,7 +57,12 @@ class Intake:
         self.counts = dict.fromkeys(REFUSALS, 0)
         self.t, self.ignored = -np.inf, 0
         self.q = self.path = np.zeros(len(self.limit))
-        self.low, self.high = -self.limit, self.limit
+        self._begin()
+
+    def _begin(self) -> None:
+        """Reset the friction state and the delay: the motion so far is unknown."""
+        self.bounds = np.stack([-self.limit, self.limit])
+        self.line = DelayLine(abs(self.levels.delay))
 
     def accept(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
         """Check a sample and update the bounds of the friction state.
@@ -47,21 +74,23 @@ class Intake:
         # positions is assumed, and the checks restart with the current sample.
         self.ignored += refusal in ("reversed", "jump")
         restarts = self.ignored >= TUNING.restart
-        if refusal == "gap" or restarts or self.t == -np.inf:
-            self.low, self.high = -self.limit, self.limit
-            self.path = q.copy()
-        elif refusal not in IGNORED:
+        refusal = "gap" if restarts else refusal
+        if refusal not in IGNORED:
+            begins = refusal == "gap" or self.t == -np.inf
+            if begins:
+                self._begin()
+            now = np.stack([q, qd, tau])
+            is_delayed = np.array([[True], [True], [False]]) == (self.levels.delay > 0)
+            self.aligned = np.where(is_delayed, self.line.step(t, now), now)
             # Position changes of one encoder step are treated as rounding, not as motion.
-            path = np.clip(self.path, q - self.levels.encoder, q + self.levels.encoder)
-            moved = path - self.path
+            position = self.aligned[0]
+            start = position if begins else self.path
+            path = np.clip(start, position - self.levels.encoder, position + self.levels.encoder)
+            moved = path - start
             if self.bristles.motors is not None:
                 moved = self.bristles.motors @ moved
-            self.low = np.clip(self.low + moved[:, None], -self.limit, self.limit)
-            self.high = np.clip(self.high + moved[:, None], -self.limit, self.limit)
-            self.path = path
-        if restarts or refusal not in IGNORED:
-            refusal = "gap" if restarts else refusal
-            self.t, self.q, self.ignored = t, q, 0
+            self.bounds = np.clip(self.bounds + moved[:, None], -self.limit, self.limit)
+            self.path, self.t, self.q, self.ignored = path, t, q, 0
         self.counts[refusal] += 1
         return refusal
 
@@ -104,17 +133,18 @@ def balance_along(
         prepared: parameter cache of the model; None: the function computes it.
     """
     refusals: list[Refusal] = []
-    bounds: list[tuple[np.ndarray, np.ndarray]] = []
-    for sample in zip(t.tolist(), *samples, strict=True):
+    states: list[tuple[int, np.ndarray, np.ndarray]] = []
+    for k, sample in enumerate(zip(t.tolist(), *samples, strict=True)):
         refusals.append(intake.accept(*sample))
-        bounds.append((intake.low, intake.high))
-    used = [k for k, refusal in enumerate(refusals) if refusal not in IGNORED]
+        if refusals[-1] not in IGNORED:
+            states.append((k, intake.aligned, intake.bounds))
     terms: list[Balance | None] = [None] * len(t)
-    if used:
+    if states:
         # The terms of all samples are computed in one call, because the overhead of a call of torch is larger than the
         # computation for one sample.
-        low, high = np.array([bounds[k] for k in used]).swapaxes(0, 1)
-        columns = balance(model, levels.point, [x[used] for x in samples], (low, high), prepared)
-        for k, *row in zip(used, *columns, strict=True):
+        used, aligned, bounds = map(np.array, zip(*states, strict=True))
+        signals, limits = [*aligned.swapaxes(0, 1)], [*bounds.swapaxes(0, 1)]
+        columns = balance(model, levels.point, signals, limits, prepared)
+        for k, *row in zip(used.tolist(), *columns, strict=True):
             terms[k] = Balance(*row)
     return refusals, terms

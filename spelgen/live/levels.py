@@ -32,6 +32,9 @@ from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.trajectory import Trajectory, joined_column
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
+Folds = Sequence[tuple[RigidBodyDynamics, Sequence[Trajectory]]]
+"""Pairs of a model and the logs to which it was not fitted."""
+
 
 def noise_levels(fit: Fit) -> NoiseLevels:
     """Return the stored or estimated noise levels of a fit. Raises RunError if they cannot be read or estimated."""
@@ -71,7 +74,7 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
     for k, fold in enumerate(folds):
         others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
         tested.append((fitted_to(fit, others), fold))
-    levels = find_levels(tested, effort, point)
+    levels = find_levels(tested, effort, point, fit.preprocessing.torque_delay or 0.0)
     # Serialization rounds the numbers. The rounded numbers are returned, so that they are equal to the numbers that are
     # later read from the run folder.
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
@@ -103,12 +106,11 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
 class HeldOutSample(NamedTuple):
     """A sample of a log, with the terms of a model that was not fitted to the log.
 
-    t: time [s]. qd: velocities, (n,) [rad/s, m/s]. at: terms of the momentum balance. is_resumed: whether the sample is
-    the first one after a gap. block: the block that ends at this sample, or None.
+    t: time [s]. at: terms of the momentum balance. is_resumed: whether the sample is the first one after a gap. block:
+    the block that ends at this sample, or None.
     """
 
     t: float
-    qd: np.ndarray
     at: Balance
     is_resumed: bool
     block: Block | None
@@ -119,24 +121,23 @@ def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> 
     intake, blocks = Intake(levels, bristle_reach(model)), Blocks(levels.rest_speed)
     refusals, terms = balance_along(model, levels, intake, log.t, (log.q, log.qd, log.tau))
     samples = []
-    for t, qd, refusal, at in zip(log.t.tolist(), log.qd, refusals, terms, strict=True):
+    for t, refusal, at in zip(log.t.tolist(), refusals, terms, strict=True):
         if at is None:
             continue
         if refusal == "gap":
             blocks.restart()
-        samples.append(HeldOutSample(t, qd, at, refusal == "gap", blocks.add(t, qd, at)))
+        samples.append(HeldOutSample(t, at, refusal == "gap", blocks.add(t, at)))
     return samples
 
 
-def find_levels(
-    folds: Sequence[tuple[RigidBodyDynamics, Sequence[Trajectory]]], effort: np.ndarray, point: np.ndarray
-) -> NoiseLevels:
+def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: float) -> NoiseLevels:
     """Return the noise levels of an arm from held-out logs.
 
     Args:
-        folds: pairs of a model and the logs to which it was not fitted.
+        folds: models with their held-out logs.
         effort: torque limits, (n,) [Nm, N]; infinite if unknown.
         point: position of the tip in the frame of the last body, (3,) [m].
+        delay: delay of the torques relative to the positions [s].
     """
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
@@ -149,6 +150,7 @@ def find_levels(
         effort=np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest),
         minutes=sum(log.duration for log in logs) / 60,
         point=point,
+        delay=delay,
     )
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
     segments = [[x.block for x in samples if x.block is not None] for samples in tested]
@@ -275,10 +277,10 @@ def _observer_residuals(
     observer = ContactObserver(levels, TUNING.alarms_per_minute)
     drift = JointFilters.of_drift(levels.drift)
     columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    for t, qd, at, is_resumed, block in samples:
+    for t, at, is_resumed, block in samples:
         if is_resumed:
             observer.restart()
-        columns.append((*observer.residual(t, at, NO_REPORT, drift.x), qd))
+        columns.append((*observer.residual(t, at, NO_REPORT, drift.x), at.velocity))
         if block is not None:
             drift.update(block, block.y)
     signal, variance, speed = (np.array(column) for column in zip(*columns, strict=True))

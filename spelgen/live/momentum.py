@@ -33,6 +33,7 @@ class Balance(NamedTuple):
         load_momentum: P, momentum per inertial parameter of the payload, (T, n, 10).
         load_torque: N, torque per inertial parameter of the payload, (T, n, 10).
         jacobian: Jacobian of a point of the last body, in root axes, (T, 3, n).
+        velocity: Velocities qd, (T, n).
     """
 
     momentum: np.ndarray
@@ -42,6 +43,7 @@ class Balance(NamedTuple):
     load_momentum: np.ndarray
     load_torque: np.ndarray
     jacobian: np.ndarray
+    velocity: np.ndarray
 
 
 def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -114,9 +116,7 @@ def _terms(
 ) -> list[Tensor]:
     at = model.at(q, qd, prepared=prepared)
     torque = model.input_force(at, qd, tau) + model.lagrangian_gradient(at, qd)
-    if is_stateful(model):
-        low, high = (model.friction_torque(at, qd, z) for z in bounds)
-    else:
-        low = high = model.friction_torque(at, qd)
+    states = (torch.stack(bounds),) if is_stateful(model) else ()
+    low, high = model.friction_torque(at, qd, *states).expand(2, *qd.shape)
     terms = model.momentum(at, qd), torque, (high + low) / 2, (high - low).abs() / 2
-    return [*terms, *load_terms(model.chain, q, qd, point)]
+    return [*terms, *load_terms(model.chain, q, qd, point), qd]

@@ -65,6 +65,7 @@ class NoiseLevels(BaseModel):
         effort: Torque limit, (n,) [Nm, N].
         minutes: Duration of the training logs [min].
         point: Position of the tip in the frame of the last body, (3,) [m].
+        delay: Delay of measured torques relative to positions, as found by the fit [s].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -84,6 +85,7 @@ class NoiseLevels(BaseModel):
     effort: Vector
     minutes: float
     point: Vector
+    delay: float
 
     @property
     def rest_speed(self) -> np.ndarray:
@@ -105,6 +107,11 @@ class NoiseLevels(BaseModel):
     def supported_alarms(self) -> float:
         """Lowest rate of false alarms that can be estimated from the training logs: one in their duration [1/min]."""
         return 1 / self.minutes
+
+    def contact_thresholds(self, alarms_per_minute: float) -> np.ndarray:
+        """Return the smallest external torques that are contacts, in motion and at rest, (n, 2) [Nm, N]."""
+        moving = self.thresholds(alarms_per_minute) * self.observer
+        return np.stack([moving, moving + self.resting], axis=1)
 
     def resting_torque(self, qd: np.ndarray) -> np.ndarray:
         """Return the bound of the friction error near standstill, (..., n) [Nm, N], at velocities qd (..., n).

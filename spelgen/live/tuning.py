@@ -22,6 +22,8 @@ class LiveTuning:
     jump: float = 10.0
     # [1] Number of consecutive refused samples after which the estimator restarts at the new positions.
     restart: int = 5
+    # [1] Samples over the delay of the torques: samples that follow each other faster are omitted from the memory.
+    delay_samples: int = 16
     # [1] A joint is at rest below this fraction of its largest speed in the training logs.
     rest: float = 0.01
 
@@ -66,6 +68,10 @@ class LiveTuning:
 
     # [1/s] Bandwidth of the momentum observer.
     bandwidth: float = 20.0
+    # [1] Standard deviation of the torque error while dp/dt changes, relative to the difference of two estimates of
+    # dp/dt, with the bandwidth of the observer and with twice this bandwidth. Torques that lag behind the motion by
+    # 1 / (2 * 2 * bandwidth) = 12 ms have this error.
+    jerk: float = 0.5
     # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so
     # that logs without noise give positive thresholds.
     min_observer_noise: float = 1e-3
@@ -74,7 +80,7 @@ class LiveTuning:
     baseline: float = 0.3
     # [1] Smallest factor by which thresholds from the training logs are multiplied, because the errors of a model are
     # larger on other days.
-    other_days: float = 1.22
+    other_days: float = 1.3
     # [1/min] Default rate of false contact alarms.
     alarms_per_minute: float = 1.0
     # Thresholds are computed from peaks, the largest residuals in time windows of `window` [s]. The largest peaks, a

@@ -21,12 +21,13 @@ from spelgen.logs.joint_signals import (
     find_elastic,
     find_frozen,
     find_jumps,
+    find_words,
     is_factor,
     joint_keys,
     mapping_line,
 )
 from spelgen.logs.trajectory import Trajectory, gap_ends
-from spelgen.logs.tuning import SLOWEST, is_dense, shows_accelerations
+from spelgen.logs.tuning import SIGNALS, SLOWEST, is_dense, shows_accelerations
 from spelgen.logs.unit_checks import (
     find_copied,
     find_held,
@@ -154,7 +155,8 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
     Return None for logs of position commands, whose fits do not need accelerations.
     """
     rate = trajectory.sample_rate
-    if trajectory.u is not None or rate == 0 or is_dense(rate):
+    # below 2 Hz the times are in another unit, which another check reports
+    if trajectory.u is not None or rate * SIGNALS.slowest_step < 1 or is_dense(rate):
         return None
     use = f"too slow for fits to torques, which need {SLOWEST:g} Hz"
     if shows_accelerations(rate):
@@ -171,12 +173,14 @@ CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", fi
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
+    # undecoded words of velocities differ from dq/dt, as if positions were frozen
+    Check("jumps", "error", find_words, expected="signals without jumps"),
     Check(
-        "frozen", "error", find_frozen, expected="columns that belong together",
+        "frozen", "error", find_frozen, unless=("jumps",), expected="columns that belong together",
         do="check the logger, and the names of the columns",
     ),
     Check(
-        "jumps", "error", find_jumps, unless=("frozen",), expected="signals without jumps",
+        "jumps", "error", find_jumps, unless=("frozen", "jumps"), expected="signals without jumps",
         do="split recordings that were joined by a column 'trajectory', or check the encoder",
     ),
     Check(
@@ -249,7 +253,7 @@ class LogChecks:
         factors, correlations = velocity_agreement(products)
         for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
             columns, fits = (trajectory.q[:, k], trajectory.qd[:, k]), correlations[:, k].tolist()
-            signals = JointSignals(trajectory, k, kind, self._joints, *columns, float(factors[k]), fits)
+            signals = JointSignals(trajectory, k, kind, self._joints, *columns, factors.tolist(), fits)
             for check, advice in run_checks(CHECKS, signals, trajectory.accepted):
                 self._add(joint, check, advice, trajectory)
 

@@ -57,17 +57,17 @@ def csv_columns(file: Path) -> pa.Table:
 def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
     """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
 
-    Columns may be separated by commas, semicolons, tabs or single spaces; numbers may have decimal commas; the encoding
-    may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
+    Columns may be separated by commas, semicolons, tabs, bars or single spaces; numbers may have decimal commas; the
+    encoding may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
     """
     text = _beginning(file)
     # Names of columns may contain spaces, so spaces are the delimiter only if the header contains no other delimiter.
-    delimiter = max(",;\t", key=text.header.count)
+    delimiter = max(",;\t|", key=text.header.count)
     if delimiter not in text.header:
         delimiter = " "
     cells = text.header.split(delimiter)
     names = _joint_state_columns(cells, file) if is_number(cells[0]) else None
-    start = '"' if delimiter == "," else f"(^|{delimiter}) *"
+    start = '"' if delimiter == "," else f"(^|{re.escape(delimiter)}) *"
     decimal_point = "," if re.search(rf"{start}-?\d+,\d", text.rows, re.MULTILINE) else "."
     wrong: list[pa.csv.InvalidRow] = []
 

@@ -78,7 +78,7 @@ class JointSignals(NamedTuple):
         joints: names of all joints.
         q: (T,) positions of the joint [rad, m].
         qd: (T,) velocities of the joint [rad/s, m/s].
-        factor: ratio of dq/dt to qd, 1 for correct units; NaN for a joint at rest.
+        factors: ratio of dq/dt to qd of each of the n joints, 1 for correct units; NaN for joints at rest.
         correlations: correlation of this joint's dq/dt with the qd of each of the n joints; NaN for joints at rest.
     """
 
@@ -88,7 +88,7 @@ class JointSignals(NamedTuple):
     joints: Sequence[str]
     q: np.ndarray
     qd: np.ndarray
-    factor: float
+    factors: Sequence[float]
     correlations: Sequence[float]
 
     @property
@@ -118,6 +118,11 @@ class JointSignals(NamedTuple):
         """Return the joint's signal "q", "qd", "tau" or "u", (T,); an empty array if it was not logged."""
         values = self.trajectory.column(quantity)
         return values[:, self.number] if values.size else np.zeros(0)
+
+    @property
+    def factor(self) -> float:
+        """Ratio of dq/dt to qd; NaN for a joint at rest."""
+        return self.factors[self.number]
 
     @property
     def correlation(self) -> float:
@@ -163,8 +168,8 @@ def find_dropouts(signals: JointSignals) -> str | None:
         values = signals.signal(name)
         rows = np.flatnonzero(outlier_rows(name, values))
         if rows.size:
-            first = rows[0]
-            size = values[first] - values[max(first - 1, 0)]
+            first, sound = rows[0], np.setdiff1d(np.arange(len(values)), rows)
+            size = values[first] - values[sound[np.abs(sound - first).argmin()]]
             what = (
                 "falls to 0"
                 if values[first] == 0
@@ -175,12 +180,14 @@ def find_dropouts(signals: JointSignals) -> str | None:
     return None
 
 
-def find_jumps(signals: JointSignals) -> str | Advice | None:
-    """Return a finding if a signal jumps, due to undecoded register words, wrapped angles or joined recordings."""
-    for name in signals.trajectory.quantities:
-        words = _find_words(signals, name)
-        if words is not None:
-            return words
+def find_words(signals: JointSignals) -> Advice | None:
+    """Return a finding if a signal of the joint consists of undecoded register words or of wrapped angles."""
+    found = (_find_words(signals, name) for name in signals.trajectory.quantities)
+    return next((advice for advice in found if advice is not None), None)
+
+
+def find_jumps(signals: JointSignals) -> str | None:
+    """Return a message if the position of the joint jumps, for example between joined recordings."""
     sound = ~is_outlier(signals.q, smooth=True)
     t, q = signals.trajectory.t[sound], signals.q[sound]
     rows = jumps(t, q)
@@ -215,7 +222,10 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
             q = signals.q[~is_lost(signals.signal("u"))]
             if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
                 return None
-        keys: dict[str, object] = {word.key: {name: plain_number(word.value, 9)}}
+        # The line states the sign bits of the other signals too, so that it can replace the line in the mapping.
+        stated = {x: mapping.word("sign_bit", x, signals.joint) for x in signals.trajectory.quantities}
+        words = {x: plain_number(y, 9) for x, y in stated.items() if y and word.key == "sign_bit"}
+        keys: dict[str, object] = {word.key: words | {name: plain_number(word.value, 9)}}
         if turn == 360.0 and unit is None:
             unit, keys = "deg", {"units": {name: "deg"}} | keys
         unit = unit or ("as logged" if turn is None else "rad")

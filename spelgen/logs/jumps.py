@@ -25,8 +25,14 @@ def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
     """Return the signal (T,) with jumps of whole periods removed, starting at the unchanged first value."""
     if not jump_count(values, period):
         return values
-    steps = np.diff(values, prepend=values[:1])
-    return np.asarray(values - period * np.cumsum(np.round(steps / period)))
+    turns = np.diff(values, prepend=values[:1]) / period
+    whole = np.round(turns)
+    # Two opposite steps of about half a period are an outlier of one sample: rounded separately, the two steps would
+    # shift all later samples by a period.
+    is_half = np.abs(np.abs(turns) - 0.5) < 0.25
+    rows = np.flatnonzero(is_half[:-1] & is_half[1:] & (turns[:-1] * turns[1:] < 0))
+    whole[rows], whole[rows + 1] = 0.0, np.round(turns[rows] + turns[rows + 1])
+    return np.asarray(values - period * np.cumsum(whole))
 
 
 def centred(values: np.ndarray, period: float) -> np.ndarray:
@@ -76,14 +82,21 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     # a signal in which more than 5 % of the steps are large is noisy: its large steps are no outliers
     if not is_jump.any() or is_jump.mean() > 0.05:
         return outliers
-    for first, second in pairwise(np.flatnonzero(is_jump)):
+    rows = np.flatnonzero(is_jump)
+    first, last, window = rows[0], rows[-1], TUNING.jump_window
+    # an outlier of one or two samples at an end of the recording has only one jump
+    if first < 2 and sizes[first] > 4.0 * sizes[first + 1 : first + 1 + window].max():
+        outliers[: first + 1] = True
+    if last > len(sizes) - 3 and sizes[last] > 4.0 * sizes[last - window : last].max():
+        outliers[last + 1 :] = True
+    for first, second in pairwise(rows):
         out, back = steps[first], steps[second]
         # An excursion consists of two opposite jumps of similar size, with at most five samples between them. A signal
         # that returns later has jumped twice and has no outlier.
         is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= 5
         if not is_excursion:
             continue
-        low, high = max(0, first - TUNING.jump_window), second + 1 + TUNING.jump_window
+        low, high = max(0, first - window), second + 1 + window
         # An excursion is an outlier only if its jumps are four times as large as the neighbouring steps, which are
         # large during fast motion. The two largest neighbouring steps are ignored, since they may belong to another
         # outlier.

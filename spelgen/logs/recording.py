@@ -1,6 +1,6 @@
 """Conversion of rows in SI units to trajectories: sorting, unwrapping, removal of repeats, velocities, torque delay."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from math import pi
 
@@ -8,10 +8,18 @@ import numpy as np
 
 from spelgen.errors import LogError
 from spelgen.labels import counted
-from spelgen.logs.jumps import centred, is_outlier, is_stale, jump_count, repeated_rows, unwrapped
+from spelgen.logs.jumps import (
+    centred,
+    is_outlier,
+    is_stale,
+    jump_count,
+    read_as_words,
+    repeated_rows,
+    unwrapped,
+)
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
-from spelgen.logs.tuning import TUNING
+from spelgen.logs.tuning import SIGNALS, TUNING
 from spelgen.logs.values import foreign_rows, is_split
 from spelgen.settings.log_mapping import LogMapping
 
@@ -64,6 +72,12 @@ def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping
         if not period:
             continue
         count = jump_count(column, period)
+        if count and quantity == "q":
+            scale = mapping.scale(quantity, joint)
+            word = read_as_words((column - mapping.offset(quantity, joint)) / scale, 2 * pi / abs(scale))
+            # a sign bit of whole turns: unwrapped, the words would be magnitudes
+            if word is not None and word.key == "sign_bit":
+                continue
         result = unwrapped(column, period)
         if quantity == "u":
             # Registers of commands and of positions may start in different revolutions. The commands are shifted by
@@ -193,16 +207,26 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
     if is_split(data):
         data, repairs = _joined_rows(data, layout)
         rows = np.arange(len(data))
-    foreign = foreign_rows(data, len(layout.joints))
-    if foreign.any():
-        data, rows = data[~foreign], np.asarray(rows)[~foreign]
-        count, message = counted(int(foreign.sum()), "row"), "of another topic or publisher left out"
-        repairs += (f"{count} {message}: without values, or with positions only",)
-    if layout.mapping.sample_rate:
-        data = np.column_stack([np.arange(len(data)) / layout.mapping.sample_rate, data[:, 1:]])
-        return data, repairs
+    rate, others = (
+        layout.mapping.sample_rate,
+        "another topic or publisher: without values, or with positions only",
+    )
+    left_out: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        f"of {others}": lambda x: foreign_rows(x, len(layout.joints)),
+        "with a signal without a number": lambda x: np.isnan(x).any(axis=1),
+        "with times far from those of all other rows": lambda x: _is_timeless(x[:, 0]) & (not rate),
+    }
+    for reason, find in left_out.items():
+        found = find(data)
+        if found.any():
+            data, rows = data[~found], np.asarray(rows)[~found]
+            repairs += (f"{counted(int(found.sum()), 'row')} left out, {reason}",)
+    if rate:
+        return np.column_stack([np.arange(len(data)) / rate, data[:, 1:]]), repairs
+    if len(data) and abs(data[0, 0]) > 1e8:  # a date, if the first rows had no time
+        data[:, 0] -= data[0, 0]
     t = data[:, 0]
-    late = np.count_nonzero(np.diff(t) < 0)
+    late = int(np.count_nonzero(np.diff(t) < 0))
     if late:
         ordered = data[np.argsort(t, kind="stable")]
         positions = slice(1, 1 + len(layout.joints))
@@ -211,7 +235,7 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
         if _roughness(ordered[:, positions]) > _roughness(data[:, positions]):
             raise _backward_times(t, rows, layout)
         data = ordered
-        repairs += (f"{late} times before that of the row above: the rows were sorted",)
+        repairs += (f"{counted(late, 'time')} before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
     # The resolution of the clock is too low if more than ten rows, and more than 2 % of all rows, have the same time as
@@ -222,8 +246,16 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaire
     repeats = np.count_nonzero(is_repeat)
     if repeats:
         data = data[~is_repeat]
-        repairs += (f"{repeats} rows with the time of the row before were left out",)
+        repairs += (f"{counted(int(repeats), 'row')} with the time of the row before left out",)
     return data, repairs
+
+
+def _is_timeless(t: np.ndarray) -> np.ndarray:
+    """Return a mask (T,) of the times t (T,) that are far from all others, such as 0 in a message without a stamp."""
+    if len(t) < TUNING.jump_window:
+        return np.zeros(len(t), bool)
+    first, middle, last = np.quantile(t, [0.25, 0.5, 0.75])
+    return np.asarray((np.abs(t - middle) > 1e4 * (last - first)) & (last > first))
 
 
 def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:
@@ -272,7 +304,7 @@ def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
         slope, first = np.polyfit(numbers, t[start:stop], 1) if len(numbers) > 2 else (0.0, t[start])
         times[start:stop] = first + slope * numbers
         rates.append(slope)
-    if np.abs(times - t).max() > tick or not min(rates) > 0:
+    if np.abs(times - t).max() > tick or not min(rates) > 0 or np.median(rates) < SIGNALS.fastest_step:
         count = np.count_nonzero(steps == 0)
         raise LogError(
             f"{count} of {len(t)} rows with the time of another row, but another state", file=layout.file,

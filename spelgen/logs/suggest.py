@@ -23,10 +23,11 @@ from spelgen.logs.unit_checks import time_unit
 from spelgen.settings.log_mapping import CURRENTS
 
 WORDS = {
-    "t": {"t", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis"},
-    "q": {"q", "pos", "position", "positions", "angle", "angles", "theta"},
-    "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega"},
-    "tau": {"tau", "torque", "torques", "effort", "efforts", "current", "currents", "curr", "cur", "moment", "load"},
+    "t": {"t", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis", "zeit"},
+    "q": {"q", "pos", "position", "positions", "angle", "angles", "theta", "θ", "winkel"},
+    "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega", "ω", "geschwindigkeit"},
+    "tau": {"tau", "τ", "torque", "torques", "trq", "tq", "effort", "efforts", "force", "forces", "current", "currents",
+            "curr", "cur", "moment", "drehmoment", "strom", "load"},
 }  # fmt: skip
 # Words that distinguish the names of commanded values from the names of measured values.
 COMMANDED = {
@@ -47,7 +48,7 @@ UNITS = {
 }  # fmt: skip
 # Letters that are units only in brackets: without brackets they may be part of a name.
 BARE = {"s", "n", "a", "m"}
-CURRENT = {"current", "currents", "curr", "cur"}
+CURRENT = {"current", "currents", "curr", "cur", "strom"}
 
 
 class Suggestion(NamedTuple):
@@ -159,7 +160,7 @@ def _column_name(name: str) -> ColumnName:
     if not unit and last and last[2].lower() in unit_names - BARE and last[2] != name[:1]:
         base, unit = last.groups()
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", base)
-    return ColumnName(name, set(re.findall(r"[a-z]+", separated.lower())), unit.strip().lower())
+    return ColumnName(name, set(re.findall(r"[^\W\d_]+", separated.lower())), unit.strip().lower())
 
 
 def _by_quantity(
@@ -225,9 +226,10 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
     order: dict[str, int] = {}
     for name, column in zip(table.schema.names, table.columns if len(table) else (), strict=False):
         numbers, first = re.findall(r"\d+", name), column[0].as_py()
-        if isinstance(first, list):
-            order |= {text: position for position, text in enumerate(first) if text in joints}
-        elif numbers and first in joints:
+        for position, text in enumerate(_first_list(column)):
+            if text in joints:
+                order[str(text)] = position
+        if numbers and first in joints:
             order[first] = int(numbers[-1])
     return order
 
@@ -239,11 +241,17 @@ def _names(table: pa.Table) -> list[str]:
     """
     names: list[str] = []
     for name, column in zip(table.column_names, table.columns, strict=True):
-        values = column.drop_null()
-        is_list = pa.types.is_nested(values.type) and len(values)
         if table.column_names.count(name) == 1:
-            names += [f"{name}[{index}]" for index in range(len(values[0]))] if is_list else [name]
+            names += [f"{name}[{index}]" for index in range(len(_first_list(column)))] or [name]
     return names
+
+
+def _first_list(column: pa.ChunkedArray) -> list[object]:
+    """Return the first list of a column of lists, which may be texts such as "[0.1, 0.2]"; [] for other columns."""
+    first = next(iter(column.drop_null().slice(0, 1).to_pylist()), None)
+    if isinstance(first, str) and (match := re.fullmatch(r"[\w.]*[\[(]+(.*?)[\])]+", first.strip())):
+        first = [text.strip("'\"") for text in re.split(r"[,;\s]+", match[1].strip())]
+    return first if isinstance(first, list) else []
 
 
 def _by_joint(

@@ -166,7 +166,8 @@ def missing_columns(
     elif set(missing) <= set(of_quantity.get("qd", ())):
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
-        do = _renaming(missing[0], columns, of_quantity, [mapping.log_name(joint) for joint in joints])
+        others = [x for x in columns if x not in (mapping.columns.t, mapping.columns.trajectory)]
+        do = _renaming(missing[0], others, of_quantity, [mapping.log_name(joint) for joint in joints])
     element = f"missing column{'s' * (len(missing) > 1)} {shortened(missing, TUNING.listed)}"
     got, expected = (
         f"only the columns {shortened(list(columns), TUNING.listed)}",
@@ -179,7 +180,7 @@ def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequenc
     """Return True if the columns of a log contain commanded positions of all joints and no torques."""
     commands = {mapping.column("u", joint) for joint in joints}
     torques = {mapping.column("tau", joint) for joint in joints}
-    return commands <= set(columns) and torques.isdisjoint(columns)
+    return torques.isdisjoint(columns) and all(x in columns or list_element(x, columns) for x in commands)
 
 
 def _renaming(
@@ -199,6 +200,8 @@ def _renaming(
         for x in columns
         if x not in chain(*of_quantity.values()) and not x.lower().startswith(("qdd", "acc"))
     ]
+    if not unused:
+        return "log them, torques for example as efforts of ROS, or as motor currents with a 'gain'"
     for close in difflib.get_close_matches(name, unused, n=5):
         if names_joint(close, "".join(named[-1:])):
             return f"rename the column {close!r} to {name!r}?"

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from spelgen.logs.joint_signals import Advice, JointSignals
+from spelgen.logs.joint_signals import Advice, JointSignals, is_factor, plain_number
 from spelgen.logs.jumps import held_samples
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SIGNALS, TUNING, shows_accelerations
@@ -71,6 +71,8 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     message = f"q that changes {signals.factor:.3g} times as fast as qd"
     if is_far:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
+        if (signals.q == signals.q.round()).all():
+            message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
     distance, keys = min(_unit_readings(signals, is_far), key=itemgetter(0), default=(np.inf, {}))
     if distance > log(1.25):
         return message if is_far else None
@@ -92,6 +94,8 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
     if mapping.unit("q", joint):
         positions = positions[:1]
+    elif is_far and not is_known:
+        positions = positions[:3]  # milliradians and counts of an encoder have similar ranges
     if not is_known or mapping.unit("qd", joint):
         speeds = speeds[:1]
     for q, qd in product(positions, speeds):
@@ -108,9 +112,17 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
 def find_time_unit(signals: JointSignals) -> str | Advice | None:
     """Return a finding if times are not in seconds.
 
-    Either the sample rate is then below 2 Hz, or dq/dt is a power of 1000 times qd.
+    The sample rate is then below 2 Hz, or dq/dt is a power of 1000 times qd, or dq/dt is the same multiple of qd at all
+    joints.
     """
     step, is_stated = signals.step, signals.trajectory.mapping.units.t != "s"
+    rate = _rate_by_velocities(signals)
+    if rate:
+        message = (
+            f"q that changes {signals.factor:.3g} times as fast as qd: the rate is {rate:g} Hz, not {1 / step:.3g} Hz "
+            "(if the times are right, the velocities are in another unit: 'velocity: differentiated' uses those of q)"
+        )
+        return Advice(message, keys={"sample_rate": rate})
     message, unit = f"a sample every {step:.3g} s", time_unit(step)
     if step <= SIGNALS.slowest_step:
         message = f"q that changes {signals.factor:.3g} times as fast as qd"
@@ -123,6 +135,24 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
     if unit is None or is_stated:
         return message if step > SIGNALS.slowest_step else None
     return Advice(message, keys={"units": {"t": unit}})
+
+
+def _rate_by_velocities(signals: JointSignals) -> float | None:
+    """Return the sample rate [Hz] at which qd of all joints is dq/dt; None if the times may be right or in a unit."""
+    factors = np.array(signals.factors)[~np.isnan(signals.factors)]
+    mapping, steps = signals.trajectory.mapping, np.diff(signals.trajectory.t)
+    if "qd" not in mapping.quantities or len(factors) < 2 or len(steps) <= 2 * SIGNALS.increments:
+        return None
+    factor = float(np.median(factors))
+    # velocities of one joint in another unit, and times that are not evenly spaced, have other causes
+    is_common = factor > 0 and np.ptp(factors) < 0.05 * factor and signals.correlation > 0.98
+    if not is_common or abs(steps - signals.step).max() > 0.5 * signals.step:
+        return None
+    # a factor near 1 is more likely one of the velocities
+    if abs(log(factor)) < log(1.5) or any(is_factor(factor, TIMES[unit]) for unit in TIMES):
+        return None
+    step = signals.step * factor
+    return plain_number(1 / step, 4) if SIGNALS.fastest_step <= step <= SIGNALS.slowest_step else None
 
 
 def time_unit(step: float) -> str | None:
@@ -244,7 +274,7 @@ def find_unsigned_velocity(signals: JointSignals) -> str | None:
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
     lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
     # Velocities in both directions have a sign, and so do velocities computed from positions.
-    if trajectory.mapping.velocity == "differentiated" or lowest > share * highest or len(qd) < 3:
+    if "qd" not in trajectory.mapping.quantities or lowest > share * highest or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)
     backward, forward = sorted((-np.quantile(speed, 0.02), np.quantile(speed, 0.98)))

@@ -24,9 +24,9 @@ Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows: Rows) -> np.ndarray:
     """Return the C columns of a layout as numbers (T, C) in SI units.
 
-    Absent values are NaN in rows of another topic or publisher (see `foreign_rows`), and in logs whose signals are in
-    separate rows (see `is_split`). Raises LogError, with row and column, for values that are absent elsewhere, that are
-    not numbers, or that are beyond the range of any arm.
+    Absent values are NaN in rows of another topic or publisher (see `foreign_rows`), in logs whose signals are in
+    separate rows (see `is_split`), and with the setting 'dropouts: dropped'. Raises LogError, with row and column, for
+    values that are absent elsewhere, that are not numbers, or that are beyond the range of any arm.
 
     Args:
         table: the logged columns.
@@ -57,6 +57,8 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         bad[:, 1:] &= ~np.isnan(data[:, 1:])
     elif not foreign.all():
         bad &= ~foreign[:, None]
+    if layout.mapping.dropouts == "dropped" and np.isfinite(data).all(axis=1).any():
+        bad &= ~np.isnan(data)
     if bad.any():
         first, k = np.argwhere(bad)[0]
         value, count = data[first, k], f"{bad.any(axis=1).sum()} of {len(data)} rows have such a"
@@ -64,7 +66,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         do = "check units and gains"
         if not np.isfinite(value):
             got, expected = f"no finite number ({count} gap", "a number"
-            do = "remove those rows; a gap in t is understood"
+            do = "'dropouts: dropped' under 'logs' in the robot's YAML leaves out those rows"
         raise layout.row_error(f"{got}, this is the first)", rows[first], layout.columns[k], expected, do)
     return data
 

@@ -19,7 +19,13 @@ from spelgen.files import read_bytes
 Location: TypeAlias = tuple[int | str, ...]
 """Place of a value in a YAML file: keys, and indices of list items from 0, from the outermost group inwards."""
 
-EXPECTED = {"missing": "a value", "model_type": "keys with values", "dict_type": "keys with values"}
+# Expected content per error type of pydantic, for types whose message has words of Python or of pydantic.
+EXPECTED = {
+    "missing": "a value", "model_type": "keys with values", "dict_type": "keys with values", "tuple_type": "a list",
+    "list_type": "a list", "too_short": "a longer list", "too_long": "a shorter list", "float_type": "a number",
+    "float_parsing": "a number", "int_parsing": "a whole number", "int_from_float": "a whole number",
+    "bool_parsing": "true or false", "bool_type": "true or false", "string_type": "a text, in quotes",
+}  # fmt: skip
 
 Checked = TypeVar("Checked", bound=BaseModel)
 

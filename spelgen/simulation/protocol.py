@@ -9,7 +9,7 @@ import numpy as np
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import DriveFriction, joint_friction
 from spelgen.errors import SettingsError, SpelgenError, collect
-from spelgen.excitation.bounds import SPEEDS, MotionBounds
+from spelgen.excitation.bounds import SPEEDS, MotionBounds, range_error
 from spelgen.excitation.trajectory import ExcitationTrajectory, Motion
 from spelgen.excitation.tuning import TUNING as EXCITATION
 from spelgen.logs.trajectory import Trajectory, trajectory_listing
@@ -68,7 +68,7 @@ def make_friction(arm: Chain, settings: Settings, speeds: np.ndarray | None = No
 def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest initial positions, (n,) each [rad, m].
 
-    Raises SettingsError if neither the settings nor the URDF specify a range for a joint.
+    Raises ArmError if neither the settings nor the URDF specify a range for a joint.
     """
     positions = settings.simulation.positions or {}
     ranges, errors = [], []
@@ -76,8 +76,7 @@ def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarra
         limits = (-np.pi, np.pi) if joint.continuous else joint.limits
         # Limits of 0 and 0 are treated as unknown, because exporters of URDFs write them for an unknown range.
         if joint.name not in positions and (limits is None or limits[0] >= limits[1]):
-            message = "the joint has no range: give its lowest and highest initial position"
-            errors.append(SettingsError(message, element=f"simulation.positions.{joint.name}"))
+            errors.append(range_error(joint.name, limits))
         ranges.append(positions.get(joint.name, limits))
     collect(errors)
     lowest, highest = np.array(ranges, dtype=float).T

@@ -88,6 +88,10 @@ def _refuse_damage(path: Path, data: bytes) -> None:
     """
     if not data.strip():
         raise UrdfError("an empty file", file=path, expected="a URDF document")
+    if data.startswith(b"version https://git-lfs"):
+        raise UrdfError(
+            "a pointer of Git LFS", file=path, expected="a URDF document", do="run 'git lfs pull' first"
+        )
     # Conflict markers of git are the most common defect, and the message of the parser would not name them.
     conflict = _CONFLICT.search(data)
     if conflict:
@@ -120,7 +124,8 @@ def _syntax_error(path: Path, error: etree.XMLSyntaxError) -> UrdfError:
             do=f'add xmlns:{prefix}="..." to <robot>, or remove the prefix',
         )  # fmt: skip
     reason = " ".join(re.sub(r",? ?line \d+, column \d+.*", "", message).split())
-    return UrdfError(f"not well-formed XML ({reason})", file=path, line=error.lineno)
+    do = "save the file as UTF-8, or declare its encoding in <?xml ...?>" if "encoding" in reason else None
+    return UrdfError(f"not well-formed XML ({reason})", file=path, line=error.lineno, do=do)
 
 
 def _check_root(path: Path, root: etree._Element) -> None:

@@ -134,8 +134,9 @@ def _read_axis(joint: Element, kind: str | None) -> Vector:
 
 
 def _read_limits(limit: Element, kind: str | None) -> Limits:
-    # An effort or velocity limit of 0 counts as absent, because exporters write 0 for an unknown limit.
-    effort, velocity = limit.limit("effort") or None, limit.limit("velocity") or None
+    # An effort or velocity limit of 0 counts as absent, because exporters write 0 for an unknown limit; a negative one
+    # means "unlimited" in SDF.
+    effort, velocity = (x if x and x > 0 else None for x in (limit.limit("effort"), limit.limit("velocity")))
     if kind == "continuous":
         # URDF defines that lower and upper of a continuous joint have no effect.
         return None, None, effort, velocity

@@ -1,6 +1,7 @@
 """Warnings about physically inconsistent values and probable mistakes in a URDF."""
 
 from collections.abc import Iterator, Sequence
+from math import pi
 
 import numpy as np
 
@@ -26,6 +27,7 @@ def lint(robot: Robot) -> list[Diagnostic]:
     findings += _lint_placeholders([link.inertial for link in robot.links if link.inertial])
     moving = [joint for joint in robot.joints if joint.moves]
     findings += [finding for joint in moving for finding in _lint_joint(joint)]
+    findings += [finding for joint in robot.joints for finding in _lint_units(joint)]
     findings += _lint_groups(robot, moving)
     warnings = [Diagnostic("warning", code, where, line, message) for code, where, line, message in findings]
     return [*warnings, *_unlimited([joint for joint in moving if joint.mimic is None])]
@@ -83,6 +85,20 @@ def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
     if joint.lower is not None and joint.upper is not None and joint.lower > joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
         yield "lower-above-upper", f"{where} limit", line, message
+
+
+def _lint_units(joint: UrdfJoint) -> Iterator[Finding]:
+    """Yield warnings about angles that are probably in degrees, and lengths that are probably in millimetres."""
+    limits = [abs(x) for x in (joint.lower, joint.upper) if x is not None and joint.type == "revolute"]
+    sizes = (
+        ("degrees", "origin", "rpy", max(map(abs, joint.rpy)), "rad", 2 * pi + 0.01),
+        ("degrees", "limit", "a position", max(limits, default=0.0), "rad", 8 * pi),
+        ("millimetres", "origin", "xyz", max(map(abs, joint.xyz)), "m", 20.0),
+    )
+    for code, element, quantity, size, unit, largest in sizes:
+        if size > largest:
+            message = f"{quantity} of {size:g} {unit}: perhaps {code}"
+            yield code, f"joint {joint.name!r} {element}", joint.line, message
 
 
 def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:

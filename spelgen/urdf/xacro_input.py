@@ -70,6 +70,8 @@ def _failure(path: Path, code: int, lines: list[str]) -> UrdfError:
         return UrdfError("a xacro file, and no package to expand it", file=path, do=do)
     # The message of xacro is cut at 400 characters, because its length is not limited.
     reason = " ".join(" ".join(lines).split())[:400] or f"it ended with code {code}"
+    # It states some exceptions twice, the first time with their class.
+    reason = re.sub(r"^<class '[\w.]+'>: (.+) \1", r"\1", reason)
     return UrdfError(f"xacro cannot expand it ({reason})", file=path, do=f"correct it, or {_BY_HAND}")
 
 
@@ -90,7 +92,11 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
                         return str(candidate)
         # A package without package.xml is recognised by the name of its folder.
         named = [folder for folder in path.parents if folder.name == package]
-        return str(named[0]) if named else installed(package)
+        with suppress(Exception):  # ROS is not installed, or does not know the package
+            return str(named[0]) if named else installed(package)
+        raise ValueError(
+            f"the package {package!r} of $(find {package}) is neither above the file nor known to ROS"
+        )
 
     functions["_eval_find"] = find
 
