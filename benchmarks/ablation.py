@@ -42,7 +42,6 @@ from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.linearization import RigidProjection
 from spelgen.fitting.torque.tuning import SELECTION, TUNING
 from spelgen.fitting.tuning import TUNING as DAMPING
-from spelgen.logs.tuning import SAMPLES
 
 NEVER = float("inf")
 SIMULATED = (
@@ -142,7 +141,6 @@ def alternately(model: Any, samples: Any, *rest: Any) -> joint_functions.Project
 def mechanisms() -> list[Mechanism]:
     """Return all mechanisms."""
     return [
-        Mechanism("filter transients excluded", tuned(SAMPLES, unsettled=0.0)),
         Mechanism("correlated errors", tuned(TUNING, correlation_time=0.02, correlation_weight=NEVER)),
         Mechanism("correlation time from the data", tuned(TUNING, correlation_weight=NEVER)),
         Mechanism("shorter correlation at reversals", tuned(TUNING, reversal_correlation_time=0.2)),

@@ -149,7 +149,9 @@ class Truth:
         self.offset = 0.3 * self.coulomb * rng.normal(size=n) * case.offsets
         self.spring = np.zeros(n)
         if case.springs:
-            self.spring[rng.integers(n)] = 0.3 * size.max()
+            joint = rng.integers(n)
+            # Springs balance the load of their own joint.
+            self.spring[joint] = 0.3 * size[joint]
         self.asymmetry = 0.3 * rng.normal(size=n) * (case.friction == "asymmetric")
         self.load = np.abs(gravity + self.spring * np.sin(middle.numpy())).mean(axis=0)
         own_rng = np.random.default_rng([case.number, 2])

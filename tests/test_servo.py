@@ -11,13 +11,23 @@ import pytest
 import torch
 import yaml
 from emitted import import_source
-from servo_arm import COM, GRAVITY, MASS, STRIBECK_VELOCITY, Servos, servo_logs, write_servo_arm
+from servo_arm import (
+    COM,
+    GRAVITY,
+    INERTIA,
+    LENGTH,
+    MASS,
+    STRIBECK_VELOCITY,
+    Servos,
+    servo_logs,
+    write_servo_arm,
+)
 from typer.testing import CliRunner
 
 import spelgen
 from spelgen.cli.main import app
 from spelgen.dynamics.servo_rollout import replayed
-from spelgen.errors import LogError, OptionError, SettingsError
+from spelgen.errors import LogError, OptionError, RunError, SettingsError
 from spelgen.files import write_json
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder
@@ -25,7 +35,7 @@ from spelgen.fitting.servo import objective
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.windows import servo_windows
-from spelgen.identification.intervals import jackknife_covariance
+from spelgen.identification.intervals import QUANTILE, jackknife_covariance
 from spelgen.labels import DELAYED_COMMAND, LINEAR_SERVOS
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
@@ -191,6 +201,8 @@ def test_its_report_shows_servos_and_replays_and_no_torques(fitted, results):
         '<h2 id="servos">Servos</h2>' in page
         and re.search(f"<td[^>]*>{kd}", page)
         and "dry/kp of elbow" in told
+        and f"ratios to kp of {fitted.posterior.scale_joint}" in told
+        and f"{fitted.posterior.drives['kp'][0].text} Nm/rad" in told
     )
     assert "<td>command [rad]</td>" in page
     for empty in ("to draw", "metrics.jsonl", 'id="torques"', "trained parameters"):
@@ -220,6 +232,81 @@ def test_reported_intervals_cover_the_truth(fitted):
             assert joint[what]["low"] < truth < joint[what]["high"], what
     # with the elbow's small weight dry friction and a dead zone are confounded
     assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_summary(fitted.record.servo).text
+
+
+def servo_truth(servos, q):
+    """True values of `servo_values`."""
+    first, second = (np.sin(q[:, 0]), np.sin(q[:, 0] + q[:, 1]))
+    weight = GRAVITY * np.array([MASS[0] * COM[0] + MASS[1] * LENGTH, MASS[1] * COM[1]])
+    gravity = np.stack([weight[0] * first + weight[1] * second, weight[1] * second], axis=1)
+    kp, own = np.array(servos.kp), INERTIA + MASS * COM**2
+    inertia = own[1] + np.array(servos.armature)[1]
+    return np.concatenate([(gravity / kp).ravel(), [inertia / kp[1]]])
+
+
+def servo_values(q):
+    """Return the function of gravity / kp at q (T, 2) and of the elbow's inertia / kp of a model."""
+
+    def values(model):
+        kp, position = model.servo.kp(), torch.from_numpy(q)
+        mass = model.mass_matrix(position)[0, 1, 1]
+        return torch.cat([(model.gravity(position) / kp).flatten(), mass[None] / kp[1]])
+
+    return values
+
+
+def test_the_posterior_of_a_servo_fit_holds_the_truth(fitted, arm):
+    """Also of an arm with other servos, of which the masses of the URDF are 20 % wrong."""
+    other = Servos((10.0, 6.0), (0.5, 0.6), (0.02, 0.02), (0.08, 0.1), delay=0.015)
+    heavy = spelgen.build(arm, "closed-form")
+    with torch.no_grad():
+        heavy.bodies.raw[:, -1] += np.log(1.2)
+    held, q = [], np.random.default_rng(0).uniform(-1.5, 1.5, (4, 2))
+    second = spelgen.fit(heavy, servo_logs(3, 10.0, other, seed=4))
+    for fit, servos in ((fitted, TRUTH), (second, other)):
+        posterior, kp = fit.posterior, np.array(servos.kp)
+        truths = {
+            "kp": kp,
+            "kd/kp": np.array(servos.kd) / kp,
+            "lag": np.array(servos.kd) / kp + servos.delay,
+            "armature/kp": np.array(servos.armature) / kp,
+        }
+        for name, truth in truths.items():
+            stated = posterior.drives[name]
+            held += [x.low <= y <= x.high for x, y in zip(stated, truth, strict=True)]
+            assert all(x.determined == ("weak" if name == "kp" else "firm") for x in stated), name
+        value, std = posterior.uncertain(servo_values(q))
+        error = np.abs(value - servo_truth(servos, q))
+        held += (error <= QUANTILE * std).tolist()
+        assert np.median(std / np.abs(value)) < 0.05  # relative to kp, masses are determined
+    assert len(held) == 34 and np.mean(held) >= 0.9, np.mean(held)
+
+
+def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
+    posterior = fitted.posterior
+    assert {"a common factor of kp and all masses", "coulomb/kp and dead zone of elbow"} <= {
+        *posterior.unidentifiable
+    }
+    assert not any(x.startswith("kd/kp and delay") for x in posterior.unidentifiable)
+    assert all(x.name.endswith("/kp") for x in posterior.base_parameters)
+    assert next(x for x in posterior.base_parameters if x.name == "hx2/kp").determined == "firm"
+    delay = fitted.record.servo["delay"]
+    assert posterior.delay.value == delay["value"] and posterior.delay.half == pytest.approx(delay["half"])
+    for k, joint in enumerate(fitted.record.servo["joints"]):
+        for ratio, name in (("kd", "kd/kp"), ("lag", "lag"), ("armature", "armature/kp")):
+            stated = posterior.drives[name][k]
+            value, high = joint[ratio]["value"], joint[ratio]["high"]
+            assert stated.value == pytest.approx(value)
+            # The interval of the record is in the logarithm, and includes 3 % of the delay in the lag.
+            assert 0.5 < (stated.high - value) / (high - value) < 1.05
+    with pytest.raises(RunError, match="got intervals of torques, expected a fit to logs with torques"):
+        posterior.torque(*np.zeros((3, 1, 2)))
+    again = spelgen.load_run(fitted.folder).posterior
+    for one, other in zip(again.base_parameters, posterior.base_parameters, strict=True):
+        assert one.name == other.name and one.high == pytest.approx(other.high, rel=1e-6, abs=1e-12)
+    text = "".join(table.text() for table in posterior.listings)
+    assert f"ratios to kp of {posterior.scale_joint}" in " ".join(text.split())
+    assert "Delay of the commands" in text
 
 
 @pytest.mark.parametrize(

@@ -158,7 +158,9 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
 
         record["payload"] = payload_content(payload)
         outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
-    outcome += [] if posterior is None else [table.text() for table in posterior.listings]
+    # The outcome of a servo fit already has a table of its drives.
+    listings = () if posterior is None else posterior.listings[: 1 if fit.record.servo else None]
+    outcome += [table.text() for table in listings]
     answer(format, record, *outcome, f"run folder: {folder}")
     # An interrupted fit has the exit code that shells use, so that scripts can distinguish it from a finished fit.
     if fit.status == "interrupted":

@@ -133,7 +133,7 @@ class Fit:
     def posterior(self) -> Posterior:
         """Posterior of the model: 95 % intervals of the parameters, of M(q), g(q) and of predicted torques.
 
-        Raises RunError unless rigid bodies were fitted to torques.
+        Raises RunError unless rigid bodies were fitted to torques, or to positions under position servos.
         """
         # Imported here, because evaluation needs no posterior.
         from spelgen.fitting.posterior import posterior_of

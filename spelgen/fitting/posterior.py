@@ -1,8 +1,8 @@
 """Posterior of a fitted model: 95 % intervals of its parameters, of M(q), g(q) and of predicted torques.
 
-The covariance R R^T of the fitted parameters x (`fitting.torque.covariance`) is propagated to first order: the variance
-of a function f(x) is |J R|^2, with the Jacobian J = df/dx. The variance of a predicted torque also includes the squared
-residual of held-out samples.
+The covariance R R^T of the fitted parameters x (`fitting.torque.covariance`, `fitting.servo.covariance`) is propagated
+to first order: the variance of a function f(x) is |J R|^2, with the Jacobian J = df/dx. The variance of a predicted
+torque also includes the squared residual of held-out samples.
 """
 
 import copy
@@ -18,25 +18,19 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.body_regressor import base_combinations, constants_regressor
-from spelgen.dynamics.parameters import evaluate_with, friction_factor
+from spelgen.dynamics.parameters import evaluate_with
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
+from spelgen.fitting.drive_quantities import SUMS, drive_quantities
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.parameters import ParameterVector
-from spelgen.identification.intervals import Interval, base_unit, interval_listing
+from spelgen.identification.intervals import PRECISE, Interval, base_unit, interval_listing
 from spelgen.labels import UNITS, parameter_name
 from spelgen.listing import Listing
-from spelgen.runtime.motors import MotorInputs
 
-QUANTITIES = {
-    "armature": "{0.inertia}",
-    "viscous": "{0.torque} s/{0.position}",
-    "coulomb": "{0.torque}",
-    "offset": "{0.torque}",
-    "gain": "",
-}
-"""Unit of each quantity of a drive: a format string for the `UNITS` of the joint's type."""
+PER_KP = "/kp"
+"""Ending of the names of base parameters that are ratios to kp of `Posterior.scale_joint`."""
 
 
 class Uncertain(NamedTuple):
@@ -60,18 +54,19 @@ class Propagated(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Posterior of a model that was fitted to torques.
+    """Posterior of a model that was fitted to torques, or to positions under position servos.
 
     Attributes:
         covariance: (K, K), covariance of the K rigid-body, drive and friction parameters.
         torque_std: (n,) [Nm, N], RMS of the low-pass filtered torque residual on blocks of samples that were not
-            fitted.
-        delay: delay of the torques relative to the positions [s]; None if there is no delay.
+            fitted; None for position servos, whose torques are not logged.
+        delay: delay of the torques relative to the positions, or of the commands of position servos [s]; None if there
+            is no delay.
     """
 
     model: ArmModel
     covariance: Tensor
-    torque_std: np.ndarray
+    torque_std: np.ndarray | None
     delay: Interval | None = None
 
     def uncertain(self, function: Callable[[ArmModel], Tensor]) -> Uncertain:
@@ -119,8 +114,10 @@ class Posterior:
 
         motion: q, qd, qdd, (T, n) each and, if known, the friction state z and the direction of motion (see
         `DynamicsSamples`). The variance is the sum of two variances: the one due to errors of the parameters, and
-        `torque_std` squared, which includes noise and model errors.
+        `torque_std` squared, which includes noise and model errors. Raises RunError for position servos.
         """
+        if self.torque_std is None:
+            raise RunError("intervals of torques", expected="a fit to logs with torques, not to commands")
         # Imported here, because intervals of parameters need no samples.
         from spelgen.fitting.torque.jacobian import TorqueJacobian
         from spelgen.fitting.torque.samples import TorqueSamples
@@ -147,11 +144,29 @@ class Posterior:
 
     @cached_property
     def base_parameters(self) -> tuple[Interval, ...]:
-        """95 % intervals of the base parameters: identifiable combinations of inertial parameters and armatures."""
+        """95 % intervals of the base parameters: identifiable combinations of inertial parameters and armatures.
+
+        Under position servos of unknown gains, they are ratios to kp of one joint, `scale_joint`.
+        """
         names, combination = self._base
         values, roots = (combination @ factor for factor in self._constants)
+        joint = self._scale_index
+        if joint is not None:
+            names = tuple(f"{name}{PER_KP}" for name in names)
+            values, roots = _ratios(Propagated(values, roots), self._stiffness, joint)
         rows = zip(names, values.tolist(), roots.norm(dim=1).tolist(), strict=True)
-        return tuple(Interval(name, value, std, base_unit(name)) for name, value, std in rows)
+        return tuple(
+            Interval(name, value, std, base_unit(name) if joint is None else "") for name, value, std in rows
+        )
+
+    @property
+    def scale_joint(self) -> str | None:
+        """Name of the joint whose kp divides the base parameters; None if they are not divided.
+
+        Positions under servos determine masses and friction only relative to kp, unless a kp is known. The ratios to
+        kp of this joint have the smallest errors (median of the relative standard deviations).
+        """
+        return None if self._scale_index is None else self.model.joint_names[self._scale_index]
 
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
@@ -162,37 +177,42 @@ class Posterior:
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
-        """Names of the masses and first moments that logs determine only in combinations, or not at all."""
-        known = {x.name for x in self.bodies}
+        """Names of the masses and first moments that logs determine only in combinations, or not at all.
+
+        Under position servos, also pairs of quantities whose sum has a smaller error than either of them (`SUMS`), and
+        a common factor if no gain is known.
+        """
+        known = {x.name.removesuffix(PER_KP) for x in self.bodies}
         names = map(parameter_name, range(10 * len(self.model.chain.parents)))
-        return tuple(name for name in names if name[0] in "mh" and name not in known)
+        single = [name for name in names if name[0] in "mh" and name not in known]
+        drives, delay = self.drives, (self.delay,) * self.model.n
+        pairs = [
+            f"{first} and {second} of {total.name}"
+            for name, (first, second) in SUMS.items()
+            for total, *terms in zip(
+                drives.get(name, ()), drives.get(first, ()), drives.get(second, delay), strict=False
+            )
+            # The errors of the two terms are then correlated by less than -1/2.
+            if all(term is not None and total.std < term.std for term in terms)
+        ]
+        common = [] if self._scale_index is None else ["a common factor of kp and all masses"]
+        return tuple(single + pairs + common)
 
     @cached_property
     def drives(self) -> dict[str, tuple[Interval, ...]]:
         """{quantity: 95 % intervals of the joints}.
 
-        The quantities are armature, viscous and Coulomb friction, torque offset, and trained motor gain. Viscous and
-        Coulomb friction approximate the fitted friction by least squares up to the typical speed.
+        The quantities are armature, viscous and Coulomb friction, torque offset, and trained motor gain; of position
+        servos they are kp and the ratios to kp (see `drive_quantities`).
         """
-        model, inputs = self.model, self.model.inputs
-        trained = inputs.gain_rows.tolist() if isinstance(inputs, MotorInputs) else []
-        friction_line = _friction_line(model)
-
-        def constants(model: ArmModel) -> Tensor:
-            """Return armature, viscous friction, Coulomb friction, offset and, if trained, gain, (4, n) or (5, n)."""
-            rows = [model.armature, *friction_line(model), model.torque_offset]
-            if isinstance(model.inputs, MotorInputs) and trained:
-                rows.append(model.inputs.gains().sum(dim=1))
-            return torch.stack(rows)
-
-        rows = zip(QUANTITIES.items(), *self.uncertain(constants), strict=False)
+        model = self.model
+        quantities, function = drive_quantities(model)
         result = {}
-        for (quantity, unit), value, std in rows:
-            positive, joints = quantity in ("armature", "coulomb", "gain"), range(model.n)
-            labels = [unit.format(UNITS[joint_type]) for joint_type in model.joint_types]
-            result[quantity] = tuple(
-                Interval(model.joint_names[k], float(value[k]), float(std[k]), labels[k], positive)
-                for k in (trained if quantity == "gain" else joints)
+        for quantity, value, std in zip(quantities, *self.uncertain(function), strict=True):
+            labels = [quantity.unit.format(UNITS[joint_type]) for joint_type in model.joint_types]
+            result[quantity.name] = tuple(
+                Interval(model.joint_names[k], float(value[k]), float(std[k]), labels[k], quantity.positive)
+                for k in quantity.joints
             )
         return result
 
@@ -211,15 +231,16 @@ class Posterior:
     @property
     def listings(self) -> tuple[Listing, Listing]:
         """Two tables with 95 % intervals: the determined base parameters, and constants of the drives."""
-        determined = [x for x in self.base_parameters if x.determined in ("firm", "fair")]
+        determined = [x for x in self.base_parameters if x.determined in PRECISE]
         note = (
             f"{len(self.base_parameters) - len(determined)} more are not determined to 20 %. Unidentifiable on their "
             f"own: {', '.join(self.unidentifiable) or 'none'}."
         )
-        title = "Base parameters [kg, m], with half 95 % intervals; numbers after names: joint"
+        unit = "kg, m" if self.scale_joint is None else f"kg, m; ratios to kp of {self.scale_joint}"
+        title = f"Base parameters [{unit}], with half 95 % intervals; numbers after names: joint"
         columns = {"joint": list(self.model.joint_names), **self.drive_columns}
         drives = tuple(zip(*columns.values(), strict=True))
-        note_delay = "" if self.delay is None else f"Torque delay: {self.delay.text} s."
+        note_delay = "" if self.delay is None else f"{self.delay.name.capitalize()}: {self.delay.text} s."
         return (
             interval_listing(title, determined, note),
             Listing("Drives, with half 95 % intervals", tuple(columns), drives, note_delay),
@@ -232,8 +253,8 @@ class Posterior:
             "bodies": [x.to_dict() for x in self.bodies],
             "unidentifiable": list(self.unidentifiable),
             "drives": {name: [x.to_dict() for x in of_joints] for name, of_joints in self.drives.items()},
-            "torque_delay": None if self.delay is None else self.delay.to_dict(),
-            "torque_deviation": self.torque_std.tolist(),
+            "delay": None if self.delay is None else self.delay.to_dict(),
+            "torque_deviation": None if self.torque_std is None else self.torque_std.tolist(),
         }
 
     @cached_property
@@ -262,7 +283,21 @@ class Posterior:
     @cached_property
     def _constants(self) -> Propagated:
         """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance."""
-        return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
+        return self.propagate(_constants)
+
+    @cached_property
+    def _stiffness(self) -> Propagated:
+        """kp of all servos, (n,) [Nm/rad, N/m]."""
+        return self.propagate(lambda model: model.servo.kp())
+
+    @cached_property
+    def _scale_index(self) -> int | None:
+        """Index of `scale_joint`."""
+        if self.model.input_quantity != "position" or not self.model.servo.trained.all():
+            return None
+        base = Propagated(*(self._base[1] @ factor for factor in self._constants))
+        ratios = [_ratios(base, self._stiffness, joint) for joint in range(self.model.n)]
+        return int(np.argmin([float((root.norm(dim=1) / value.abs()).median()) for value, root in ratios]))
 
     def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         return constants_regressor(self.model.chain, motors_of(self.model), q, qd, qdd)
@@ -283,8 +318,8 @@ def posterior_of(
 
     Args:
         model: model with the fitted parameters.
-        content: field ``posterior`` of a checkpoint: covariance of the K parameters, (K, K), torque_std, (n,) [Nm, N],
-            and delay_std [s].
+        content: field ``posterior`` of a checkpoint: covariance of the K parameters, (K, K), delay_std [s], and, unless
+            the model has position servos, torque_std, (n,) [Nm, N].
         delay: delay of the torques relative to the positions [s].
         file: path of the checkpoint, for error messages.
 
@@ -292,20 +327,37 @@ def posterior_of(
     """
     if content is None:
         raise RunError(
-            "a fit without intervals", file=file, expected="rigid bodies fitted to torques, and not adapted",
-            do="fit the preset closed-form or hybrid by the objective torque",
+            "a fit without intervals", file=file,
+            expected="rigid bodies fitted to torques or by the objective servo, and not adapted",
+            do="fit the preset closed-form or hybrid by the objective torque or servo",
         )  # fmt: skip
     vector = ParameterVector(model)
     count = len(vector.flatten(vector.initial))
     covariance = _tensor(content, "covariance", (count, count))
     torque_std, delay_std = _tensor(content, "torque_std", (model.n,)), content.get("delay_std")
-    if covariance is None or torque_std is None or not isinstance(delay_std, float):
+    servos = model.input_quantity == "position"
+    if covariance is None or (torque_std is None) != servos or not isinstance(delay_std, float):
         do = "restore it from a copy, or fit again"
         raise RunError("a posterior of another model", file=file, element="posterior", do=do)
-    late = Interval("torque delay", delay, delay_std, "s") if delay else None
+    if servos:
+        delay = float(model.servo.delay)
+    late = Interval("delay of the commands" if servos else "torque delay", delay, delay_std, "s", servos)
     # The posterior keeps a copy of the model, because the caller may change the model.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
-    return Posterior(model, covariance, torque_std.numpy(), late)
+    std = None if torque_std is None else torque_std.numpy()
+    return Posterior(model, covariance, std, late if delay else None)
+
+
+def _ratios(values: Propagated, divisors: Propagated, joint: int) -> Propagated:
+    """Return the ratios of values (r,) to one of the divisors (n,)."""
+    divisor, root = divisors.value[joint], divisors.root[joint]
+    ratio = values.value / divisor
+    return Propagated(ratio, (values.root - ratio.outer(root)) / divisor)
+
+
+def _constants(model: ArmModel) -> Tensor:
+    """Return the inertial parameters of all B bodies, then the armatures, (10 B + n,)."""
+    return torch.cat([model.inertial_parameters.flatten(), model.armature])
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
@@ -314,32 +366,3 @@ def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | Non
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
         return tensor if tensor.any() and tensor.isfinite().all() else None
     return None
-
-
-def _friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
-    """Return a function: model -> its viscous and Coulomb friction coefficients, (2, n).
-
-    They are the slope and the intercept of a straight line through the friction torque at speeds up to the typical
-    speed, fitted by least squares. The friction torque is averaged over random positions. The gravity load and the
-    factor of the residual terms at these positions are computed only once, from the argument ``model``: they are also
-    used for models with other friction parameters.
-    """
-    rng, joints = np.random.default_rng(0), model.spec.joints
-    places = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
-    q = torch.from_numpy([x.center for x in joints] + places)
-    with torch.no_grad():
-        # The load of each drive is the gravity torque in the drive's coordinates, at P = 32 random positions, (P, n).
-        load = model.gravity(q) @ torch.linalg.inv(motors_of(model))
-        factor = friction_factor(model, q)
-    # The speeds are in units of the typical speed. They are dense at low speeds, where the Stribeck effect determines
-    # the intercept of the line.
-    speeds = np.geomspace(0.02, 1.0, 25)
-    line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
-
-    def friction_line(model: ArmModel) -> Tensor:
-        friction = model.friction
-        speed = torch.from_numpy(speeds)[:, None] * friction.speed
-        slope, intercept = line @ (factor * friction.prepare().torque(speed[:, None], load)).mean(dim=1)
-        return torch.stack([slope / friction.speed, intercept])
-
-    return friction_line

@@ -137,7 +137,7 @@ class Checkpoint(BaseModel):
         substeps: integrator steps per sample interval.
         torque_nmse: mean squared torque error divided by the variance of the torque, per joint.
         posterior: covariance of the parameters and RMS torque residual (see `posterior_of`), only for rigid bodies
-            fitted to torques.
+            fitted to torques, or to positions under position servos.
         rollbacks: number of repeated epochs of a fit to windows.
         learning_rate_factor: factor on the learning rate after these repetitions.
         momentum_done: whether the momentum stage has ended.

@@ -18,6 +18,8 @@ BLOCKS = 10
 # [1] Smallest number of samples of a jackknife block, half a second, for fits with a prior.
 MIN_BLOCK = 25
 DETERMINED = ("firm", "fair", "weak", "may be zero")
+PRECISE = DETERMINED[:2]
+"""Classes of intervals whose standard deviation is at most 20 % of the value."""
 
 
 @dataclass(frozen=True)

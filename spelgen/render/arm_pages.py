@@ -13,12 +13,13 @@ from spelgen.certificate.inspection import Inspection, range_text
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.excitation.excitation import ADVICE, Excitation
 from spelgen.fitting.run_record import Content
+from spelgen.identification.intervals import PRECISE
 from spelgen.labels import named_joints
 from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps
 from spelgen.render.arm_section import AnimatedMotion, arm_section, matrix
 from spelgen.render.charts import TUNING
-from spelgen.render.parameters import DETERMINED, base_table
+from spelgen.render.parameters import base_table
 from spelgen.render.plots import JointRow, Panel, stacks
 from spelgen.structure.structure import derive
 from spelgen.templates import render_page
@@ -69,7 +70,7 @@ def identification_page(identification: Identification, arm: Arm) -> str:
         "identification.html.jinja",
         robot=identification.arm.name,
         quality=identification.quality(),
-        sure=sum(word in DETERMINED for word in words),
+        sure=sum(word in PRECISE for word in words),
         count=len(words),
         never=never,
         residuals=identification.listings()[0],

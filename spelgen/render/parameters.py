@@ -18,7 +18,7 @@ from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_po
 from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.run_record import Content
 from spelgen.identification.base_parameters import base_parameters
-from spelgen.identification.intervals import Interval
+from spelgen.identification.intervals import PRECISE, Interval
 from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
 from spelgen.runtime.derived_mass import ConstantMass, DerivedMass
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
 Rows = tuple[tuple[str, ...], ...]
-DETERMINED = ("firm", "fair")
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,8 @@ def parameter_tables(
     tables: list[Listing] = []
     if arm is not None and identified and "base_parameters" in identified:
         tables.append(base_table(model, arm, identified, posterior))
+    elif posterior is not None:
+        tables.append(posterior.listings[0])
     if isinstance(model, RigidBodyDynamics):
         tables.append(_body_table(body_parameters(model), arm, posterior))
         tables.append(_joint_table(model, arm, posterior))
@@ -115,8 +116,8 @@ def base_table(
     # The formula of a base parameter is omitted if it equals the name: the parameter is then not a combination.
     columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
     rows = list(zip(*columns.values(), strict=True))
-    sure = tuple(row for row in rows if row[-2] in DETERMINED)
-    unsure = tuple(row for row in rows if row[-2] not in DETERMINED)
+    sure = tuple(row for row in rows if row[-2] in PRECISE)
+    unsure = tuple(row for row in rows if row[-2] not in PRECISE)
     title = "Base parameters: identifiable combinations"
     folded_title = f"{len(unsure)} more, not significantly different from zero"
     return ParameterTable(title, tuple(columns), sure, f"{note}.", folded=unsure, folded_title=folded_title)

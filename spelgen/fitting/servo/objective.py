@@ -23,6 +23,7 @@ from spelgen.fitting.levenberg_marquardt import SolverState, initial_state, leve
 from spelgen.fitting.objective import Objective, Status
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_record import Content
+from spelgen.fitting.servo.covariance import posterior_content
 from spelgen.fitting.servo.laws import select_dead_zones, without_small_dead_zones
 from spelgen.fitting.servo.least_squares import fit_linear_servos, set_initial_guess
 from spelgen.fitting.servo.parameters import ServoParameters
@@ -130,6 +131,7 @@ class ServoObjective(Objective):
         linear = fit_linear_servos(self._windows.subsampled(TUNING.sparse_windows))
         self.results["servo"] = record | {"linear": asdict(linear)}
         self._update_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
+        self._checkpoint["posterior"] = posterior_content(problem, solved)
 
     def _set_up(self, weights: Content) -> None:
         """Create the rollouts of the first outer iteration. weights: initial state_dict, which is the prior mean."""

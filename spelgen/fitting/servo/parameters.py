@@ -16,6 +16,7 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.servo.tuning import TUNING
 
 DEAD_ZONE = "servo.dead_zone"
+DELAY = "servo.delay"
 COULOMB = "friction.raw_coulomb"
 STRIBECK_VELOCITY = "friction.raw_stribeck_velocity"
 

@@ -32,14 +32,17 @@ RIGID_GROUPS = (
     "bodies", "friction_compensation", "gains", "armature", "offset", "sizes", "effects", "velocities",
     "load_dependence", "fractions",
 )  # fmt: skip
-"""Groups of parameters (see `ParameterInfo`) of bodies, drives and friction; all others are of residual terms."""
+"""Groups of parameters (see `ParameterInfo`) of bodies, drives and friction; all others are of residual terms, or of
+position servos."""
+SERVO_GROUPS = ("stiffness", "damping", "dead_zone", "delay")
+"""Groups of position servos, which fits to torques do not have."""
 DAY_GROUPS = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
 """Groups that differ from day to day."""
 NEGLIGIBLE = -30.0  # logarithm of a negligible friction coefficient, relative to nominal friction
 
 
 class ParameterVector:
-    """Map from the K parameters of bodies, drives and friction of a model to one vector x (K,), and back.
+    """Map from the K parameters of bodies, drives, servos and friction of a model to one vector x (K,), and back.
 
     groups: {name of a parameter: its group}. initial: {name: values when this object was created}.
     """
@@ -50,7 +53,7 @@ class ParameterVector:
         self._tensors: dict[str, torch.Tensor] = {}  # parameters and buffers that a fit may change
         self.initial: dict[str, torch.Tensor] = {}
         for name, info in parameter_table(model).items():
-            if info.kind in RIGID_GROUPS:
+            if info.kind in (*RIGID_GROUPS, *SERVO_GROUPS):
                 self.groups[name], self._tensors[name] = info.kind, tensors[name]
                 self.initial[name] = tensors[name].detach().clone()
         (self.bodies,) = self.names("bodies")

@@ -12,12 +12,7 @@ from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.torque.jacobian import TorqueJacobian
-from spelgen.fitting.torque.parameters import (
-    ParameterVector,
-    joint_torque,
-    log_cholesky_parameters,
-    upper_cholesky,
-)
+from spelgen.fitting.torque.parameters import joint_torque, log_cholesky_parameters, upper_cholesky
 from spelgen.fitting.torque.problem import TorqueProblem
 from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
 from spelgen.fitting.torque.stages import initial_fit
@@ -105,12 +100,13 @@ def _regression(
 
 
 def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) -> None:
-    """Set rigid bodies and friction of a model to physically consistent values that approximate a regression.
+    """Set the bodies of a model to physically consistent bodies that approximate a regression.
 
-    The values are a fit to the torques that the regression predicts, with a wide prior about bodies of 1 kg. The
+    The bodies are a fit to the torques that the regression predicts, with a wide prior about bodies of 1 kg. The
     inertias of the URDF are not used as the prior mean: this function is called if a fit with this prior mean has a
     larger held-out error than the regression, and the probable reason is a wrong URDF, for example with centres of mass
-    in mm.
+    in mm. The friction and the drives of this fit are discarded: friction coefficients of a regression may be negative,
+    which the fit would explain by drives that compensate friction.
     """
     with torch.no_grad():
         body = pseudo_inertia(torch.tensor([DEFAULT_BODY]).double())
@@ -124,4 +120,6 @@ def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) ->
     )
     prior = GaussianPrior(bodies=TUNING.max_width)
     estimate = initial_fit(TorqueProblem.of(TorqueJacobian(model, predicted), prior))
-    ParameterVector(model).write(estimate.state.x)
+    rigid = estimate.problem.jacobian.rigid
+    with torch.no_grad():
+        model.bodies.raw.copy_(rigid.unflatten(estimate.state.x)[rigid.bodies])

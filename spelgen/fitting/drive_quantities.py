@@ -1,0 +1,108 @@
+"""Quantities of drives whose intervals a posterior states: constants of the drives, or ratios to kp of servos."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spelgen.dynamics.parameters import friction_factor
+from spelgen.dynamics.protocol import motors_of
+from spelgen.emission.assemble import ArmModel
+from spelgen.runtime.motors import MotorInputs
+
+
+class DriveQuantity(NamedTuple):
+    """A quantity of joints. unit: format string for the `UNITS` of a joint's type. joints: joints that have it."""
+
+    name: str
+    unit: str
+    positive: bool
+    joints: tuple[int, ...]
+
+
+TORQUE_UNITS = {
+    "armature": "{0.inertia}",
+    "viscous": "{0.torque} s/{0.position}",
+    "coulomb": "{0.torque}",
+    "offset": "{0.torque}",
+    "gain": "",
+}
+"""Unit of each constant of drives that are given torques."""
+SERVO_UNITS = {
+    "kp": "{0.torque}/{0.position}",
+    "kd/kp": "s",
+    "lag": "s",
+    "armature/kp": "s²",
+    "coulomb/kp": "{0.position}",
+    "dead zone": "{0.position}",
+    "static error": "{0.position}",
+    "offset/kp": "{0.position}",
+}
+"""Unit of each quantity of position servos. lag: kd/kp plus the delay of the commands; static error: coulomb/kp plus
+half the dead zone, which is `dead zone`."""
+SUMS = {"lag": ("kd/kp", "delay"), "static error": ("coulomb/kp", "dead zone")}
+"""Sums of two quantities that logs of servos may determine better than either of the two."""
+
+
+def drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
+    """Return the quantities of a model's drives, and the function that returns their values (quantities, n).
+
+    Viscous and Coulomb friction approximate the friction by least squares up to the typical speed.
+    """
+    line, servos = friction_line(model), model.input_quantity == "position"
+    gains = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
+    signed, every = ("viscous", "offset", "offset/kp"), tuple(range(model.n))
+    units = (
+        SERVO_UNITS if servos else {name: x for name, x in TORQUE_UNITS.items() if gains or name != "gain"}
+    )
+    quantities = [
+        DriveQuantity(name, unit, name not in signed, tuple(gains) if name == "gain" else every)
+        for name, unit in units.items()
+    ]
+
+    def constants(model: ArmModel) -> Tensor:
+        rows = [model.armature, *line(model), model.torque_offset]
+        if gains and isinstance(model.inputs, MotorInputs):
+            rows.append(model.inputs.gains().sum(dim=1))
+        return torch.stack(rows)
+
+    def ratios(model: ArmModel) -> Tensor:
+        servo, kp = model.servo, model.servo.kp()
+        damping, dry = servo.kd() / kp, line(model)[1] / kp
+        return torch.stack([
+            kp, damping, damping + servo.delay, model.armature / kp, dry, servo.dead_zone,
+            dry + servo.dead_zone, model.torque_offset / kp,
+        ])  # fmt: skip
+
+    return quantities, ratios if servos else constants
+
+
+def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
+    """Return a function: model -> its viscous and Coulomb friction coefficients, (2, n).
+
+    They are the slope and the intercept of a straight line through the friction torque at speeds up to the typical
+    speed, fitted by least squares. The friction torque is averaged over random positions. The gravity load and the
+    factor of the residual terms at these positions are computed only once, from the argument ``model``: they are also
+    used for models with other friction parameters.
+    """
+    rng, joints = np.random.default_rng(0), model.spec.joints
+    places = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
+    q = torch.from_numpy([x.center for x in joints] + places)
+    with torch.no_grad():
+        # The load of each drive is the gravity torque in the drive's coordinates, at P = 32 random positions, (P, n).
+        load = model.gravity(q) @ torch.linalg.inv(motors_of(model))
+        factor = friction_factor(model, q)
+    # The speeds are in units of the typical speed. They are dense at low speeds, where the Stribeck effect determines
+    # the intercept of the line.
+    speeds = np.geomspace(0.02, 1.0, 25)
+    line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
+
+    def line_of(model: ArmModel) -> Tensor:
+        friction = model.friction
+        speed = torch.from_numpy(speeds)[:, None] * friction.speed
+        slope, intercept = line @ (factor * friction.prepare().torque(speed[:, None], load)).mean(dim=1)
+        return torch.stack([slope / friction.speed, intercept])
+
+    return line_of

@@ -1,0 +1,54 @@
+"""Covariance of the parameters of a model after a servo fit, from which its posterior is made."""
+
+import torch
+from torch import Tensor
+
+from spelgen.fitting.run_record import Content
+from spelgen.fitting.servo.parameters import DELAY
+from spelgen.fitting.servo.problem import ServoProblem
+from spelgen.fitting.servo.report import ServoSolution
+from spelgen.fitting.servo.tuning import TUNING
+from spelgen.fitting.torque.parameters import ParameterVector
+from spelgen.identification.intervals import QUANTILE
+
+
+def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content:
+    """Return `Checkpoint.posterior` of a servo fit: the covariance (K, K) of the parameters of a `ParameterVector`.
+
+    The covariance of the fitted parameters is scaled such that 1.96 standard deviations are half of Student's 95 %
+    interval. Two covariances are added: of the deviations of the form of the friction model, and the prior covariance
+    of the directions of the bodies that are not fitted. If no kp is known, the standard deviation of a common factor of
+    all torques is at least the prior standard deviation of masses: effort limits may determine this factor in the logs,
+    but the limits in URDFs often differ from the limits of the motors.
+    """
+    parameters, model = problem.parameters, problem.rollouts.model
+    vector, directions = ParameterVector(model), parameters.directions
+    (p, n), count = parameters.prior_mean.joints.shape, len(solution.covariance)
+    units = torch.eye(count).double()
+    # derivatives of the model's parameters with respect to the fitted parameters, (k, K)
+    slopes = {name: torch.zeros(count, x.numel()).double() for name, x in vector.initial.items()}
+    of_joints = parameters.named(units[:, : p * n].view(count, p, n))
+    slopes |= {name: x.reshape(count, -1) for name, x in of_joints.items()}
+    slopes[vector.bodies] = units[:, p * n : -1] @ directions.mT
+    slopes[DELAY] = units[:, -1:]
+    slope = torch.cat(list(slopes.values()), dim=1)
+    scale, bodies = solution.quantile / QUANTILE, vector.mask("bodies")
+    forms = (scale * TUNING.model_deviation) ** 2 * vector.mask("damping", "armature", "sizes")
+    covariance = scale**2 * slope.mT @ solution.covariance @ slope + forms.diag()
+    unfitted = TUNING.bodies**2 * torch.eye(len(directions)).double() - directions @ directions.mT
+    covariance[bodies[:, None] & bodies] += unfitted.flatten()
+    if model.servo.trained.all():
+        factor = _common_factor(vector)
+        missing = TUNING.bodies**2 - covariance.diagonal()[vector.mask("stiffness")].mean()
+        covariance += missing.clamp(min=0) * factor.outer(factor)
+    return {"covariance": covariance, "delay_std": scale * float(solution.covariance[-1, -1].sqrt())}
+
+
+def _common_factor(vector: ParameterVector) -> Tensor:
+    """Return the derivative (K,) of the parameters with respect to the logarithm of a factor of all torques."""
+    logarithms = vector.mask("stiffness", "damping", "armature", "sizes", "effects").double()
+    derivatives = vector.unflatten(logarithms)
+    derivatives[vector.bodies][:, -1] = 1.0  # logarithms of the masses
+    for name in vector.names("offset"):
+        derivatives[name].copy_(vector.initial[name])
+    return logarithms
