@@ -128,7 +128,9 @@ class GeometryProblem:
             rows = drive_rows(self._chains[hypothesis.gravity], q, qd, qdd, self.speeds)
             if self._has_hysteresis:
                 # the deflections of drive j act on joint i with the factor C_ji, like its other friction
-                bristles = self.samples.bent[:, None] * self.speeds.T[:, :, None]
+                # under a hypothesis, a joint may have the motion of another column, or motion of the opposite sense
+                bent = self.samples.bent[:, hypothesis.source[0]] * np.sign(hypothesis.scale[0])[:, None]
+                bristles = bent[:, None] * self.speeds.T[:, :, None]
                 rows = np.concatenate([rows, bristles.reshape(*q.shape, -1)], axis=2)
             rows = rows if self._counted is None else rows * self._counted
             if len(self._equations) >= 30:  # bounds the memory of the cache: an entry has about 1 MB
