@@ -51,11 +51,9 @@ def excite(
 
     Args:
         arm: configured arm.
-        duration: duration of the motion, which is one period [s].
-        sample_rate: approximate sample rate [Hz].
+        duration: duration of the motion, which is one period [s]. sample_rate: approximate sample rate [Hz].
         harmonics: number of harmonics; default: 0.4 per second, at least 5.
-        reach: fraction of the position ranges that is used.
-        speed: fraction of the velocity limits that is used.
+        reach, speed: fractions of the position ranges and of the velocity limits that are used.
         acceleration: largest acceleration of all joints or per joint [rad/s^2, m/s^2]; default: unlimited in the
             motion; in the approach, the acceleration that reaches the used speed in one second.
         start: position from which the approach starts, (n,) [rad, m]; default: zero if the limits allow it, per joint,
@@ -63,7 +61,7 @@ def excite(
         surroundings: floor, boxes and clearance, or the path of a YAML file; default: a clearance of 10 mm.
         trials: evaluations of the criterion by the optimizer, in addition to 40 random motions.
         seed: seed of the random motions.
-        progress: function that is called with the number of finished trials and the number of all trials.
+        progress: function of the numbers of finished and of all trials.
 
     Raises SettingsError for an invalid value, ArmError for a joint without a range and if all motions had a contact.
     """

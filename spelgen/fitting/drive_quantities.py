@@ -53,12 +53,12 @@ def drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[Ar
     """
     line, servos = friction_line(model), model.input_quantity == "position"
     gains = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
-    signed, every = ("viscous", "offset", "offset/kp"), tuple(range(model.n))
+    signed, all_joints = ("viscous", "offset", "offset/kp"), tuple(range(model.n))
     units = (
         SERVO_UNITS if servos else {name: x for name, x in TORQUE_UNITS.items() if gains or name != "gain"}
     )
     quantities = [
-        DriveQuantity(name, unit, name not in signed, tuple(gains) if name == "gain" else every)
+        DriveQuantity(name, unit, name not in signed, tuple(gains) if name == "gain" else all_joints)
         for name, unit in units.items()
     ]
 
@@ -88,8 +88,8 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
     used for models with other friction parameters.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
-    places = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
-    q = torch.from_numpy([x.center for x in joints] + places)
+    deviations = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
+    q = torch.from_numpy([x.center for x in joints] + deviations)
     with torch.no_grad():
         # The load of each drive is the gravity torque in the drive's coordinates, at P = 32 random positions, (P, n).
         load = model.gravity(q) @ torch.linalg.inv(motors_of(model))

@@ -99,10 +99,10 @@ class Delay(Fault):
             return
         stateful = problem.with_hysteresis()
         stateful_errors = stateful.fit(reading).errors
-        for part in _delayed_parts(len(reading.offset)):
+        for signals in _delayed_signals(len(reading.offset)):
 
-            def delayed(delay: np.ndarray, part: np.ndarray = part) -> Hypothesis:
-                return reading.changed(self, delay=reading.delay + delay * part)
+            def delayed(delay: np.ndarray, signals: np.ndarray = signals) -> Hypothesis:
+                return reading.changed(self, delay=reading.delay + delay * signals)
 
             # a step from 0 would be too short for noisy torques, whose derivative is mostly noise
             starts = GEOMETRY.delay_start * np.array([[0.0], [1.0], [-1.0]])
@@ -148,7 +148,7 @@ class Delay(Fault):
         return {"torque_delay": plain_number(correction.mapping.torque_delay + delay[0])}
 
 
-class Clock(Fault):
+class JointClock(Fault):
     """Motion, torque or all signals of a joint, or the torques of all joints, whose times are of another clock."""
 
     code = "joint-clock"
@@ -166,35 +166,35 @@ class Clock(Fault):
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield the fits with the best delays of signals at the start and the end of a recording, if they differ."""
         reading, starts = unchanged.hypothesis, []
-        for part in _delayed_parts(len(reading.offset)) if problem.samples.longest_delay else ():
+        for signals in _delayed_signals(len(reading.offset)) if problem.samples.longest_delay else ():
             for last in GEOMETRY.clock_starts:
                 delays = np.array([0.0, last])
                 starts.append(
-                    (problem.fit(self._drifting(problem, reading, delays, part)).cost, delays, part)
+                    (problem.fit(self._drifting(problem, reading, delays, signals)).cost, delays, signals)
                 )
         # the best starts have the right signals and the right sign
-        for _, start, part in sorted(starts, key=itemgetter(0))[:3]:
-            yield from self._best(problem, reading, start, part)
+        for _, start, signals in sorted(starts, key=itemgetter(0))[:3]:
+            yield from self._best(problem, reading, start, signals)
 
     def _best(
-        self, problem: GeometryProblem, reading: Hypothesis, start: np.ndarray, part: np.ndarray
+        self, problem: GeometryProblem, reading: Hypothesis, start: np.ndarray, signals: np.ndarray
     ) -> Iterator[HypothesisFit]:
         delays, best = problem.descend(
-            lambda x: self._drifting(problem, reading, x, part), start, largest=0.3, smallest=0.002
+            lambda x: self._drifting(problem, reading, x, signals), start, largest=0.3, smallest=0.002
         )
         if abs(delays[1] - delays[0]) >= 2 * GEOMETRY.min_delay:
             yield best
 
     def _drifting(
-        self, problem: GeometryProblem, reading: Hypothesis, delays: np.ndarray, part: np.ndarray
+        self, problem: GeometryProblem, reading: Hypothesis, delays: np.ndarray, signals: np.ndarray
     ) -> Hypothesis:
         """Return the hypothesis with delays (2,) [s] of some signals at the start and the end of a recording.
 
-        part: mask (2, n) of these signals.
+        signals: mask (2, n) of these signals.
         """
         first, last = delays
         drift = (last - first) / float(problem.samples.times.max())
-        return reading.changed(self, delay=first * part, drift=drift * part)
+        return reading.changed(self, delay=first * signals, drift=drift * signals)
 
     def text(self, correction: Correction) -> str:
         """Return a description with the relative error of the clock."""
@@ -208,12 +208,12 @@ class Clock(Fault):
         return list(names[correction.hypothesis.drift.any(axis=0)].tolist())
 
 
-def _delayed_parts(n: int) -> list[np.ndarray]:
+def _delayed_signals(n: int) -> list[np.ndarray]:
     """Return the masks (2, n) of signals with a common delay: all torques, and signals of each of n joints."""
-    parts = [np.stack([np.zeros(n), np.ones(n)])]
+    masks = [np.stack([np.zeros(n), np.ones(n)])]
     for rows in ([1.0, 0.0], [0.0, 1.0], [1.0, 1.0]):
-        parts += [np.outer(rows, unit) for unit in np.eye(n)]
-    return parts
+        masks += [np.outer(rows, unit) for unit in np.eye(n)]
+    return masks
 
 
 def _late_signals(delay: np.ndarray) -> str:
@@ -238,22 +238,22 @@ class Compensation(Fault):
         if not present.any():
             return
 
-        def reduced(part: np.ndarray) -> Hypothesis:
-            return with_gravity(self, base, part * present)
+        def reduced(fraction: np.ndarray) -> Hypothesis:
+            return with_gravity(self, base, fraction * present)
 
         without = problem.fit(reduced(np.zeros(1)))
         # a fraction of more than a half in all joints is ascribed to wrong masses of the URDF, not to a compensation
-        part, _ = problem.descend(
+        fraction, _ = problem.descend(
             reduced, np.zeros(1), largest=0.5, smallest=1e-3, allowed=lambda x: np.clip(x, -0.5, 0.5)
         )
-        some = problem.fit(with_gravity(self, base, (part * present).round(3)))
+        some = problem.fit(with_gravity(self, base, (fraction * present).round(3)))
         yield some if some.cost < without.cost - GEOMETRY.ambiguous else without
 
     def text(self, correction: Correction) -> str:
         """Return a description with the remaining fraction of gravity."""
         present = np.array(correction.unchanged.gravity)
-        part = float(np.array(correction.hypothesis.gravity) @ present / (present @ present))
-        return f"torques in which gravity is compensated: {part:.2g} times the URDF's gravity remains in all joints"
+        fraction = float(np.array(correction.hypothesis.gravity) @ present / (present @ present))
+        return f"torques in which gravity is compensated: {fraction:.2g} times the URDF's gravity remains in all joints"
 
     def robot_keys(self, correction: Correction) -> dict[str, object]:
         """Return the vector of gravity."""

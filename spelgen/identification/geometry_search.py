@@ -19,7 +19,7 @@ from spelgen.identification.column_faults import (
     WrongOrder,
     position_factors,
 )
-from spelgen.identification.continuous_faults import Clock, Compensation, Delay, Gravity, ZeroOffset
+from spelgen.identification.continuous_faults import Compensation, Delay, Gravity, JointClock, ZeroOffset
 from spelgen.identification.hypotheses import HypothesisFit
 from spelgen.identification.log_faults import Fault
 from spelgen.identification.log_geometry import GeometryProblem
@@ -50,7 +50,7 @@ def kinds_of_faults(
         TorqueUnit([np.stack([np.ones(n), factor]) for factor in torque_factors]),
         ZeroOffset(),
         Delay(),
-        Clock(),
+        JointClock(),
         Compensation(),
         Gravity(),
     )

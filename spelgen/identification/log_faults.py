@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -46,14 +45,17 @@ class Correction:
 
     def lines(self) -> str:
         """Return a text with the settings that implement the hypothesis, and where to write them; "" if none do."""
-        entries: dict[str, dict[str, Any]] = {}
+        entries: dict[str, dict[str, object]] = {}
         of_log: dict[str, object] = {}
         of_robot: dict[str, object] = {}
         for k, name in enumerate(self.arm.joint_names):
-            keys: dict[str, Any] = {}
+            keys: dict[str, object] = {}
             for fault in self.hypothesis.faults:
                 for key, value in fault.joint_keys(self, k).items():
-                    keys[key] = {**keys.get(key, {}), **value} if isinstance(value, dict) else value
+                    previous = keys.get(key)
+                    if isinstance(previous, dict) and isinstance(value, dict):
+                        value = {**previous, **value}
+                    keys[key] = value
             if keys:
                 entries[name] = keys
         if entries:
