@@ -123,15 +123,15 @@ class JointEvidence(NamedTuple):
 
 
 def find_beyond_limits(joint: JointEvidence) -> str | None:
-    """Find measured or commanded positions beyond the position limits of the joint."""
+    """Return a message about measured or commanded positions beyond the position limits; None if there are none."""
     findings = []
     (lower, upper), unit = joint.limits(), UNITS[joint.coordinate.joint_type].position
     for name in ("q", "u"):
         low, high = joint.report.low.get(name, inf), joint.report.high.get(name, -inf)
         if low < lower - TUNING.limit_rounding:
-            findings.append(f"{name} down to {low:.4g} {unit}, the limit is {lower:.4g}")
+            findings.append(f"{name} down to {low:.4g} {unit}, the limit is {lower:z.4g}")
         if high > upper + TUNING.limit_rounding:
-            findings.append(f"{name} up to {high:.4g} {unit}, the limit is {upper:.4g}")
+            findings.append(f"{name} up to {high:.4g} {unit}, the limit is {upper:z.4g}")
     return "; ".join(findings) or None
 
 
