@@ -1,13 +1,13 @@
-"""The structure of M and V in words, with reasons.
+"""The structure of the mass matrix M and of the potential energy V in words, with reasons.
 
 The facts are about zero, constant and equal entries of M, and about joints on which M or V does not depend. A reason is
 given only if the exact geometry of the arm proves it. M[a, b] is the integral of v_a . v_b over the mass that joints a
 and b both move, where v_a is the velocity field for a unit velocity of joint a; the reasons are properties of this
 integral.
 
-Functions that return a reason return None if they find none. One reason may be valid for several entries of M. Its text
-names the joint that the entries have in common; the placeholder ``{joints}`` represents their other joints, ``{axes}``
-the axes of the other joints.
+Functions that return a reason return None if they find none. One reason may be valid for several entries of M with one
+joint in common, such as M[c, a] and M[c, b]. Its text then names joint c; the placeholder ``{joints}`` is replaced by
+joints a and b, and ``{axes}`` by their axes.
 """
 
 from collections.abc import Callable, Iterator, Sequence

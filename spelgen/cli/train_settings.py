@@ -1,4 +1,7 @@
-"""The options of `train`: `--set KEY=VALUE`, else the settings of the robot."""
+"""The options of the command `train`.
+
+A value given by `--set KEY=VALUE` takes precedence over the value in the settings of the robot.
+"""
 
 from __future__ import annotations
 

@@ -191,7 +191,9 @@ class ArmInputs(ComparedArm):
 def arm_inputs(
     arm: ComparedArm, folder: Path, splits: int = 1, progress: Progress | None = None
 ) -> ArmInputs:
-    """Return the input files of the runs on an arm. If the arm has no logs, simulate logs into the folder.
+    """Return the input files of the runs on an arm: URDF, mapping and logs.
+
+    If the arm has no logs, logs are simulated and written to ``folder``, together with the URDF that models may use.
 
     Raises the errors of `load_arm`, `load_mapping`, `read_logs` and `simulate`.
     """
@@ -217,10 +219,10 @@ def arm_inputs(
 
 
 def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress | None) -> None:
-    """Simulate logs by the protocol of the arm's settings, unless the folder already contains them.
+    """Simulate logs by the protocol of the arm's settings and write them to ``folder``, unless it contains them.
 
-    Models are built from a copy of the URDF without inertials, drives and friction, so that no model starts from the
-    true parameters.
+    A copy of the URDF without inertials, drives and friction is written, too. Models are built from this copy, so that
+    no model starts from the true parameters.
     """
     # The simulation needs Pinocchio, an optional dependency. A comparison on logs of the user does not need it, so the
     # import is in this function.

@@ -219,10 +219,18 @@ def predict(
     tip: TipPosition | None,
     notes: list[Diagnostic],
 ) -> tuple[Horizon, Predictions]:
-    """Return the errors at a horizon of `steps` samples, and the predicted states.
+    """Return the errors of all predictors at a horizon of `steps` samples, and the predicted states.
 
-    Each predictor is evaluated twice: open loop, and with the disturbance that a momentum observer estimates before the
-    prediction starts. name: name of the horizon.
+    All predictors are evaluated in open loop. Predictors that integrate dynamics are evaluated a second time with a
+    constant disturbance, which a momentum observer estimates from the samples before the prediction (see `observe`).
+
+    Args:
+        name: name of the horizon, such as "1 s".
+        steps: length of the horizon [samples].
+        logs: test logs.
+        predictors: the model and the baselines.
+        tip: position of the tip as a function of q; None if the tip is unknown.
+        notes: list to which a note is appended if the logs are too short for the observer.
     """
     past = past_steps(logs.rate)
     # If no trajectory is long enough for the observer and the horizon, only open-loop predictions are evaluated.

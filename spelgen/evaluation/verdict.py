@@ -61,7 +61,8 @@ def verdict(
     _assess_torques(results, uses)
     _assess_motion(results, uses)
     _assess_replays(results, uses)
-    # Without any error there is no assessment. This happens with --quick on logs without accelerations.
+    # If neither torques nor motion were evaluated, there is nothing to assess. This happens with --quick on logs
+    # without accelerations.
     if not uses.proofs:
         return Verdict("No verdict: no horizon and no torque was evaluated.", "")
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"

@@ -21,7 +21,14 @@ GRID_RATIO = cos(pi / TUNING.grid)
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion: q, qd and qdd, (T, n) each [rad, m, s], at times t (T,) [s], which start at 0."""
+    """A motion of n joints at T times.
+
+    Attributes:
+        t: (T,) times [s], which start at 0.
+        q: (T, n) positions [rad, m].
+        qd: (T, n) velocities [rad/s, m/s].
+        qdd: (T, n) accelerations [rad/s^2, m/s^2].
+    """
 
     t: np.ndarray
     q: np.ndarray

@@ -216,9 +216,10 @@ def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
 def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Outputs:
     """Return {entry point: Jacobians, (n, n) each} for the derivatives of inverse and forward dynamics.
 
-    Inverse dynamics are differentiated with respect to q and qd, forward dynamics with respect to q, qd and tau. The
-    Jacobian of forward dynamics with respect to q or qd is -M^-1 times the Jacobian of ``force``, evaluated at the
-    accelerations of the forward dynamics (Carpentier and Mansard, RSS 2018).
+    Inverse dynamics are differentiated with respect to q and qd, forward dynamics with respect to q, qd and tau. Let
+    ``force`` be the joint force M qdd + h + friction - compensation (see ``_expressions``). The Jacobian of forward
+    dynamics with respect to q or qd is -M^-1 times the Jacobian of ``force`` at the acceleration that forward dynamics
+    returns (Carpentier and Mansard, RSS 2018); the Jacobian with respect to tau is M^-1 G.
     """
     expressions = _expressions(model, inputs, residuals, derivatives=True)
     (force,), (mass,) = expressions["force"], expressions["mass_matrix"]

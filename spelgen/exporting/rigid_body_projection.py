@@ -139,8 +139,8 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
         """Return the cost plus the ridge penalty, ()."""
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
-        # For the bodies of the URDF all parameters are zero, so the ridge penalty is a sum of squares of the
-        # parameters.
+        # The parameters represent differences from the values in the URDF. The ridge penalty towards the URDF is
+        # therefore the sum of their squares.
         weights = torch.cat([parameter.flatten() for parameter in bodies.parameters()])
         distance: Tensor = (mass_error.square().sum() / model.n + gravity_error.square().sum()) / len(q)
         return distance + 0.5 * TUNING.ridge * weights.square().sum()

@@ -83,12 +83,14 @@ class SolverResult(Generic[Parameters]):
 class LeastSquaresProblem(Protocol[Parameters]):
     """Nonlinear least-squares problem, whose cost is computed from the residual of parameters x.
 
-    The solver passes the result of `residual` to `cost` and `normal_equations`. A problem whose residual is too large
-    for the memory returns the sums of squares per joint instead.
+    The solver passes the result of `residual` to `cost` and `normal_equations`, and does not use it otherwise.
     """
 
     def residual(self, x: Parameters) -> Tensor:
-        """Return the residual of T samples, (T, n), or its sum of squares per joint, (n,)."""
+        """Return the residual of n joints at x, (..., n).
+
+        A problem whose residual is too large for the memory returns the sum of squares per joint, (n,), instead.
+        """
 
     def cost(self, x: Parameters, residual: Tensor) -> float:
         """Return the cost at x, computed from the result of `residual` at x; infinite if the residual diverged."""

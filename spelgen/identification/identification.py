@@ -90,7 +90,9 @@ class Identification:
         """Return the joint torques (T, n) [Nm, N] of the identified arm.
 
         Args:
-            q, qd, qdd: (T, n) positions, velocities and accelerations [rad, m, s].
+            q: (T, n) positions [rad, m].
+            qd: (T, n) velocities [rad/s, m/s].
+            qdd: (T, n) accelerations [rad/s^2, m/s^2].
             z: (T, n, K) [rad, m] bristle states of a friction model with hysteresis; None for other friction models.
         """
         past = None if z is None else torch.from_numpy(z)

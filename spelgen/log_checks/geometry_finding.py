@@ -1,4 +1,7 @@
-"""Finding about a hypothesis that fits a log better than its mapping, with the settings that implement it."""
+"""The finding that a log fits the arm better with other settings, for example with other signs of joints.
+
+The finding names the settings that correct the log; if no settings can correct it, the finding has other advice.
+"""
 
 from collections.abc import Sequence
 
@@ -14,10 +17,10 @@ RIGHT = "joints, zeros, units and gravity as the URDF and the settings state the
 def geometry_finding(
     unchanged: HypothesisFit, best: HypothesisFit, corrections: Sequence[Correction]
 ) -> LogError | Diagnostic:
-    """Return the finding about a log for which another hypothesis fits better.
+    """Return the finding that the hypothesis of ``best`` explains a log better than the current settings.
 
-    It is an error, or a warning if an error of the URDF or of the mounting may be the reason: a small zero offset, a
-    small tilt, or a moderate factor on the torques.
+    The finding is an error. It is only a warning if an error of the URDF or of the mounting may be the reason: a small
+    zero offset, a small tilt, or a moderate factor on the torques.
 
     Args:
         unchanged: fit of the unchanged log.

@@ -70,7 +70,8 @@ def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     """Return an error for each joint with clipped torques; if there is none, a warning for each joint at a stop.
 
-    flat: flat tops of the unchanged log.
+    problem: least-squares problem of the logs. flat: flat tops of the logs as recorded, since a low-pass filter rounds
+    flat tops off.
     """
     problem, findings = problem.thinned(GEOMETRY.confirming_samples), Findings()
     samples = problem.unchanged.signals(problem.samples)

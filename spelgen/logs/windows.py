@@ -100,9 +100,10 @@ def cut_windows(
             tau = piece.tau[:-1]
             if measured:
                 tau = (tau + piece.tau[1:]) / 2
-            # The torques of a step are weighted by their time steps, which differ if the clock has jitter.
+            # A step of a window spans `decimation` sample intervals of the log. Its torque is the mean of the torques
+            # in these intervals, weighted by their durations, which differ if the clock has jitter.
             impulses = tau * np.diff(piece.t)[:, None]
-            # [Nm s, N s], (T - decimation, n)
+            # Integral of the torque over a step from each sample of the log, (T - decimation, n) [Nm s, N s].
             impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)
             dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
             columns = [(dt, window - 1), (piece.q, window), (piece.qd, window), (impulse / dt, window - 1)]

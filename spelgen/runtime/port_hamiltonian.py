@@ -121,7 +121,8 @@ class PortHamiltonian(nn.Module):
         cache = self.at(q, qd, tau)
         force = self.input_force(cache, qd, tau) - self.nonlinear_effects(cache, qd)
         force = force - self.friction_torque(cache, qd, *state)
-        return self.velocity(cache, force)  # `velocity` multiplies by M^-1
+        # `velocity` returns M^-1 p for a momentum p; for a force it returns the acceleration M^-1 force.
+        return self.velocity(cache, force)
 
     def inverse_dynamics(self, q: Position, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the input tau, (..., n), that gives qdd; state: friction state, if the model has one."""

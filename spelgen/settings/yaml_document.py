@@ -32,7 +32,7 @@ Checked = TypeVar("Checked", bound=BaseModel)
 
 @dataclass(frozen=True, eq=False)
 class YamlDocument:
-    """A YAML file. path: path of the file. root: root of the node tree of PyYAML; None for an empty file."""
+    """A parsed YAML file. path: path of the file. root: root of the node tree of PyYAML; None for an empty file."""
 
     path: Path
     root: yaml.Node | None
@@ -115,7 +115,11 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
 
 
 def read_document(path: Path) -> YamlDocument:
-    """Return a YAML file of at most 256 KiB with one document. Raises SettingsError for any other file."""
+    """Read and parse a YAML file; its keys and values are not yet validated.
+
+    Raises SettingsError if the file cannot be read, is larger than 256 KiB, is not valid YAML in UTF-8, has more than
+    one document, or contains a construct that `_Loader` does not permit.
+    """
     # The size is bounded, because larger files could exhaust the memory. Settings of 300 joints with all keys have
     # 60 kB.
     content = read_bytes(path, SettingsError, "a YAML file", 256 * 1024)

@@ -176,7 +176,8 @@ def _mass_changes(
 ) -> np.ndarray:
     """Return, for each coordinate, the root mean square change of M if only this coordinate changes, (n,).
 
-    The mean is over samples and entries; changes of entries are divided by typical magnitudes and have no unit.
+    In each sample, the coordinate is replaced by its value in the preceding sample. Each change of an entry is divided
+    by the typical magnitude of the entry, so that it has no unit. The mean is over samples and entries.
 
     Args:
         arm: the arm.

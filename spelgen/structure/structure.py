@@ -58,7 +58,7 @@ class Structure:
         return f"<Structure of {len(self.joints)} joints ({self.assume} used): {terms}, {base}>"
 
     def outputs_from(self, first: int) -> int:
-        """Return the number of outputs that depend only on coordinates from ``first`` (0-based) to the tip."""
+        """Return the number of outputs (varying terms of M) that depend on none of the first ``first`` coordinates."""
         return sum(not output.joints or min(output.joints) >= first for output in self.outputs)
 
 

@@ -157,9 +157,10 @@ class ServoProblem:
         descent = torch.zeros(count, p * n + r).double()
         for joint in range(n):
             # The errors of a joint depend only on its p parameters and on the r parameters that all joints share.
+            # `jacobian` has the derivatives of its K' errors in each window, (W, p + r, K').
             jacobian = torch.cat([of_joints[..., joint], of_shared[..., joint]]).transpose(0, 1)
             rows = torch.cat([torch.arange(p) * n + joint, p * n + torch.arange(r)])
-            weighted = jacobian * weights[:, None, :, joint]  # (W, p + r, K')
+            weighted = jacobian * weights[:, None, :, joint]
             curvature[:, rows[:, None], rows] += weighted @ jacobian.mT
             descent[:, rows] -= (weighted @ errors[..., joint].unsqueeze(-1)).squeeze(-1)
         return NormalEquations(curvature, descent)

@@ -299,8 +299,8 @@ def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
         result = problem.minimize(state, TUNING.iteration_steps)
         state, covariance = result.state, problem.covariance(result.normal_equations.curvature)
         previous, problem = problem, problem.updated(state, covariance)
-        # Convergence is not tested after the first update, since the initial noise may be of other samples or of
-        # another model.
+        # Convergence is not tested after the first update, since the initial noise may have been estimated from other
+        # samples or with another model.
         if number and (problem.noise > TUNING.noise_converged * previous.noise).all():
             break
     return TorqueEstimate(problem, state, covariance)
@@ -311,7 +311,7 @@ def refine(
 ) -> TorqueEstimate:
     """Return the estimate for other samples or linear terms, refitted with ``estimate`` as the warm start."""
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
-    # The noise is estimated again, since the noise of ``estimate`` is of other samples or terms.
+    # The noise of ``estimate`` is not used, since it was estimated from other samples or with other linear terms.
     noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
     return alternate(replace(estimate.problem, noise=noise), estimate.state)
 

@@ -13,10 +13,16 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 
 
 class SampleBlock(NamedTuple):
-    """T samples: q, qd, qdd [rad, m, s] and tau as logged [Nm, N], all (T, n).
+    """T samples of n joints.
 
-    z: (T, n, K) [rad, m], friction state with K bristles per joint. direction: (T, n), direction of motion between -1
-    and 1, with which rate-only dry friction is computed (see `DynamicsSamples`). Both are None if unknown.
+    Attributes:
+        q: (T, n) positions [rad, m].
+        qd: (T, n) velocities [rad/s, m/s].
+        qdd: (T, n) accelerations [rad/s^2, m/s^2].
+        tau: (T, n) torques as logged [Nm, N].
+        z: (T, n, K) states of the K friction bristles of each joint [rad, m]; None if unknown.
+        direction: (T, n) smooth sign of the velocity, between -1 and 1: the factor of dry friction without bristles
+            (see `DynamicsSamples`); None if unknown.
     """
 
     q: torch.Tensor
@@ -36,6 +42,7 @@ class TorqueSamples:
     """Concatenated samples of all trajectories.
 
     Attributes:
+        columns: the samples.
         original_count: number of samples before decimation and subsampling.
         interval: time between successive samples [s].
         recordings: (T,), index of the recording to which each sample belongs.

@@ -188,7 +188,7 @@ def _better(first: SelectedTerm | None, other: SelectedTerm) -> SelectedTerm:
 
 
 def _blocks(count: int) -> list[slice]:
-    """Return the slices of ten contiguous blocks of `count` samples, one per fold."""
+    """Return the slices that divide `count` samples into contiguous blocks, one block per fold."""
     edges = torch.linspace(0, count, SELECTION.folds + 1).long().tolist()
     return [slice(start, stop) for start, stop in pairwise(edges)]
 
@@ -232,7 +232,7 @@ def _cross_validate(
 
 
 def block_squares(values: torch.Tensor) -> torch.Tensor:
-    """Return the sum of the squared values (T, ...) of each of ten contiguous blocks, (folds,)."""
+    """Return the sum of squares of each block, (folds,), for values (T, ...) divided into blocks by `_blocks`."""
     squares = [values[block].square().sum() for block in _blocks(len(values))]
     return torch.stack(squares)
 

@@ -38,12 +38,12 @@ class TorqueTuning:
     # torque offsets it is three times the typical friction. Logs that need more are of another arm than the URDF, or
     # not in Nm.
     max_width: float = 3.0
-    # [1] Largest number of outer iterations; each makes solver steps and then estimates noise and prior.
+    # [1] Largest number of outer iterations; each makes Levenberg-Marquardt steps and then updates noise and prior.
     iterations: int = 20
     # [1] Evidence, twice the logarithm of a likelihood ratio, that counts as strong (Kass and Raftery, J. Am. Stat.
     # Assoc. 90:773, 1995).
     strong_evidence: float = 6.0
-    # [1] Largest number of solver steps after noise annealing, before noise and prior are estimated.
+    # [1] Largest number of Levenberg-Marquardt steps after noise annealing, before the first update of noise and prior.
     initial_steps: int = 60
     # [1] Largest number of iterations of noise annealing, which lowers the noise to the least-squares noise.
     annealing_iterations: int = 12
@@ -52,9 +52,10 @@ class TorqueTuning:
     annealing_fraction: float = 0.03
     # [1] The noise has converged if its ratio to the noise of the previous iteration exceeds this value.
     noise_converged: float = 0.98
-    # [1] Largest number of steps in an outer iteration.
+    # [1] Largest number of Levenberg-Marquardt steps between two updates of the noise, in an outer iteration or in an
+    # iteration of noise annealing.
     iteration_steps: int = 5
-    # [1] An outer iteration ends if a step decreases the cost by less than this fraction.
+    # [1] Levenberg-Marquardt steps end early if a step lowers the cost by less than this fraction.
     min_relative_decrease: float = 1e-4
     # [1] Number of alternations between the fits of rigid bodies and of residual terms.
     alternations: int = 3
