@@ -35,7 +35,7 @@ class BristleReach:
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
-    """Return the typical break-away displacements of the joints.
+    """Return the typical break-away displacements of n joints, (n, K) for K bristles.
 
     kinds: type of each joint (revolute or prismatic). motors: see `BristleReach`.
     """

@@ -63,12 +63,14 @@ def drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[Ar
     ]
 
     def constants(model: ArmModel) -> Tensor:
+        """Return the constants of drives that are given torques, (4 or 5, n), in the order of `TORQUE_UNITS`."""
         rows = [model.armature, *line(model), model.torque_offset]
         if gains and isinstance(model.inputs, MotorInputs):
             rows.append(model.inputs.gains().sum(dim=1))
         return torch.stack(rows)
 
     def ratios(model: ArmModel) -> Tensor:
+        """Return the quantities of position servos, (8, n), in the order of `SERVO_UNITS`."""
         servo, kp = model.servo, model.servo.kp()
         damping, dry = servo.kd() / kp, line(model)[1] / kp
         return torch.stack([
@@ -100,6 +102,7 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 
     def line_of(model: ArmModel) -> Tensor:
+        """Return viscous and Coulomb friction coefficients, (2, n), of a model with the same bodies."""
         friction = model.friction
         speed = torch.from_numpy(speeds)[:, None] * friction.speed
         slope, intercept = line @ (factor * friction.prepare().torque(speed[:, None], load)).mean(dim=1)

@@ -218,7 +218,7 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
 
 
 def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> Tensor:
-    """Return `rollout_errors` without gradients; NaN if the rollout diverges."""
+    """Return `rollout_errors`, (W, K-1, 2n), without gradients; NaN if the rollout diverges."""
     try:
         with torch.no_grad():
             return rollout_errors(model, windows, scales, substeps)
@@ -232,8 +232,8 @@ def integration_error(coarse: Tensor, fine: Tensor) -> float:
     The integration error is the difference from a rollout with half the step size.
 
     Args:
-        coarse: `rollout_errors` of the rollout.
-        fine: `rollout_errors` of the rollout with half the step size.
+        coarse: `rollout_errors` of the rollout, (W, K-1, 2n).
+        fine: `rollout_errors` of the rollout with half the step size, (W, K-1, 2n).
     """
     model_error = max(fine.square().mean().sqrt().item(), TUNING.min_model_error)
     error = (coarse - fine).square().mean().sqrt().item() / model_error

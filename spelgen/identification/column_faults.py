@@ -97,6 +97,7 @@ class WrongScale(Fault):
     """
 
     def __init__(self, factors: Sequence[np.ndarray]) -> None:
+        """Define the candidates, (2, n) each."""
         self.factors = factors
 
     @abstractmethod

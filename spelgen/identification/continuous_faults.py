@@ -39,6 +39,7 @@ class ZeroOffset(Fault):
         min_offset = GEOMETRY.min_angle if is_revolute else GEOMETRY.min_shift
 
         def shifted(values: np.ndarray) -> Hypothesis:
+            """Return the hypothesis with another offset of the joint; values: change, (1,) [rad, m]."""
             return reading.changed(self, offset=reading.offset + values * unit)
 
         starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if is_revolute else np.zeros((1, 1))
@@ -102,6 +103,7 @@ class Delay(Fault):
         for signals in _delayed_signals(len(reading.offset)):
 
             def delayed(delay: np.ndarray, signals: np.ndarray = signals) -> Hypothesis:
+                """Return the hypothesis in which the signals in a mask (2, n) have this delay, (1,) [s]."""
                 return reading.changed(self, delay=reading.delay + delay * signals)
 
             # a step from 0 would be too short for noisy torques, whose derivative is mostly noise
@@ -179,6 +181,7 @@ class JointClock(Fault):
     def _best(
         self, problem: GeometryProblem, reading: Hypothesis, start: np.ndarray, signals: np.ndarray
     ) -> Iterator[HypothesisFit]:
+        """Yield the fit with the best delays (2,) at the start and the end, from `start`, if they differ enough."""
         delays, best = problem.descend(
             lambda x: self._drifting(problem, reading, x, signals), start, largest=0.3, smallest=0.002
         )
@@ -239,6 +242,7 @@ class Compensation(Fault):
             return
 
         def reduced(fraction: np.ndarray) -> Hypothesis:
+            """Return the hypothesis that this fraction, (1,), of gravity is in the torques."""
             return with_gravity(self, base, fraction * present)
 
         without = problem.fit(reduced(np.zeros(1)))
@@ -276,9 +280,11 @@ class Gravity(Compensation):
         standard = size or 9.81  # m/s^2
 
         def turned(gravity: np.ndarray) -> Hypothesis:
+            """Return the hypothesis with this vector of gravity, (3,) [m/s^2]."""
             return with_gravity(self, base, gravity)
 
         def normalised(gravity: np.ndarray) -> np.ndarray:
+            """Return the vector of the present magnitude in the direction of `gravity`, (3,) [m/s^2]."""
             return np.asarray(gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9))
 
         # gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as

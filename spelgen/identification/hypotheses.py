@@ -51,6 +51,7 @@ class MotionSamples:
 
     @property
     def _central(self) -> np.ndarray:
+        """Signals (S, n, 4) at the times of the samples."""
         return self.values[..., self.values.shape[3] // 2]
 
     def at(self, delays: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ class DelayLine:
         self.samples: list[tuple[float, np.ndarray]] = []
 
     def step(self, t: float, values: np.ndarray) -> np.ndarray:
-        """Add values at time t [s]; return the values ``delay`` seconds before, or the oldest ones."""
+        """Add values, (3, n), at time t [s]; return the values ``delay`` seconds before, or the oldest values."""
         samples, past = self.samples, t - self.delay
         if not samples or t - samples[-1][0] >= self.delay / TUNING.delay_samples:
             samples.append((t, values))
