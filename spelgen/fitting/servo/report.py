@@ -233,7 +233,8 @@ def servo_summary(record: Content | None) -> FitSummary | None:
     if record is None:
         return None
     columns = [ratio for ratio in RATIOS if any(ratio in joint for joint in record["joints"])]
-    rows, open_ratios = [], []
+    rows: list[tuple[str, ...]] = []
+    undetermined: dict[str, list[str]] = {}
     for joint in record["joints"]:
         cells = []
         for column in columns:
@@ -246,15 +247,17 @@ def servo_summary(record: Content | None) -> FitSummary | None:
                 cells.append(f"{number(interval['value'])} +- {width:.2g} %")
             else:
                 cells.append("open")
-                open_ratios.append((column, joint["joint"]))
+                # The dead zone is not named, since dry friction of the same joint is then undetermined and named.
+                if column != "dead_zone":
+                    undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
-    listing = Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
-    # An undetermined dead zone is not named, since dry friction of the same joint is then undetermined and named.
-    names = [f"{RATIOS[column][0]} of {joint}" for column, joint in open_ratios if column != "dead_zone"]
-    end = f"Not determined by these logs: {', '.join(names)}" if names else "All ratios are determined"
+    end = "All ratios are determined"
+    if undetermined:
+        groups = [f"{ratio} of {', '.join(joints)}" for ratio, joints in undetermined.items()]
+        end = f"Not determined by these logs: {'; '.join(groups)}"
+    listing = Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}. {end}.")
     delay = f"{1000 * record['delay']['value']:.1f} ms, +- {1000 * record['delay']['half']:.1f} ms"
     errors = ", ".join(number(1000 * rms) for rms in record["rms"])
-    text = f"delay {delay}\nerrors on training windows, RMS by joint: {errors} mrad\n{listing.text()}\n{end}"
-    listing = replace(listing, note=f"{listing.note} {end}.")
+    text = f"delay {delay}\nerrors on training windows, RMS by joint: {errors} mrad\n{listing.text()}"
     return FitSummary(text, listing, (delay, "delay of the commands"))
