@@ -158,7 +158,7 @@ def test_names_are_unique_across_files(tmp_path):
 def test_what_cannot_be_written_is_told(tmp_path):
     for path, logs, message in (
         ("x.txt", [swing()], "got a log named 'x.txt', expected .parquet or .csv"),
-        ("x.csv", [], f"{tmp_path}/x.csv: got no trajectory, expected at least one"),
+        ("x.csv", [], "got no trajectory, expected at least one"),
         ("x.csv", [swing()], "trajectory swing: got 2 joints, expected 3: a, b, c"),
     ):
         with pytest.raises(LogError) as caught:
