@@ -109,7 +109,7 @@ def _beginning(file: Path) -> Beginning:
     """
     encoding, head = _decoded_head(file)
     lines = head.lstrip("\ufeff").splitlines() or [""]
-    # Names of columns may contain spaces, and numbers decimal commas: these are the delimiter if nothing else is.
+    # Names of columns may contain spaces, and numbers decimal commas, so spaces and commas are tried last.
     for delimiter in "\t;|, ":
         cells = [
             _cells(line[match.end() :] if (match := COMMENT.match(line)) else line, delimiter)

@@ -35,7 +35,7 @@ COMMANDED = {
     "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
     "demand", "planned", "ipo",
 }  # fmt: skip
-# Words of signals that are not measured at the joints.
+# Words in names of signals other than measured joint signals.
 NOT_MEASURED = COMMANDED | {
     "error",
     "std",
@@ -279,7 +279,7 @@ def _first_list(column: pa.ChunkedArray) -> list[object]:
 def _of_one_signal(columns: Sequence[ColumnName], joints: Sequence[str]) -> Sequence[ColumnName]:
     """Return the columns of one of the signals of a quantity that a log contains for all joints.
 
-    Columns of a signal have the same words besides those of the joint. Torques are preferred to currents, and names
+    Names of a signal's columns differ only in the words of the joint. Torques are preferred to currents, and names
     with few words to longer ones: `tau_J` to `tau_ext_hat_filtered`. All columns are returned if no signal has a column
     for each joint.
     """

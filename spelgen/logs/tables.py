@@ -137,7 +137,7 @@ def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
 def stored_names(name: str, columns: Collection[str]) -> list[str]:
     """Return the file's columns from which a column of a mapping is computed; [] if one of them is absent.
 
-    These are the column itself, a column of lists (see `list_element`), or for a name "sec + nsec" two columns.
+    The result is the column itself, a column of lists (see `list_element`), or for a name "sec + nsec" both columns.
     columns: names of the table's columns.
     """
     element = list_element(name, columns)

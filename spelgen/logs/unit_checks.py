@@ -79,7 +79,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         registers = signals.qd / mapping.scale("qd", joint)
         if is_far or not (registers == registers.round()).all():
             return message if is_far else None
-        message += ", whole numbers of an unknown unit, such as those of a register"
+        message += ", whole numbers of an unknown unit, such as register values"
         return Advice(message, keys={"velocity": "differentiated"})
     units = " and ".join(f"{name} in {unit}" for name, unit in keys.get("units", {}).items())
     return Advice(f"{message}: {units}", keys) if keys else None
