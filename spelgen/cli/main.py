@@ -5,6 +5,7 @@ A command imports its modules when it runs, so that `spelgen --help` is fast and
 
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -123,6 +124,8 @@ def main() -> None:
     # OMP_NUM_THREADS is set before BLAS and torch are imported, because both read the variable only once. One thread
     # makes runs deterministic, and is fastest for small matrices.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # A termination ends a command as Ctrl-C does: unfinished files are removed.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     for stream in (sys.stdout, sys.stderr):
         # Names from a file may contain characters that the encoding of the terminal does not have.
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
