@@ -928,7 +928,7 @@ def test_vectors_of_matlab_and_conversions_of_other_files(tmp_path, monkeypatch)
         with pytest.raises(LogError, match="; convert it: ") as caught:
             read_logs(name, JOINTS)
         command = str(caught.value).split("convert it: ")[1].replace("python", sys.executable)
-        subprocess.run(command.replace("NAMES,OF,THE,COLUMNS", ",".join(columns())), shell=True, check=True)
+        subprocess.run(command.replace("NAMES", ",".join(columns())), shell=True, check=True)
         check(read_logs(log, JOINTS)[0], log[0])
     np.savez("x.npz", data=np.column_stack([T, Q, QD, TAU]))
     joints = {

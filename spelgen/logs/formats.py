@@ -8,34 +8,28 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
-import numpy as np
-import pyarrow as pa
-
 from spelgen.errors import LogError, SpelgenError
 from spelgen.files import local, require_regular_file
-from spelgen.logs.tables import Layout, LogFormat, LogTable, reading, stored_names
+from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
 
 LogPaths = Path | str | Iterable[Path | str]
 """Paths of log files and of folders with logs, or their addresses (see `local`)."""
 
 _PYTHON = 'python -c "import {}"'
-_HDF5 = _PYTHON.format(
-    "h5py, numpy; d = {{}}; h5py.File('{0}').visititems(lambda k, x: d.update({{k: x[()]}}) "
-    "if isinstance(x, h5py.Dataset) else None); numpy.savez('{1}.npz', **d)"
-)
-# {suffix: command that makes a log of a file of this kind}; {0} is the file's name, {1} the name without the suffix.
+# {suffix: command that makes a log of a file of this kind}; {0} is its path, {1} the path without the suffix.
 CONVERT = {
     ".zstd": "zstd -d {0}", ".zst": "zstd -d {0}", ".gz": "gunzip {0}", ".xz": "unxz {0}", ".bz2": "bunzip2 {0}",
-    ".txt": "mv {0} {1}.csv", ".dat": "mv {0} {1}.csv", ".asc": "mv {0} {1}.csv",
+    **dict.fromkeys((".txt", ".dat", ".asc"), "mv {0} {1}.csv"),
     ".xlsx": _PYTHON.format("pandas; pandas.read_excel('{0}').to_csv('{1}.csv', index=False)"),
     ".pkl": _PYTHON.format("pandas; pandas.read_pickle('{0}').reset_index().to_parquet('{1}.parquet')"),
     ".json": _PYTHON.format("pandas; pandas.read_json('{0}').to_parquet('{1}.parquet')"),
-    ".npy": _PYTHON.format(
-        "numpy; numpy.savetxt('{1}.csv', numpy.load('{0}'), delimiter=',', header='NAMES,OF,THE,COLUMNS')"
-    ),
+    ".npy": _PYTHON.format("numpy; numpy.savetxt('{1}.csv', numpy.load('{0}'), delimiter=',', header='NAMES')"),
     ".mat": _PYTHON.format("numpy, scipy.io; numpy.savez('{1}.npz', **scipy.io.loadmat('{0}'))"),
-    ".h5": _HDF5, ".hdf5": _HDF5,
+    **dict.fromkeys((".h5", ".hdf5"), _PYTHON.format(
+        "h5py, numpy; d = {{}}; h5py.File('{0}').visititems(lambda k, x: d.update({{k: x[()]}}) "
+        "if isinstance(x, h5py.Dataset) else None); numpy.savez('{1}.npz', **d)"
+    )),
 }  # fmt: skip
 
 
@@ -76,15 +70,7 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[
     log_format = format_of(path)
     assert log_format is not None, "log_files gives logs alone"
     with reading(path):
-        return [_with_times(layout, table) for layout, table in log_format.read(path, joints, mapping)]
-
-
-def _with_times(layout: Layout, table: pa.Table) -> LogTable:
-    """Return a table with a column of row numbers as times, if the mapping's `sample_rate` makes one superfluous."""
-    if not stored_names(layout.columns[0], table.schema.names):
-        rate = layout.mapping.sample_rate or 1.0
-        table = table.append_column(layout.columns[0], pa.array(np.arange(table.num_rows) / rate))
-    return layout, table
+        return log_format.read(path, joints, mapping)
 
 
 def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], list[SpelgenError]]:

@@ -87,11 +87,8 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 def npz_columns(file: Path) -> pa.Table:
     """Return a table of all arrays with as many rows as the longest one; matrices become columns of lists."""
     arrays = NpzArrays(file)
-    lengths = {
-        name: arrays[name].size if arrays.is_vector(name) else len(arrays[name])
-        for name in arrays.names
-        if arrays[name].ndim in (1, 2)
-    }
+    names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
+    lengths = {name: arrays[name].size if arrays.is_vector(name) else len(arrays[name]) for name in names}
     samples = max(lengths.values(), default=0)
     columns = [name for name, length in lengths.items() if length == samples]
     return pa.table({name: arrays.column(name, is_list=not arrays.is_vector(name)) for name in columns})
@@ -146,11 +143,8 @@ def _with_matrix_columns(
     if matrix not in arrays.names or arrays[matrix].ndim < 2:
         return mapping
     if arrays[matrix].ndim > 2:
-        got, do = (
-            f"an array of shape {arrays[matrix].shape}",
-            "store an array per recording, such as q_1, q_2",
-        )
-        raise arrays.error(matrix, got, "a row per time and a column per joint", do)
+        got, expected = f"an array of shape {arrays[matrix].shape}", "a row per time and a column per joint"
+        raise arrays.error(matrix, got, expected, "store an array per recording, such as q_1, q_2")
     names = [mapping.log_name(joint) for joint in joints]
     column_of = dict(zip(names, _matrix_columns(arrays, matrix, names), strict=True))
     columns: dict[str, dict[str, str | None]] = {}

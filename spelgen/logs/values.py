@@ -11,7 +11,7 @@ import pyarrow.compute
 
 from spelgen.errors import LogError
 from spelgen.logs.jumps import signed
-from spelgen.logs.tables import Layout, list_element
+from spelgen.logs.tables import Layout, list_element, stored_names
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import TIMES
 
@@ -167,10 +167,12 @@ def _numbers(texts: Column) -> np.ndarray:
 def _column(table: pa.Table, name: str) -> Column:
     """Return a column, or for a name like `position[2]` the element 2 of each list in the column `position`.
 
-    A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is the sum of these two columns.
+    A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is the sum of these two columns. Row
+    numbers replace absent times, which the mapping's `sample_rate` makes superfluous.
     """
-    if name not in table.schema.names and " + " in name:
-        return stamps(*map(table.column, name.split(" + ")))
+    stored = stored_names(name, table.schema.names)
+    if len(stored) != 1:
+        return stamps(*map(table.column, stored)) if stored else pa.array(np.arange(len(table), dtype=float))
     element = list_element(name, table.schema.names)
     if element is None:
         return table.column(name)
