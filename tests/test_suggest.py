@@ -70,6 +70,7 @@ PUBLIC = {
                   "tau_ext_hat_filtered[{}]"),
     "RTDE": ("timestamp", "actual_q_{}", "actual_qd_{}", "actual_moment_{}", "target_q_{} target_moment_{} "
              "actual_current_{} actual_TCP_speed_{} actual_TCP_force_{}"),
+    "set and actual": ("t", "q_act_{}", "dq_act_{}", "trq_{}", "q_set_{} I_act_{} friction_trq_{} gravity_trq_{}"),
     "FRI": ("sec nsec", "measured_position_{}", "measured_speed_{}", "measured_torque_{}", "ipo_position_{} "
             "commanded_position_{} commanded_torque_{} external_torque_{}"),
     "Kortex": ("ts", "actuators[{}].position", "actuators[{}].velocity", "actuators[{}].torque", ""
@@ -87,6 +88,16 @@ def test_of_several_signals_of_a_quantity_the_measured_one_of_the_joints_is_take
     rest = np.random.default_rng(1).normal(size=(len(T), 4 * (len(names) - 3)))
     rows = np.column_stack([times, Q, QD, TAU, rest])
     require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+def test_joints_named_by_words_of_other_signals(scara, tmp_path):
+    text = (scara.robot.path).read_text()
+    for k, name in enumerate(("tool_joint", "set_joint", "target_slide", "ee")):
+        text = text.replace(f'"joint{k + 1}"', f'"{name}"')
+    (tmp_path / "arm.urdf").write_text(text)
+    arm = load_arm(tmp_path / "arm.urdf")
+    head = ["t", *(f"{x}_{name}" for x in ("q", "qd", "tau") for name in arm.chain.joint_names)]
+    require_same(suggested(written(tmp_path / "log.csv", head, np.column_stack([T, Q, QD, TAU])), arm)[0])
 
 
 def test_columns_of_pandas_with_a_date_as_index(scara, tmp_path):

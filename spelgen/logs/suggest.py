@@ -33,21 +33,13 @@ WORDS = {
 # Words that distinguish the names of commanded values from the names of measured values.
 COMMANDED = {
     "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
-    "demand", "planned", "ipo",
+    "demand", "planned", "ipo", "set", "soll",
 }  # fmt: skip
 # Words in names of signals other than measured joint signals.
 NOT_MEASURED = COMMANDED | {
-    "error",
-    "std",
-    "external",
-    "ext",
-    "tcp",
-    "ee",
-    "eef",
-    "cartesian",
-    "tool",
-    "contact",
-}
+    "error", "std", "external", "ext", "tcp", "ee", "eef", "cartesian", "tool", "contact", "gravity", "friction",
+}  # fmt: skip
+MEASURED = {"actual", "act", "measured", "meas", "present", "feedback", "fb", "ist"}
 # For each quantity: units as written in column names, in lower case, and the corresponding units of a mapping.
 UNITS = {
     "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "ns": "ns"},
@@ -196,7 +188,7 @@ def _by_quantity(
     The name of a joint in a column's name does not mark commands, even if it is a word such as "d" or "target".
     """
     by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
-    names = {joint.lower() for joint in joints}
+    names = set().union(*(_column_name(joint, set()).words for joint in joints))
     for column in columns:
         quantity = next((x for x, words in WORDS.items() if column.words & words), None)
         if quantity is None:
@@ -279,20 +271,20 @@ def _first_list(column: pa.ChunkedArray) -> list[object]:
 def _of_one_signal(columns: Sequence[ColumnName], joints: Sequence[str]) -> Sequence[ColumnName]:
     """Return the columns of one of the signals of a quantity that a log contains for all joints.
 
-    Names of a signal's columns differ only in the words of the joint. Torques are preferred to currents, and names
-    with few words to longer ones: `tau_J` to `tau_ext_hat_filtered`. All columns are returned if no signal has a column
-    for each joint.
+    Names of a signal's columns differ only in the words of the joint. Torques are preferred to currents, names with a
+    word such as "actual" to others, and names with few words to longer ones: `tau_J` to `tau_hat_filtered`. All columns
+    are returned if no signal has a column for each joint.
     """
     signals: dict[frozenset[str], list[ColumnName]] = {}
     for column in columns:
         joint = max((x for x in joints if names_joint(column.name, x)), key=len, default="")
         signals.setdefault(frozenset(column.words - _column_name(joint, set()).words), []).append(column)
     complete = [
-        (bool(words & CURRENT), len(words), named)
+        ((bool(words & CURRENT), not words & MEASURED, len(words)), named)
         for words, named in signals.items()
         if len(named) >= len(joints)
     ]
-    return min(reversed(complete), key=itemgetter(0, 1), default=(False, 0, columns))[-1]
+    return min(reversed(complete), key=itemgetter(0), default=((), columns))[1]
 
 
 def _by_joint(
