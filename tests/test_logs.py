@@ -22,6 +22,7 @@ from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.tuning import shows_accelerations
 from spelgen.logs.windows import cut_windows, split_validation
+from spelgen.settings.log_mapping import LogMapping
 
 JOINTS = ("a", "b")
 
@@ -300,6 +301,13 @@ def test_registers_get_no_unit_by_chance_but_the_lines_that_read_them(tmp_path):
         with pytest.raises(LogError, match=expected):
             check(read_logs(tmp_path / "x.parquet", JOINTS, mapping), JOINTS, ("revolute", "revolute"))
     found = read_logs(tmp_path / "x.parquet", JOINTS, counts | {"velocity": "differentiated"})
+    few = replace(
+        log, q=np.round(2048 + 0.05 * log.q * 4096 / 2 / np.pi), mapping=LogMapping(velocity="differentiated")
+    )
+    with pytest.raises(
+        LogError, match=r"counts of an encoder need 'counts_per_turn'\), expected .*; write 'units' under"
+    ):
+        check([few], JOINTS, ("revolute", "revolute"))
     assert check(found, JOINTS, ("revolute", "revolute")) == []
     np.testing.assert_allclose(found[0].q, log.q, atol=1e-3)
 

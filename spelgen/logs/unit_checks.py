@@ -89,7 +89,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     """Yield (distance, settings of the joint) for all combinations of units of q and qd that the mapping permits.
 
     The distance is |log r|, with r the ratio of dq/dt to qd in these units, plus a penalty for units other than SI.
-    is_far: True if the range of q is more than two turns; combinations with such a range are then omitted.
+    is_far: True if the range of q is more than two turns; combinations in which q exceeds two turns are then omitted.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
     # The ratio r is known only if velocities were logged and are proportional to dq/dt. If it is unknown, only the
@@ -115,7 +115,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
         scale = SCALES.get(q, 1.0)
         units = {name: x for name, x in (("q", q), ("qd", qd)) if x in SCALES}
         distance = abs(log(signals.factor * scale / SCALES.get(qd, 1.0))) if is_known else 0.0
-        if not is_far or np.ptp(signals.q) * scale <= TURNS:
+        if not is_far or np.abs(signals.q).max() * scale <= TURNS:
             yield distance + 0.02 * len(units), {"units": units} if units else {}
     for counts in (2 ** np.arange(10, 21)).tolist() if is_known and "turns" in positions else ():
         distance = abs(log(signals.factor * 2 * np.pi / counts)) + 0.02
