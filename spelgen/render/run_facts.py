@@ -14,8 +14,7 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.parameters import used_parameter_count
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import SpelgenError, shortened
-from spelgen.evaluation.measurements import Verdict
-from spelgen.evaluation.results import Results
+from spelgen.evaluation.results import Results, Verdict
 from spelgen.evaluation.tables import figures
 from spelgen.evaluation.verdict import Limits
 from spelgen.fitting.posterior import Posterior, posterior_of
