@@ -70,19 +70,9 @@ class Trained:
         return entry_points(self.described, self.entries)
 
     @property
-    def robot(self) -> str:
-        """The name of the robot in the URDF."""
-        return self.arm.chain.name
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """The names of the joints in the URDF."""
-        return self.arm.chain.joint_names
-
-    @property
     def tip(self) -> str:
         """The name of the tip link."""
-        return self.arm.tip or last_link(self.arm.robot, self.joint_names)
+        return self.arm.tip or last_link(self.arm.robot, self.arm.chain.joint_names)
 
     def prepared(self) -> PreparedModel:
         """Return the copy of the model from which ONNX and torch programs are made.

@@ -101,14 +101,15 @@ def _use(package: str, name: str, *, controller: bool) -> str:
 def _controller_numbers(trained: Trained) -> dict[str, object]:
     """Return {variable of the templates: C++ or YAML text} with names, limits and the pose of the tip."""
     model, coordinates = trained.described, trained.arm.chain.coordinates
+    names = trained.arm.chain.joint_names
     revolute = np.array([joint.joint_type == "revolute" for joint in coordinates])
     continuous = [str(joint.continuous).lower() for joint in coordinates]
     rotation = (f"{{{_listed(row)}}}" for row in model.tip.pose[:3, :3])
     return {
-        "joint_names": ", ".join(map(cpp_string, trained.joint_names)),
+        "joint_names": ", ".join(map(cpp_string, names)),
         # A JSON string is also a valid YAML string.
-        "yaml_joints": ", ".join(map(json.dumps, trained.joint_names)),
-        "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in trained.joint_names),
+        "yaml_joints": ", ".join(map(json.dumps, names)),
+        "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in names),
         # An effort limit that the URDF does not specify is 0; the user must set it.
         "efforts": _listed(joint.effort or 0.0 for joint in coordinates),
         "velocities": _listed(_velocity_limit(joint.velocity) for joint in coordinates),

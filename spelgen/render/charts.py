@@ -174,19 +174,11 @@ Mark = Line | Band
 
 
 @dataclass(frozen=True)
-class LegendEntry:
-    """An entry of a legend: CSS classes of the mark, and the label of the mark."""
-
-    style: str
-    label: str
-
-
-@dataclass(frozen=True)
 class Chart:
-    """A chart: an SVG element, and the legend of its visible marks."""
+    """A chart: an SVG element, and its legend: CSS classes and label of each visible mark."""
 
     svg: str
-    legend: tuple[LegendEntry, ...]
+    legend: tuple[tuple[str, str], ...]
 
     def __html__(self) -> str:
         """Return the SVG element; templates call this method to insert it without escaping."""
@@ -235,7 +227,7 @@ def line_chart(
     for mark in marks:
         inside = y_axis.contains(_shown([mark.heights], log))
         if inside.any():
-            legend.append(LegendEntry(f"{mark.shape} {mark.style}", mark.label))
+            legend.append((f"{mark.shape} {mark.style}", mark.label))
         if mark.shape == "line" and not inside.all():
             beyond.append(mark.label)
     svg = render(
