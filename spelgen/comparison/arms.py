@@ -1,20 +1,18 @@
 """The arms, models and logs of a comparison, which is specified by a URDF with options, or by a YAML file."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Self
 
 import numpy as np
 import yaml
 from lxml import etree
 from pydantic import Field, StringConstraints
 
-from spelgen.arm.configured_arm import load_arm
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.design import PRESET_NAMES, Design, load_design
 from spelgen.errors import LogError, RunError, SettingsError, collect, suggestion
 from spelgen.files import read_json, remove, write_bytes, write_json, write_text
@@ -27,10 +25,6 @@ from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group
 from spelgen.settings.yaml_document import Location, dotted, read_document, validated
-
-if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import Arm
-
 
 YAML = (".yaml", ".yml")
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,60}$")]
@@ -56,7 +50,7 @@ class ComparedArm(Group):
         if self.mapping is not None:
             yield "mapping", self.mapping
 
-    def in_folder(self, folder: Path) -> ComparedArm:
+    def in_folder(self, folder: Path) -> Self:
         """Return the arm with its relative paths resolved against a folder."""
         mapping = None if self.mapping is None else folder / self.mapping
         data = tuple(folder / path for path in self.data)

@@ -1,7 +1,5 @@
 """The assessment of an evaluation in words: suitable uses, failures, and the motions to record next."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,13 +1,10 @@
 """``Trained``, a model with its arm, which every exporter gets as argument, and its conversion to NumPy arrays."""
 
-from __future__ import annotations
-
 import copy
 import keyword
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,8 +13,9 @@ from torch import Tensor
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.protocol import motors_of, residual_terms
-from spelgen.dynamics.tip import last_link, tip_kinematics
+from spelgen.dynamics.tip import last_link
 from spelgen.dynamics.tip_frame import tip_frame
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
 from spelgen.exporting.description import (
     EntryPoint,
@@ -31,14 +29,10 @@ from spelgen.exporting.description import (
 from spelgen.listing import Listing
 from spelgen.live.noise import NoiseLevels
 from spelgen.runtime.friction_laws import FrictionConstants
+from spelgen.runtime.networks import JointEncoding
+from spelgen.runtime.parts import Layers
+from spelgen.runtime.residual_terms import ResidualTerms
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-
-if TYPE_CHECKING:
-    from spelgen.dynamics.prepared import PreparedModel
-    from spelgen.emission.assemble import ArmModel
-    from spelgen.runtime.networks import JointEncoding
-    from spelgen.runtime.parts import Layers
-    from spelgen.runtime.residual_terms import ResidualTerms
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +67,6 @@ class Trained:
     def tip(self) -> str:
         """The name of the tip link."""
         return self.arm.tip or last_link(self.arm.robot, self.arm.chain.joint_names)
-
-    def prepared(self) -> PreparedModel:
-        """Return the copy of the model from which ONNX and torch programs are made.
-
-        It has precomputed parameters, the kinematics of the tip, and the number type of the programs.
-        """
-        dtype = torch.float32 if self.float32 else torch.float64
-        return self.model.prepared(tip_kinematics(self.arm), dtype=dtype)
 
     @property
     def memory(self) -> int:

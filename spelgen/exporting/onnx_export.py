@@ -23,6 +23,7 @@ from spelgen.exporting.torch_export import (
     check_programs,
     export_program,
     number_type,
+    prepared,
     program_inputs,
     program_names,
     program_output,
@@ -32,7 +33,7 @@ from spelgen.exporting.tuning import TUNING
 
 def export_onnx(trained: Trained) -> Exported:
     """Return an .onnx file for each entry point. Raises RunError if results of ONNX Runtime and the model differ."""
-    model = trained.prepared()
+    model = prepared(trained)
     models, files = {}, {}
     for name in program_names(trained):
         models[name] = files[f"{name}.onnx"] = onnx_model(model, name)

@@ -1,12 +1,9 @@
 """Parity check: the largest difference between an export and the torch model at random states."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,13 +11,11 @@ from torch import Tensor
 
 from spelgen.arm.arm import Coordinate
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.tuning import TUNING
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 Values = dict[str, np.ndarray]
 """Inputs or outputs of an entry point by name, (states, ...) each."""

@@ -1,10 +1,8 @@
 """Approximation of a trained model by rigid bodies with viscous and Coulomb friction."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +13,7 @@ from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.parameters import without_residuals
 from spelgen.dynamics.protocol import motors_of
+from spelgen.emission.assemble import ArmModel
 from spelgen.emission.build import build
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.description import Servos
@@ -22,9 +21,6 @@ from spelgen.exporting.parity import nominal_speeds, random_inputs
 from spelgen.exporting.tuning import TUNING
 from spelgen.fitting.optimizers import minimise
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 class NearestFriction(NamedTuple):

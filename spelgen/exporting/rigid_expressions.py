@@ -5,9 +5,7 @@ Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002,
 with structural zeros: zeros of the geometry, and all velocities if qd is ``ca.SX(n, 1)``.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import casadi as ca
 import numpy as np
@@ -128,7 +126,7 @@ class RigidBodies:
             gradient[body.coordinate] += ratio * turned
         return momentum, gradient
 
-    def _rows(self) -> zip[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
+    def _rows(self) -> Iterator[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
         """Return (body, (mass, first moment (3, 1), inertia tensor (3, 3)), frame) of each body, parents first."""
         return zip(self.bodies, self.inertias, self.frames, strict=True)
 

@@ -1,17 +1,15 @@
 """Facts about a run: most important figures, training, options, and the commands that reproduce the run."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.parameters import used_parameter_count
+from spelgen.emission.assemble import ArmModel
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import SpelgenError, shortened
 from spelgen.evaluation.results import Results, Verdict
@@ -30,9 +28,6 @@ from spelgen.runtime.residual_terms import ResidualDynamics
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
 from spelgen.spec import ModelSpec, Options
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,10 @@ random positions; the positions of block 1 + k differ from these in coordinate k
 differs between block 0 and block 1 + k depends on coordinate k.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from fractions import Fraction
 from functools import cached_property
 from itertools import accumulate
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,9 +16,7 @@ from spelgen.arm.arm import Chain
 from spelgen.structure import field
 from spelgen.structure.field import PRIME, Residues, difference, random_residues, residue
 from spelgen.structure.recursion import Element, Position, base_denominators, coefficients, energies, triangle
-
-if TYPE_CHECKING:
-    from spelgen.urdf.robot import Assume
+from spelgen.urdf.robot import Assume
 
 Ten = Sequence[Element]
 
