@@ -105,7 +105,11 @@ def evaluate(
         if baselines:
             expected = "none: the model is one of position servos"
             raise LogError("baselines that take torques", expected=expected)
-        results = _evaluate_commands(tested, logs, notes)
+        for trajectory in logs:
+            require_commands(trajectory)
+        followers = command_followers(tested.linear_servos, notes)
+        errors, missed = replays(tested.model, logs, followers, notes)
+        results = replace(_results(tested, logs, notes, replay_traces(missed)), replays=errors)
     else:
         require_torques(logs)
         used = _preprocessing(tested.preprocessing, preprocessing, logs)
@@ -209,15 +213,6 @@ def _results(
         diagnostics=tuple(notes),
         traces=traces,
     )
-
-
-def _evaluate_commands(tested: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
-    """Return the errors of the positions that are predicted under the logged position commands."""
-    for trajectory in logs:
-        require_commands(trajectory)
-    followers = command_followers(tested.linear_servos, notes)
-    errors, missed = replays(tested.model, logs, followers, notes)
-    return replace(_results(tested, logs, notes, replay_traces(missed)), replays=errors)
 
 
 def _tip(tested: Subject, notes: list[Diagnostic]) -> TipPosition | None:

@@ -95,7 +95,11 @@ def excite(
     else:
         do = "use less of the ranges (--reach), begin elsewhere (--from), or lower the clearance"
         raise ArmError(f"no motion without a contact: {'; '.join(contacts)}", element="excite", do=do)
-    statement += _other_designs(seed, attempt, reach * fraction)
+    if attempt:
+        statement += (
+            f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed {seed + attempt} and "
+            f"{reach * fraction:.0%} of the ranges."
+        )
     first, states = criterion.states(starts[0]), np.stack([motion.q, motion.qd, motion.qdd])
     return Excitation(
         arm=arm.chain,
@@ -107,16 +111,6 @@ def excite(
         condition=criterion.condition(criterion.states(best)),
         efforts=criterion.largest_efforts(torch.from_numpy(states)),
         first_efforts=criterion.largest_efforts(first),
-    )
-
-
-def _other_designs(seed: int, attempt: int, reach: float) -> str:
-    """Return a sentence about earlier attempts, whose designs had contacts; "" if there was no earlier attempt."""
-    if attempt == 0:
-        return ""
-    return (
-        f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed {seed + attempt} and "
-        f"{reach:.0%} of the ranges."
     )
 
 

@@ -73,16 +73,12 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 
     robot: URDF with its meshes, for the picture of the arm; default: the URDF in the run folder.
     """
-    folder = Path(folder)
-    if not RunFolder(folder).path.is_dir():
-        expected = "a folder with spec.json"
-        raise RunError("no run", file=folder, expected=expected, do="make one with `spelgen train`")
     # Files of a run folder are untrusted and may have any content, so exceptions of any type are reported as errors.
     try:
         return _rendered(open_run(folder), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
         got = f"files without the data of a report ({in_one_line(error)})"
-        raise RunError(got, file=folder, do="run `spelgen evaluate` again") from error
+        raise RunError(got, file=Path(folder), do="run `spelgen evaluate` again") from error
 
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
