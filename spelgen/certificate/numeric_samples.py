@@ -48,8 +48,7 @@ class NumericSamples:
     @property
     def changes(self) -> np.ndarray:
         """Changes of M / scale due to a change of one coordinate, (n, S, n(n+1)/2): mass[1:] - mass[0]."""
-        result: np.ndarray = self.mass[1:] - self.mass[0]
-        return result
+        return np.asarray(self.mass[1:] - self.mass[0])
 
 
 def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:

@@ -43,13 +43,6 @@ class ComparedArm(Group):
     joints: tuple[str, ...] | None = None
     tip: str | None = None
 
-    def files(self) -> Iterator[tuple[str, Path]]:
-        """Yield (key, path) for each path of the arm, with the key of the path in the YAML file of the comparison."""
-        yield "urdf", self.urdf
-        yield from (("data", path) for path in self.data)
-        if self.mapping is not None:
-            yield "mapping", self.mapping
-
     def in_folder(self, folder: Path) -> Self:
         """Return the arm with its relative paths resolved against a folder."""
         mapping = None if self.mapping is None else folder / self.mapping
@@ -128,9 +121,11 @@ def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Loca
         if preset not in (*PRESET_NAMES, *ablation_designs()) and not _is_file(preset):
             yield ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
     for name, arm in comparison.arms.items():
-        for key, file in arm.files():
-            if not (folder / file).exists():
-                yield ("arms", name, key), f"no such file: {file}", "check the path"
+        paths = {"urdf": [arm.urdf], "data": arm.data, "mapping": [arm.mapping] if arm.mapping else []}
+        for key, files in paths.items():
+            for file in files:
+                if not (folder / file).exists():
+                    yield ("arms", name, key), f"no such file: {file}", "check the path"
 
 
 Progress = Callable[[int, int], None]

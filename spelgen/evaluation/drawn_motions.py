@@ -211,5 +211,4 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
 
 def _at_joints(inputs: np.ndarray, torques: np.ndarray) -> np.ndarray:
     """Return joint torques (T, n) [Nm, N] for motor torques (T, n); inputs: input matrix G, (n, n) or (T, n, n)."""
-    by_joint: np.ndarray = (inputs @ torques[..., None])[..., 0]
-    return by_joint
+    return np.asarray((inputs @ torques[..., None])[..., 0])

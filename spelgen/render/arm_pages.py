@@ -145,5 +145,4 @@ def _derivative(segment: Trajectory) -> np.ndarray:
     """Return dq/dt, (T, n) [rad/s, m/s], by central differences of the positions; NaN for a segment of one sample."""
     if len(segment.t) < 2:
         return np.full_like(segment.q, np.nan)
-    derivative: np.ndarray = np.gradient(segment.q, segment.t, axis=0)
-    return derivative
+    return np.asarray(np.gradient(segment.q, segment.t, axis=0))

@@ -72,13 +72,11 @@ class Axis:
         # Values are clipped, because browsers limit the range of coordinates.
         scale = np.log if self.log else np.asarray
         low, high, clipped = map(scale, (self.low, self.high, np.clip(values, self.low, self.high)))
-        pixels: np.ndarray = self.start + (clipped - low) / (high - low) * (self.end - self.start)
-        return pixels
+        return np.asarray(self.start + (clipped - low) / (high - low) * (self.end - self.start))
 
     def contains(self, values: np.ndarray) -> np.ndarray:
         """Return a mask (T,): true for the values (T,) within the axis."""
-        inside: np.ndarray = (values >= self.low) & (values <= self.high)
-        return inside
+        return np.asarray((values >= self.low) & (values <= self.high))
 
     def ticks(self) -> list[tuple[float, str]]:
         """Return the ticks at about five round values within the axis: pixel and label of each tick."""
@@ -257,8 +255,7 @@ def _spaced(pixels: np.ndarray) -> str:
 def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
     """Return the finite values of all columns as one vector; if `positive`, only the positive values."""
     values = np.concatenate([np.zeros(0), *columns])
-    drawable: np.ndarray = values[np.isfinite(values) & ((values > 0) | (not positive))]
-    return drawable
+    return np.asarray(values[np.isfinite(values) & ((values > 0) | (not positive))])
 
 
 def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool) -> Axis:
