@@ -214,7 +214,8 @@ def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress |
     no model starts from the true parameters.
     """
     # The simulation needs Pinocchio, an optional dependency. A comparison on logs of the user does not need it, so the
-    # import is in this function.
+    # imports are in this function.
+    from spelgen.simulation.as_built import urdf_without
     from spelgen.simulation.simulate import simulate
 
     if loaded.settings.input == "position":
@@ -234,16 +235,7 @@ def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress |
         training = [log[: int((log.t - log.t[0] < first - 1e-9).sum())] for log in training]
     write_logs(folder / "train.parquet", training, loaded.chain.joint_names)
     write_logs(folder / "test.parquet", logs.test, loaded.chain.joint_names)
-    write_bytes(inputs.urdf, _kinematics(loaded.robot.path))
+    kinematics = urdf_without(loaded.robot.path, "dynamics", "visual", "collision", "inertial")
+    write_bytes(inputs.urdf, etree.tostring(kinematics, xml_declaration=True, encoding="utf-8"))
     write_text(inputs.urdf.with_suffix(".yaml"), yaml.safe_dump({"gravity": list(loaded.settings.gravity)}))
     write_json(complete, {"digest": inputs.digest})
-
-
-def _kinematics(urdf: Path) -> bytes:
-    """Return a URDF without inertials, friction, visuals and collision bodies."""
-    # The parser needs no limits of size and entities, because `load_arm` has checked them when it read the URDF.
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
-    tree = etree.ElementTree(etree.fromstring(urdf.read_bytes(), parser))
-    for element in list(tree.iter("dynamics", "visual", "collision", "inertial")):
-        element.getparent().remove(element)
-    return bytes(etree.tostring(tree, xml_declaration=True, encoding="utf-8"))

@@ -17,7 +17,7 @@ from spelgen.excitation.bounds import SPEEDS, motion_bounds
 from spelgen.files import write_bytes, write_text
 from spelgen.simulation.tuning import AS_BUILT
 from spelgen.structure.nominal import parameters_of, pseudo_inertia
-from spelgen.urdf.document import urdf_bytes
+from spelgen.urdf.document import read_document
 
 ABOUT = "The arm as built, from seed {}: the ground truth of simulated logs. `spelgen simulate` on it makes more logs."
 
@@ -145,15 +145,20 @@ def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
         error: Relative standard deviation: 0.3 is 30 %.
         seed: Seed of the random factors; the same seed gives the same bytes.
     """
-    # Entities and network access are off, so that a malicious URDF cannot include other files.
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
-    tree = etree.ElementTree(etree.fromstring(urdf_bytes(robot), parser))
-    for element in list(tree.iter("dynamics", "visual", "collision")):
-        element.getparent().remove(element)
+    root = urdf_without(robot, "dynamics", "visual", "collision")
     rng = np.random.default_rng(seed)
-    for inertial in tree.iterfind(".//link/inertial"):
+    for inertial in root.iterfind(".//link/inertial"):
         _perturb(inertial, error * rng.normal(size=2), error * rng.normal(size=3))
-    return bytes(etree.tostring(tree, xml_declaration=True, encoding="utf-8"))
+    return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8"))
+
+
+def urdf_without(robot: Path, *tags: str) -> etree._Element:
+    """Return the root element of a URDF or xacro file, without comments and without elements of these tags."""
+    root = read_document(robot).root
+    etree.strip_tags(root, etree.Comment)
+    for element in list(root.iter(*tags)):
+        element.getparent().remove(element)
+    return root
 
 
 def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np.ndarray) -> None:
