@@ -172,7 +172,7 @@ def formulas(
     n = len(arm.coordinates)
     entries: list[Entry] = [*((row + 1, column + 1) for row, column in triangle(n)), "V"]
     if entry is not None:
-        lower: Entry = entry if entry == "V" else (max(entry), min(entry))
+        lower = entry if entry == "V" else (max(entry), min(entry))
         # M is symmetric, and only its lower triangle is computed: entry 2,1 is returned for 1,2.
         if lower not in entries:
             expected = f"a row and a column from 1 to {n}, or V"

@@ -114,7 +114,7 @@ class Inspection:
         n = len(self.structure.joints)
         # The JSON object contains zero entries of G too, unlike `actuation.entries`.
         values = {(entry.row, entry.column): (entry.kind, entry.value) for entry in self.actuation.entries}
-        entries: list[dict[str, object]] = []
+        entries = []
         for row, column in product(range(n), repeat=2):
             kind, value = values.get((row, column), ("zero", 0.0))
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})

@@ -199,8 +199,8 @@ def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> I
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     # (entries, n), largest change of each entry of M when only one joint moves
     largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()
-    zeros: list[Magnitude] = []
-    pairs: list[Magnitude] = []
+    zeros = []
+    pairs = []
     dependent = 0
     for entry, size, changes in zip(structure.entries, largest, largest_changes, strict=True):
         name = entry_name(entry.row, entry.column)

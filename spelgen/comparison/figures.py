@@ -92,7 +92,7 @@ def simulated_figures(
     example = predict_example(of_dynamics("", model, far), testing, steps, decimation)
     mass = None if example is None else model.mass_matrix(torch.from_numpy(example.q)).numpy()
     loss, position, velocity = prediction_loss(model, far, substeps)
-    losses: Figures = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
+    losses = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
     losses["M, relative error"] = mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints))
     # The training loss and the test loss are computed from windows as long as the windows of the training, and not from
     # windows of 1 s.

@@ -67,8 +67,8 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     # Presets are checked first, so that a misspelt name is an error before logs are simulated.
     for preset in set(comparison.presets or ()) - ablation_designs().keys():
         load_design(preset)
-    jobs: list[Job] = []
-    failures: dict[str, str] = {}
+    jobs = []
+    failures = {}
     for name, arm in comparison.arms.items():
         try:
             inputs = arm_inputs(arm, folder / "arms" / name, comparison.splits, progress)

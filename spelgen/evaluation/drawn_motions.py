@@ -165,7 +165,7 @@ def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
     """Return the torques of all predictors on these samples, and the terms of the model's torque."""
-    model: Any = dynamics[MODEL]
+    model = dynamics[MODEL]
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
         inputs = np.eye(q.shape[-1])

@@ -17,7 +17,6 @@ from spelgen.errors import Diagnostic, LogError, SpelgenError, in_one_line
 from spelgen.evaluation.horizons import (
     EvaluatedLogs,
     Horizon,
-    Predictions,
     TipPosition,
     horizon_lengths,
     predict,
@@ -26,7 +25,7 @@ from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.rollout import mass_errors
 from spelgen.evaluation.subject import Subject, subject
-from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_errors
+from spelgen.evaluation.torque import coarse_torques, torque_errors
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
 from spelgen.evaluation.tuning import TUNING
 from spelgen.evaluation.verdict import SEEN
@@ -162,7 +161,7 @@ def _evaluate_torques(
     predictors += [of_dynamics(name, dynamics, probe) for name, dynamics in baselines.items()]
     tip = _tip(tested, notes)
     horizons: list[Horizon] = []
-    longest: Predictions | None = None
+    longest = None
     for name, k in lengths.items():
         if progress is not None:
             progress(len(horizons), len(lengths), f"predicting {name} ahead")
@@ -172,7 +171,7 @@ def _evaluate_torques(
         if k == max(lengths.values()):
             longest = predictions
     all_dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
-    torque: dict[str, TorqueErrors] = {}
+    torque = {}
     if samples:
         torque = {name: torque_errors(dynamics, samples) for name, dynamics in all_dynamics.items()}
     if not horizons and not torque:

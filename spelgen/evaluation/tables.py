@@ -199,7 +199,7 @@ def _replay_tables(results: Results) -> list[Table]:
     """Return the tables of replayed commands: per trajectory and per joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
-        rows: dict[str, Numbers] = {}
+        rows = {}
         for log in replay.errors[MODEL].trajectories:
             rows[log] = {name: 1000 * errors.trajectories[log] for name, errors in replay.errors.items()}
         # The mean of all logs is the last row of the table.
@@ -260,7 +260,7 @@ class Figure:
 
 def figures(results: Results) -> list[Figure]:
     """Return the known figures of the model: nMSE of torques, errors of the longest rollout and of replays."""
-    candidates: list[tuple[str, str, str, float | None]] = []
+    candidates = []
     if MODEL in results.torque:
         torque = results.torque[MODEL]
         candidates.append(("torque.nmse", "nMSE of torques", "variance", torque.mean_nmse))

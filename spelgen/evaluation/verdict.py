@@ -160,7 +160,7 @@ def _relative(errors: StateErrors | None) -> float:
 
 def _better_baselines(results: Results) -> list[str]:
     """Return sentences about the horizons at which constant velocity or another baseline has a smaller error."""
-    times: list[str] = []
+    times = []
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
         errors = {name: _relative(of_predictor) for name, of_predictor in horizon.errors.items()}

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from spelgen.arm.arm import Chain
-from spelgen.errors import ArmError, SpelgenError, collect
+from spelgen.errors import ArmError, collect
 from spelgen.excitation.tuning import TUNING
 from spelgen.settings.values import Group, Number, Positive
 from spelgen.settings.yaml_document import read_document, validated
@@ -77,7 +77,7 @@ def motion_bounds(
             limits[k] = max(low, limits[k, 0]), min(high, limits[k, 1])
         if mimic.velocity:
             speeds[k] = min(speeds[k], mimic.velocity / abs(factor))
-    errors: list[SpelgenError] = []
+    errors = []
     for coordinate, (low, high) in zip(arm.coordinates, limits, strict=True):
         if not low < high:
             errors.append(range_error(coordinate.name, None if np.isnan(low) else (low, high)))

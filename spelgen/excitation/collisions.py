@@ -203,7 +203,7 @@ class Collisions:
 
         links: number of objects that are shapes of links; they are the first objects.
         """
-        neighbour: dict[int, int] = {}
+        neighbour = {}
         for index, body in enumerate(chain.bodies):
             # The shapes of a body and of its parent overlap. A parent without a shape is replaced by its own parent.
             parent = body.parent

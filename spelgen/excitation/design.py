@@ -77,7 +77,7 @@ def excite(
         bounds = replace(bounds, acceleration=strongest)
     collisions, statement = _collisions(arm, surroundings, limits)
     beginning = _start(start, arm.chain, limits, collisions)
-    contacts: list[str] = []
+    contacts = []
     for attempt in range(TUNING.attempts):
         fraction = TUNING.range_factor**attempt
         trajectory = ExcitationTrajectory(duration, harmonics, bounds.narrowed(fraction))

@@ -123,7 +123,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     # The generated code contains a checksum of all constants. With it, the code refuses a saved state of an estimator
     # with other constants.
     identity = zlib.crc32(repr(sorted((name, str(value)) for name, value in values.items())).encode())
-    files: dict[str, str] = {}
+    files = {}
     for suffix in (".h", ".c"):
         text = render(f"estimator{suffix}.jinja", **values, identity=identity)
         files[f"{model.name}_estimator{suffix}"] = text

@@ -207,7 +207,7 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[description.Harmonic
     the joint, then harmonics of a revolution of the motor. An export computes the harmonics k = 1, 2, ... of one
     frequency in sequence. Harmonics with zero amplitude are therefore removed only after the last nonzero one.
     """
-    ripple: list[description.Harmonics] = []
+    ripple = []
     cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)

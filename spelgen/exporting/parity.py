@@ -103,7 +103,7 @@ def check_parity(
     inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
     # The torch model computes in double precision, since rounding errors in float32 exceed the tolerance.
     exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
-    differences: dict[str, float] = {}
+    differences = {}
     for name in names:
         outputs = called(name, inputs)
         expected = _expected(exact, trained, name, inputs)
@@ -157,7 +157,7 @@ def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> V
     name: name of the entry point. inputs: {input: array (states, n)}.
     """
     entry = ENTRY_POINTS[name]
-    arguments: list[Tensor] = []
+    arguments = []
     for key in entry.inputs:
         value = torch.from_numpy(inputs[key])
         if key != "z":

@@ -96,7 +96,7 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     q = sampled_positions(arm.chain)
     # The rigid bodies of a model are used if it has some; its residual terms are omitted, as the summary states.
     exact = isinstance(model, RigidBodyDynamics)
-    bodies: ArmModel = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
+    bodies = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
         arm=arm,
         inertias=bodies.inertial_parameters.numpy(),
@@ -169,7 +169,7 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
     positions = positions.unsqueeze(1).expand(-1, len(speeds), -1)  # (positions, speeds, n)
     qd = torch.from_numpy(speeds).expand_as(positions)
     torques = model.friction_torque(positions, qd).numpy()  # (positions, speeds, n)
-    rows: list[tuple[float, float, float, float]] = []
+    rows = []
     for joint, speed in enumerate(speeds.T):
         # Torques are multiplied by the direction of motion, so that viscous and Coulomb friction are not
         # negative.

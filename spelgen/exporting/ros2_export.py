@@ -139,7 +139,7 @@ def _listed(numbers: Iterable[float] | np.ndarray) -> str:
 
 def cpp_string(text: str) -> str:
     """Return a C++ string literal of an untrusted text; all bytes except ASCII letters, digits and _-/ are escaped."""
-    characters: list[str] = []
+    characters = []
     for character in text:
         plain = character.isascii() and (character.isalnum() or character in "_-/")
         # Escapes are octal, since an octal escape ends after three digits; a hexadecimal one would include a

@@ -97,7 +97,7 @@ def growth_panels(
     panels = []
     for title, label, errors_of in MEASURES:
         marks: list[Mark] = []
-        errors: dict[str, Quantiles] = {}
+        errors = {}
         for name, (growth, predictor) in growths.items():
             error = errors_of(growth).get(predictor)
             if error is None:

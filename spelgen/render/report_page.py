@@ -131,8 +131,8 @@ def write_runs(folders: Sequence[Path], output: Path) -> Path:
 def render_runs(folders: Sequence[Path]) -> str:
     """Return the page about several runs as HTML."""
     # All runs are read before the page is written, so that an unreadable run does not result in an incomplete page.
-    runs: dict[str, Run] = {}
-    results: dict[str, Results] = {}
+    runs = {}
+    results = {}
     for name, folder in zip(_names(folders), folders, strict=True):
         RunFolder(folder).read_record()  # This call only checks that the folder contains a run.
         run = open_run(folder)
@@ -158,7 +158,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
     """
     # Paths are resolved, because `.` has no name.
     paths = list(map(Path.resolve, folders))
-    names: list[str] = []
+    names = []
     for count in range(1, max(len(path.parts) for path in paths) + 1):
         names = ["/".join(path.parts[-count:]) for path in paths]
         if len(set(names)) == len(names):

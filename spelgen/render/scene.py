@@ -128,7 +128,7 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
     that are fixed to another drawn link.
     """
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
-    carried: set[str] = set()
+    carried = set()
     visible = [robot.root]
     for joint in robot.joints_from_root:
         # A link moves with the arm if its joint belongs to the arm or its parent link moves with the arm.

@@ -65,7 +65,7 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
         exclude_unset=True,
     )
     names = list(arm.chain.joint_names)
-    settings: dict[str, object] = {"about": ABOUT.format(seed), "moving_joints": names} | carried
+    settings = {"about": ABOUT.format(seed), "moving_joints": names} | carried
     # Other arms are simulated along prescribed paths. This is not possible with position servos and passive joints, so
     # such arms keep the protocol of their settings.
     if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
@@ -116,7 +116,7 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
     asymmetry = rng.uniform(-AS_BUILT.asymmetry, AS_BUILT.asymmetry, len(joints))
     viscous = rng.uniform(*AS_BUILT.viscous, len(joints)) * coulomb / speed
     armature = rng.uniform(*AS_BUILT.armature, len(joints)) * inertia
-    drives: dict[str, dict[str, object]] = {}
+    drives = {}
     for k, joint in enumerate(joints):
         drive = arm.settings.joint(joint.name)
         forward, backward = coulomb[k] * (1 + asymmetry[k]), coulomb[k] * (1 - asymmetry[k])

@@ -38,7 +38,7 @@ def servo_motions(
     resolution = 2 * np.pi / TUNING.encoder_counts
     is_revolute = np.array([x.joint_type == "revolute" for x in arm.coordinates])
     encoder = np.where(is_revolute, resolution, resolution / 10)  # (n,) [rad, m]
-    logs: list[Trajectory] = []
+    logs = []
     for number, random in enumerate(np.random.default_rng(protocol.seed).spawn(protocol.trajectories)):
         u = middle + width * _commands(random, t, len(middle))
         q = _positions(arm, settings, t, u)

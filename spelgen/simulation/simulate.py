@@ -139,7 +139,7 @@ def _controlled(settings: Settings) -> Settings:
         return settings
     simulation = ControlledSimulation(**simulation.model_dump(exclude_unset=True))
     rate = simulation.sample_rate
-    defaults: dict[str, object] = {
+    defaults = {
         "control": "computed-torque",
         "paths": "own" if {"amplitude", "frequency"} & tracking.model_fields_set else "excitation",
         "control_rate": rate / max(1, round(rate / TUNING.control_rate)),

@@ -8,7 +8,6 @@ parameter, and an expansion is stopped before it exceeds its budget of multiplic
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TypeAlias
 
 from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
@@ -77,7 +76,7 @@ class Expansion:
         variables = [Deferred("constant", x) for x in self.context.gens()]
         self._parameters = [Deferred("parameter", index) for index in range(10 * len(arm.bodies))]
         positions = list(map(Position, variables[1::3], variables[::3], variables[2::3]))
-        inertias: list[Sequence[Deferred]] = []
+        inertias = []
         for first in range(0, len(self._parameters), 10):
             inertias.append(self._parameters[first : first + 10])
         self.energies = energies(

@@ -78,7 +78,7 @@ def float_samples(arm: Chain, assume: Assume, samples: int, seed: int = 2) -> np
     rng = np.random.default_rng(seed)
     n = len(arm.coordinates)
     q = [_one_moved(rng.uniform(-3.0, 3.0, 2 * samples), index, 1 + n) for index in range(n)]
-    inertias: list[Ten] = [list(rng.normal(size=(10, samples))) for _ in arm.bodies]
+    inertias = [list(rng.normal(size=(10, samples))) for _ in arm.bodies]
     if assume == "inertials":
         inertias = [list(map(float, body.inertia or (0,) * 10)) for body in arm.bodies]
     mass, _ = float_energies(arm, np.stack(q, axis=-1), inertias)
