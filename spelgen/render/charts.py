@@ -76,7 +76,7 @@ class Axis:
 
     def contains(self, values: np.ndarray) -> np.ndarray:
         """Return a mask (T,): true for the values (T,) within the axis."""
-        return np.asarray((values >= self.low) & (values <= self.high))
+        return (values >= self.low) & (values <= self.high)
 
     def ticks(self) -> list[tuple[float, str]]:
         """Return the ticks at about five round values within the axis: pixel and label of each tick."""

@@ -166,7 +166,7 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
 def _axis(joint: UrdfJoint) -> np.ndarray:
     """Return the unit vector of the joint axis (3,), in the joint frame."""
     axis = np.array(joint.axis, dtype=float)
-    return np.asarray(axis / (np.linalg.norm(axis) or 1.0))
+    return axis / (np.linalg.norm(axis) or 1.0)
 
 
 def _rotation(joint: UrdfJoint) -> np.ndarray:
