@@ -127,11 +127,9 @@ class Formulas:
     @property
     def trusted(self) -> str:
         """Text about the inertial parameters for which the formulas are valid: any, or with the zeros of the URDF."""
-        return (
-            "the URDF's inertial zeros and symmetries"
-            if self.assume == "inertials"
-            else "any inertial values"
-        )
+        if self.assume == "inertials":
+            return "the URDF's inertial zeros and symmetries"
+        return "any inertial values"
 
     @property
     def written(self) -> tuple[Formula, ...]:

@@ -87,14 +87,11 @@ def motion_bounds(
 
 def range_error(joint: str, limits: tuple[float, float] | None) -> ArmError:
     """Return the error about a joint without a range to move in; limits: [rad, m], None if there are none."""
-    line = f"write 'simulation: {{positions: {{{joint}: [LOWEST, HIGHEST]}}}}' into the robot's YAML"
-    if limits is None:
-        got, do = "no position limits", line
-    else:
-        got, do = (
-            f"the limits {limits[0]:g} .. {limits[1]:g}",
-            f"correct them, omit the joint by --joints, or {line}",
-        )
+    got = "no position limits"
+    do = f"write 'simulation: {{positions: {{{joint}: [LOWEST, HIGHEST]}}}}' into the robot's YAML"
+    if limits is not None:
+        got = f"the limits {limits[0]:g} .. {limits[1]:g}"
+        do = f"correct them, omit the joint by --joints, or {do}"
     return ArmError(got, element=f"joint {joint!r}", expected="a range to move in", do=do)
 
 

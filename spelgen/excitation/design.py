@@ -118,14 +118,11 @@ def _checked_harmonics(
     duration: float, sample_rate: float, harmonics: int | None, reach: float, speed: float
 ) -> int:
     """Return the number of harmonics of a motion. Raises SettingsError for an invalid argument of ``excite``."""
-    fraction, positive = (1.0, "more than 0, at most 1"), (inf, "a positive number")
-    for name, value, (largest, expected) in (
-        ("duration", duration, positive),
-        ("sample_rate", sample_rate, positive),
-        ("reach", reach, fraction),
-        ("speed", speed, fraction),
-    ):
+    bounded = {"duration": (duration, inf), "sample_rate": (sample_rate, inf)}
+    bounded |= {"reach": (reach, 1.0), "speed": (speed, 1.0)}
+    for name, (value, largest) in bounded.items():
         if not 0 < value <= largest or value == inf:
+            expected = "a positive number" if largest == inf else "more than 0, at most 1"
             raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
     if harmonics is None:
         return max(TUNING.min_harmonics, round(TUNING.harmonics_per_second * duration))

@@ -22,18 +22,9 @@ _CONTROLLER_DEPENDENCIES = (
     "controller_interface", "geometry_msgs", "hardware_interface", "rcl_interfaces", "rclcpp_lifecycle",
     "sensor_msgs", "std_msgs", "trajectory_msgs",
 )  # fmt: skip
-_PATHS = {
-    "package.xml": "package.xml",
-    "CMakeLists.txt": "CMakeLists.txt",
-    "solver.xml": "solver.xml",
-    "solver.cpp": "src/solver.cpp",
-}
-_CONTROLLER_PATHS = {
-    "controller.xml": "controller.xml",
-    "controller.yaml": "config/controller.yaml",
-    "controller.cpp": "src/controller.cpp",
-    "control.hpp": "src/control.hpp",
-}
+# Paths in the package; each file has a template of its name.
+_PATHS = ("package.xml", "CMakeLists.txt", "solver.xml", "src/solver.cpp")
+_CONTROLLER_PATHS = ("controller.xml", "config/controller.yaml", "src/controller.cpp", "src/control.hpp")
 
 
 def export_ros2(trained: Trained) -> Exported:
@@ -48,13 +39,13 @@ def export_ros2(trained: Trained) -> Exported:
     context = {"package": package, "controller": controller, "name": model.name, "upper": model.name.upper()}
     context |= {"joints": ", ".join(model.joint_labels), "estimator": estimator}
     context["dependencies"] = sorted(_DEPENDENCIES + (_CONTROLLER_DEPENDENCIES if controller else ()))
-    paths = _PATHS
+    paths = [*_PATHS]
     if controller:
-        paths = _PATHS | _CONTROLLER_PATHS
+        paths += _CONTROLLER_PATHS
         context |= _controller_numbers(trained)
     files = {f"src/{name}": content for name, content in sources.items()}
-    for template, path in paths.items():
-        files[path] = render(f"ros2/{template}.jinja", **context).encode()
+    for path in paths:
+        files[path] = render(f"ros2/{path.rpartition('/')[2]}.jinja", **context).encode()
     about = (
         "getTorques includes friction, and updates its state by the positions of successive calls; "
         "initialize resets it."
