@@ -24,7 +24,7 @@ from spelgen.evaluation.horizons import (
 from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.rollout import mass_errors
-from spelgen.evaluation.subject import Subject, subject
+from spelgen.evaluation.subject import Subject
 from spelgen.evaluation.torque import coarse_torques, torque_errors
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
 from spelgen.evaluation.tuning import TUNING
@@ -86,7 +86,7 @@ def evaluate(
     Raises LogError.
     """
     # Model and logs are checked before the rollouts, because rollouts take minutes.
-    tested = subject(model, arm)
+    tested = Subject(model, arm)
     logs = [logs] if isinstance(logs, Trajectory) else list(logs)
     # Joints are matched by name: the order of the joints in a log may differ, but a missing joint is an error.
     for trajectory in logs:
@@ -205,7 +205,7 @@ def _results(
     """
     return Results(
         robot=tested.spec.robot if tested.spec else type(tested.model).__name__,
-        joints=tuple(tested.joints),
+        joints=tested.joints,
         joint_types=tuple(tested.model.joint_types),
         trajectories=tuple(trajectory.name for trajectory in logs),
         parameters=used_parameter_count(tested.model),
