@@ -21,7 +21,7 @@ from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
 from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.plots import growth_panels
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
-from spelgen.render.run_facts import Run, open_run
+from spelgen.render.run_facts import Run
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.structure.structure import derive
 from spelgen.templates import render_page
@@ -54,7 +54,7 @@ def write_report(
 
 def report_data(folder: Path | str) -> Content:
     """Return the data of the page for programs: assessment, evaluation, baselines and parameters."""
-    run = open_run(folder)
+    run = Run(folder)
     tables = parameter_tables(run.model, run.arm, run.baselines, run.posterior)
     bodies = body_parameters(run.model).tolist() if isinstance(run.model, RigidBodyDynamics) else None
     return {
@@ -75,7 +75,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
     """
     # Files of a run folder are untrusted and may have any content, so exceptions of any type are reported as errors.
     try:
-        return _rendered(open_run(folder), robot)
+        return _rendered(Run(folder), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
         got = f"files without the data of a report ({in_one_line(error)})"
         raise RunError(got, file=Path(folder), do="run `spelgen evaluate` again") from error
@@ -135,7 +135,7 @@ def render_runs(folders: Sequence[Path]) -> str:
     results = {}
     for name, folder in zip(_names(folders), folders, strict=True):
         RunFolder(folder).read_record()  # This call only checks that the folder contains a run.
-        run = open_run(folder)
+        run = Run(folder)
         if run.results is None:
             raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
         runs[name], results[name] = run, run.results
