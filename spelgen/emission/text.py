@@ -125,11 +125,10 @@ def module_name(spec: ModelSpec) -> str:
 
 def _picture(spec: ModelSpec) -> str:
     """Return a picture of the lower triangle of M as text: per entry, the joints that the entry depends on."""
-    cells, width = {}, 2
+    cells = {}
     for row, column, kind, joints in spec.entries:
-        cell = {"varying": joint_ranges(joints), "constant": "C", "zero": "0"}[kind]
-        cells[row, column] = cell
-        width = max(width, len(cell))
+        cells[row, column] = {"varying": joint_ranges(joints), "constant": "C", "zero": "0"}[kind]
+    width = max(2, *map(len, cells.values()))
     lines = ["Mass matrix: numbers of the joints that each entry depends on; C constant, 0 always zero", ""]
     for row in range(len(spec.joints)):
         line = "  ".join(cells[row, column].ljust(width) for column in range(row + 1))
