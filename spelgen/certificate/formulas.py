@@ -213,10 +213,10 @@ class _Writer:
         terms = sum(map(len, polynomials.values()))
         if terms > longest:
             return Formula(entry, terms, None)
-        present = {name: polynomial for name, polynomial in polynomials.items() if polynomial}
-        functions = [
-            (parameter(name), self._writer.terms(polynomial)) for name, polynomial in present.items()
-        ]
+        functions = []
+        for name, polynomial in polynomials.items():
+            if polynomial:
+                functions.append((parameter(name), self._writer.terms(polynomial)))
         return Formula(entry, terms, grouped(functions))
 
     def _polynomials(self, entry: Entry) -> dict[str, fmpq_mpoly]:
