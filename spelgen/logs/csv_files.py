@@ -22,7 +22,7 @@ from spelgen.settings.log_mapping import PLAIN, LogMapping
 # first columns that `ros2 topic echo --csv` writes: the header of the message
 STAMP = ("sec", "nanosec", "frame_id")
 # Beginning of a comment; "%time" is a name that `rostopic echo -p` writes.
-COMMENT = re.compile(r"(#|% )\s*")
+COMMENT = re.compile(r"^(#|% )\s*")
 
 
 class Beginning(NamedTuple):
@@ -111,10 +111,7 @@ def _beginning(file: Path) -> Beginning:
     lines = head.lstrip("\ufeff").splitlines() or [""]
     # Names of columns may contain spaces, and numbers decimal commas, so spaces and commas are tried last.
     for delimiter in "\t;|, ":
-        cells = [
-            _cells(line[match.end() :] if (match := COMMENT.match(line)) else line, delimiter)
-            for line in lines
-        ]
+        cells = [_cells(COMMENT.sub("", line), delimiter) for line in lines]
         width = mode(map(len, cells[:-1] or cells))
         if width > 2:
             break
@@ -129,9 +126,8 @@ def _beginning(file: Path) -> Beginning:
         return Beginning(encoding, delimiter, names, first, "\n".join(lines[first:]))
     # Names may be in two lines: the quantities, repeated or once for several joints, and below them the joints.
     is_repeated = len(set(names)) < len(names) - 1
-    between = [
-        *takewhile(lambda k: _is_text(lines[k], lines[first], cells[k] if is_repeated else None), rows)
-    ]
+    named = cells if is_repeated else [None] * len(cells)
+    between = [*takewhile(lambda k: _is_text(lines[k], lines[first], named[k]), rows)]
     if is_repeated and between:
         filled = accumulate(names, lambda before, name: name or before, initial="")
         parts = zip_longest([*filled][1:], *(cells[k] for k in between), fillvalue="")
@@ -180,8 +176,9 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
 def _decoded_head(file: Path) -> tuple[str, str]:
     """Return the encoding and the first characters of a file."""
-    # [B] size of the head of the file, from which encoding, delimiter and decimal point are detected
-    size = 2**16
+    # [B] size of the head of the file, from which names, encoding, delimiter and decimal point are detected. The module
+    # csv reads no larger cells.
+    size = 2**17
     with file.open("rb") as source:
         head = source.read(size)
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
