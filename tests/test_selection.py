@@ -372,6 +372,15 @@ def test_weak_evidence_of_a_joint_yields_to_that_of_all(evidence, unlikely):
     assert stages._rejected(torch.tensor(evidence)).tolist() == unlikely
 
 
+@pytest.mark.parametrize(
+    ("evidence", "rate_only"),
+    [((-1.0, -20.0), [True, True]), ((-20.0, 9.0), [True, False]), ((-20.0, 30.0), [False, False])],
+)
+def test_joints_without_bristles(evidence, rate_only):
+    """One joint has bristles if it has strong evidence for them, or if all joints together have evidence for them."""
+    assert stages._rate_only(torch.tensor(evidence)).tolist() == rate_only
+
+
 def test_freedom_that_samples_narrow_speaks_against_memory():
     """Of two joints with two elements each: samples narrow one fraction of the second to a tenth."""
     rigid = SimpleNamespace(

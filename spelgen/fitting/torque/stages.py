@@ -120,15 +120,14 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
 
     ``estimate`` has rate-only friction. The force of bristles reverses over a displacement, later than the velocity. At
     joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The marginal
-    likelihoods of both fits decide (see `_rejected`).
+    likelihoods of both fits decide (see `_rate_only`).
     """
     friction = estimate.problem.jacobian.model.friction
     friction.memoryless.fill_(0.0)
     # The noise is estimated again, since bristles explain more of the torque than rate-only friction does.
     problem, state = _least_squares_noise_fit(estimate.problem, estimate.state)
     hysteretic = alternate(problem, state)
-    evidence = log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic)
-    rate_only = _rejected(evidence)
+    rate_only = _rate_only(log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic))
     friction.memoryless.copy_(rate_only)
     if rate_only.all():
         return estimate
@@ -137,6 +136,18 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
         mixed = hysteretic.with_jacobian(hysteretic.problem.jacobian)
         return alternate(mixed.problem, mixed.state)
     return hysteretic
+
+
+def _rate_only(evidence: torch.Tensor) -> torch.Tensor:
+    """Return a mask (n,), True for joints with rate-only friction.
+
+    If the sum of the evidence over all joints favours bristles, all joints get them, otherwise only joints with strong
+    evidence. The gears of an arm have similar friction, and evidence of a single joint against bristles is unreliable:
+    where one recording of an arm with bristles had it, bristles predicted the torque of other motions better (see
+    docs/decisions.md). evidence: (n,), twice the log of the ratio of marginal likelihoods; positive values favour
+    bristles.
+    """
+    return (evidence < TUNING.strong_evidence) & (evidence.sum() <= 0)
 
 
 def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
