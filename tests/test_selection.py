@@ -372,13 +372,13 @@ def test_weak_evidence_of_a_joint_yields_to_that_of_all(evidence, unlikely):
     assert stages._rejected(torch.tensor(evidence)).tolist() == unlikely
 
 
-@pytest.mark.parametrize(
-    ("evidence", "rate_only"),
-    [((-1.0, -20.0), [True, True]), ((-20.0, 9.0), [True, False]), ((-20.0, 30.0), [False, False])],
-)
-def test_joints_without_bristles(evidence, rate_only):
-    """One joint has bristles if it has strong evidence for them, or if all joints together have evidence for them."""
-    assert stages._rate_only(torch.tensor(evidence)).tolist() == rate_only
+def test_a_residual_that_is_smaller_in_one_part_of_a_log_is_no_evidence_of_another_friction():
+    """A third of the squared residual in each block of joint 1; of joint 2 a hundredth, but in two blocks only."""
+    other = torch.ones(1000, 2).double()
+    residual = other.clone()
+    residual[:, 0] /= 3**0.5
+    residual[:200, 1] /= 10.0
+    assert stages._smaller_in_most_blocks(residual, other).tolist() == [True, False]
 
 
 def test_freedom_that_samples_narrow_speaks_against_memory():
