@@ -57,7 +57,7 @@ def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
 
 
 def test_base_parameters_are_equal_in_every_bit(robots):
-    """Intervals in reports are the same bytes each time, whatever the memory contained before."""
+    """Intervals in reports are the same bytes each time, for all contents of the memory."""
     model = build(robots / "rpr.urdf", "closed-form")
     draw = torch.Generator().manual_seed(0)
     results = set()
