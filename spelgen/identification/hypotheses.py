@@ -42,15 +42,15 @@ class MotionSamples:
     @property
     def motion(self) -> np.ndarray:
         """Positions, velocities and accelerations, (3, S, n)."""
-        return np.moveaxis(self._central[..., :3], 2, 0)
+        return np.moveaxis(self.central[..., :3], 2, 0)
 
     @property
     def tau(self) -> np.ndarray:
         """Joint torques, (S, n)."""
-        return self._central[..., 3]
+        return self.central[..., 3]
 
     @property
-    def _central(self) -> np.ndarray:
+    def central(self) -> np.ndarray:
         """Signals (S, n, 4) at the times of the samples."""
         return self.values[..., self.values.shape[3] // 2]
 
@@ -60,7 +60,7 @@ class MotionSamples:
         Signals at a longer delay than `longest_delay` are those around the sample that is nearest in time.
         """
         if not delays.any():
-            return self._central
+            return self.central
         spline = CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
         if delays.ndim == 2:
             return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
@@ -137,11 +137,11 @@ class Hypothesis:
 
     def signals(self, samples: MotionSamples) -> MotionSamples:
         """Return the samples of the joints, in SI units, for logged samples under this hypothesis."""
-        of_joint = _permuted(samples.values, self.source)
         delays = _per_signal(self.delay)
         if self.drift.any():
             delays = delays + samples.times[:, None, None] * _per_signal(self.drift)
-        signals = replace(samples, values=of_joint).at(delays) * _per_signal(self.scale)
+        values = samples.values if delays.any() else samples.central[..., None]
+        signals = replace(samples, values=_permuted(values, self.source)).at(delays) * _per_signal(self.scale)
         signals[..., 0] += self.offset
         return replace(samples, values=signals[..., None])
 
