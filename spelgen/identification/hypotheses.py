@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,7 +62,7 @@ class MotionSamples:
         """
         if not delays.any():
             return self.central
-        spline = CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
+        spline = _interpolation()
         if delays.ndim == 2:
             return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
         # times of later recordings are larger, so that the nearest sample is of the same recording
@@ -150,6 +151,12 @@ class Hypothesis:
         signals = samples.values.copy()
         signals[:, :, 0] -= self.offset[:, None]
         return replace(samples, values=signals / _per_signal(self.scale)[..., None])
+
+
+@cache
+def _interpolation() -> CubicSpline:
+    """Return the weights (E,) of the signals around a sample for their values at a time [s] after the sample."""
+    return CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
 
 
 def _per_signal(values: np.ndarray) -> np.ndarray:
