@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from spelgen.dynamics.constraint import mimic_constraint
+from spelgen.dynamics.tip_frame import last_link
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot, UrdfJoint
 
@@ -105,17 +106,3 @@ def tip_kinematics(
     if not names:
         raise ValueError("no joints are named")
     return TipKinematics(robot, names, link or last_link(robot, names))
-
-
-def last_link(robot: Robot, joints: Sequence[str]) -> str:
-    """Return the last link behind the given joints, for example a flange.
-
-    The search starts at the child link of the last joint. It follows fixed joints from parent to child, and ends at a
-    link with no fixed joint, or with several.
-    """
-    link = robot.joint[joints[-1]].child
-    while True:
-        fixed = [joint.child for joint in robot.joints_below[link] if joint.type == "fixed"]
-        if len(fixed) != 1:
-            return link
-        link = fixed[0]

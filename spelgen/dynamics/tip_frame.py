@@ -1,5 +1,6 @@
-"""The frame of the tip link of an arm."""
+"""The tip link of an arm, and its frame."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from spelgen.arm.arm import Body, lump_links, make_arm
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.dynamics.tip import last_link
+from spelgen.urdf.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,3 +50,17 @@ def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
         pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
         poses[link] = frame.body, pose
     return poses
+
+
+def last_link(robot: Robot, joints: Sequence[str]) -> str:
+    """Return the last link behind the given joints, for example a flange.
+
+    The search starts at the child link of the last joint. It follows fixed joints from parent to child, and ends at a
+    link with no fixed joint, or with several.
+    """
+    link = robot.joint[joints[-1]].child
+    while True:
+        fixed = [joint.child for joint in robot.joints_below[link] if joint.type == "fixed"]
+        if len(fixed) != 1:
+            return link
+        link = fixed[0]

@@ -19,11 +19,11 @@ from spelgen.emission.parts import (
     model_parts,
     term_names,
 )
-from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call
-from spelgen.emission.standalone import bundle, load_runtime, names_in
+from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call, names_in
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
 from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
+from spelgen.runtime import __all__ as RUNTIME
 from spelgen.spec import ModelSpec, spec_from_json
 from spelgen.templates import render
 
@@ -74,9 +74,11 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     title = f"Port-Hamiltonian model of an arm with {counted(len(spec.joints), 'joint')}, by `spelgen build`."
     context = {"title": title, "header": header(spec), "arm": arm, "model": model, "spec": spec.to_json()}
     if standalone:
+        from spelgen.emission.standalone import bundle
+
         return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
     # A module imports only the names that occur in its text.
-    used = names_in(ast.parse(f"{arm}\n{model}")) & load_runtime().public
+    used = names_in(ast.parse(f"{arm}\n{model}")) & set(RUNTIME)
     # ruff's order of imported names: classes first.
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
     return render("module.py.jinja", names=ordered, has_tensor=MASS_ENTRIES.text in names, **context)

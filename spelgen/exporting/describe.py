@@ -16,8 +16,8 @@ from torch import Tensor
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.protocol import motors_of, residual_terms
-from spelgen.dynamics.tip import last_link, tip_kinematics
-from spelgen.dynamics.tip_frame import tip_frame
+from spelgen.dynamics.tip import tip_kinematics
+from spelgen.dynamics.tip_frame import last_link, tip_frame
 from spelgen.errors import RunError
 from spelgen.exporting.description import (
     EntryPoint,
