@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Chain
 from spelgen.urdf.robot import Robot
 
 
@@ -43,12 +42,3 @@ def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
         if leader in columns:
             jacobian[row, columns[leader]] = multiplier
     return Constraint(tuple(moving), jacobian, offset)
-
-
-def body_constraint(arm: Chain) -> Constraint:
-    """Return the constraint that gives the joint positions of all bodies, including mimic joints, from q (n,)."""
-    jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
-    for row, body in enumerate(arm.bodies):
-        jacobian[row, body.coordinate] = float(body.multiplier)
-    offset = np.array([body.offset for body in arm.bodies], dtype=float)
-    return Constraint(tuple(body.name for body in arm.bodies), jacobian, offset)

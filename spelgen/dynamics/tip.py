@@ -10,7 +10,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from spelgen.dynamics.constraint import mimic_constraint
-from spelgen.dynamics.tip_frame import last_link
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot, UrdfJoint
 
@@ -93,7 +92,7 @@ def tip_kinematics(
 ) -> TipKinematics:
     """Return the kinematics of ``link``, by default the tip of the arm.
 
-    If no tip was specified, the default is the result of `last_link`.
+    If no tip was specified, the default is the result of `Robot.last_link`.
 
     arm: result of ``load_arm``, or the path of a URDF together with the names of its ``joints``. Raises ValueError if
     the link is not moved by these joints.
@@ -105,4 +104,4 @@ def tip_kinematics(
         link = link or arm.tip
     if not names:
         raise ValueError("no joints are named")
-    return TipKinematics(robot, names, link or last_link(robot, names))
+    return TipKinematics(robot, names, link or robot.last_link(names))

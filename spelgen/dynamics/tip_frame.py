@@ -1,6 +1,5 @@
-"""The tip link of an arm, and its frame."""
+"""The frame of the tip link of an arm."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +7,6 @@ import numpy as np
 from spelgen.arm.arm import Body, lump_links, make_arm
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.urdf.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +29,7 @@ class Tip:
 def tip_frame(loaded: Arm) -> Tip:
     """Return the frame of the tip link, with the unrounded angles of the URDF."""
     names = loaded.chain.joint_names
-    link = loaded.tip or last_link(loaded.robot, names)
+    link = loaded.tip or loaded.robot.last_link(names)
     # Rounded angles would displace the tip by up to the tolerance of the rounding times the extent of the arm.
     bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
     return Tip(link, *link_poses(loaded)[link], bodies)
@@ -50,17 +48,3 @@ def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
         pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
         poses[link] = frame.body, pose
     return poses
-
-
-def last_link(robot: Robot, joints: Sequence[str]) -> str:
-    """Return the last link behind the given joints, for example a flange.
-
-    The search starts at the child link of the last joint. It follows fixed joints from parent to child, and ends at a
-    link with no fixed joint, or with several.
-    """
-    link = robot.joint[joints[-1]].child
-    while True:
-        fixed = [joint.child for joint in robot.joints_below[link] if joint.type == "fixed"]
-        if len(fixed) != 1:
-            return link
-        link = fixed[0]

@@ -7,6 +7,8 @@ read is parsed, but not executed.
 import ast
 import json
 import re
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from textwrap import fill, wrap
 
@@ -23,7 +25,6 @@ from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call, name
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
 from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
-from spelgen.runtime import __all__ as RUNTIME
 from spelgen.spec import ModelSpec, spec_from_json
 from spelgen.templates import render
 
@@ -78,10 +79,19 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
 
         return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
     # A module imports only the names that occur in its text.
-    used = names_in(ast.parse(f"{arm}\n{model}")) & set(RUNTIME)
+    used = names_in(ast.parse(f"{arm}\n{model}")) & _public_names()
     # ruff's order of imported names: classes first.
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
     return render("module.py.jinja", names=ordered, has_tensor=MASS_ENTRIES.text in names, **context)
+
+
+@cache
+def _public_names() -> frozenset[str]:
+    """Return the names that a module can import from ``spelgen.runtime``."""
+    # The source is read, because the import of the package would import torch.
+    source = (files("spelgen") / "runtime" / "__init__.py").read_text(encoding="utf-8")
+    imports = [node for node in ast.parse(source).body if isinstance(node, ast.ImportFrom)]
+    return frozenset(alias.name for node in imports for alias in node.names)
 
 
 def class_summary(spec: ModelSpec) -> str:

@@ -17,7 +17,7 @@ from spelgen.arm.arm import Chain, lump_links
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
 from spelgen.arm.rational import rotation_from_rpy
-from spelgen.dynamics.constraint import body_constraint
+from spelgen.dynamics.body_constraint import body_constraint
 from spelgen.dynamics.pinocchio_arm import kinematic_model
 from spelgen.excitation.bounds import MotionBounds, Surroundings
 from spelgen.excitation.trajectory import Motion

@@ -17,7 +17,7 @@ from torch import Tensor
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.protocol import motors_of, residual_terms
 from spelgen.dynamics.tip import tip_kinematics
-from spelgen.dynamics.tip_frame import last_link, tip_frame
+from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.errors import RunError
 from spelgen.exporting.description import (
     EntryPoint,
@@ -82,7 +82,7 @@ class Trained:
     @property
     def tip(self) -> str:
         """The name of the tip link."""
-        return self.arm.tip or last_link(self.arm.robot, self.joint_names)
+        return self.arm.tip or self.arm.robot.last_link(self.joint_names)
 
     def prepared(self) -> PreparedModel:
         """Return the copy of the model from which ONNX and torch programs are made.

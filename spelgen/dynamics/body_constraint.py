@@ -1,0 +1,15 @@
+"""Joint positions of all bodies as a linear function of the coordinates of an arm, computed without Pinocchio."""
+
+import numpy as np
+
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.constraint import Constraint
+
+
+def body_constraint(arm: Chain) -> Constraint:
+    """Return the constraint that gives the joint positions of all bodies, including mimic joints, from q (n,)."""
+    jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
+    for row, body in enumerate(arm.bodies):
+        jacobian[row, body.coordinate] = float(body.multiplier)
+    offset = np.array([body.offset for body in arm.bodies], dtype=float)
+    return Constraint(tuple(body.name for body in arm.bodies), jacobian, offset)
