@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import spelgen
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.predictor import accurate_solver, roll_out_stiff
+from spelgen.baselines.predictor import Solver, roll_out_stiff
 from spelgen.baselines.registry import EvaluatedArm, urdf_values
 from spelgen.cli.main import app
 from spelgen.dynamics.bristles import moved_bristles
@@ -109,7 +109,7 @@ def test_the_method_has_order_two():
 def test_method_and_steps_are_those_that_the_dynamics_need(damping, tolerance):
     slider, windows = Slider(1.0, damping), pushed()
     windows.qd[:, 1:] = exact(slider, windows)
-    qd = accurate_solver(slider, windows)(windows)[1]
+    qd = Solver(slider, windows)(windows)[1]
     assert (qd - windows.qd[:, 1:]).abs().max() < tolerance
 
 
