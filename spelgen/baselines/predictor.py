@@ -165,7 +165,7 @@ TUNING = PredictorTuning()
 States = tuple[Tensor, Tensor]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solver:
     """The Rosenbrock method, with the fewest steps per sample interval that are accurate in the `probe` windows."""
 
