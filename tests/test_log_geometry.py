@@ -241,6 +241,26 @@ def test_a_slow_arm_with_right_torques_is_not_refused(arm):
     assert check_logs([slow], arm).errors == ()
 
 
+def test_gravity_along_all_axes_is_called_compensated(robots, tmp_path):
+    """With both axes horizontal, gravity along the axes gives the same torques as none."""
+    arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
+    upright = replace(arm, chain=replace(arm.chain, gravity=(0.0, -9.81, 0.0)))
+    error = told(upright, recorded(upright, 5, gravity=0.0))
+    assert "--accept gravity-compensated" in error and "'gravity: [0, 0, 0]' in the robot's YAML" in error
+    assert "or 'gravity" not in error
+
+
+def test_factors_of_torques_that_differ_are_stated_per_joint(robots, tmp_path):
+    arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
+    upright = replace(arm, chain=replace(arm.chain, gravity=(0.0, -9.81, 0.0)))
+    log = recorded(upright, 6)
+    error = told(upright, replace(log, tau=log.tau * [37.0, 11.0]))
+    gains = np.array(list(map(float, re.findall(r"gain: ([\d.e-]+)", error))))
+    assert "--accept torque-unit" in error
+    assert gains[1] / gains[0] == pytest.approx(37 / 11, rel=0.05)  # by the coupling of the joints
+    np.testing.assert_allclose(np.log(gains * [37.0, 11.0]), 0.0, atol=np.log(2))  # by the masses of the URDF
+
+
 LIFT = """<robot name="lift">
   <link name="base"/>
   {joints}
