@@ -213,21 +213,21 @@ class ServoLogs:
         if following is None:
             message = f"no {FILTER_SAMPLES} samples without a gap: no servo is determined"
             summary.notes.append(Diagnostic("warning", "idle-command", "logs", None, message))
-        exchanged = _exchanged_commands(following) if following else {}
-        if exchanged:
-            summary.errors.append(_exchange_error(exchanged, names, mapping))
-        of_sums = [0.0] * len(names)
+        exchanged = list[int]()
+        if following is not None and (wrong := _exchanged_commands(following, names, mapping)):
+            exchanged, error = wrong
+            summary.errors.append(error)
+        summed = following
         if following is not None and (following.correlation.diagonal() < FOLLOWS).any():
             sums = [x.q[0] + np.cumsum(require_commands(x), axis=0).clip(-1e6, 1e6) for x in self._logs]
-            summed = [replace(log, u=u) for log, u in zip(self._logs, sums, strict=True)]
-            tracking = measure_following(summed, saturation)
-            of_sums = tracking.correlation.diagonal().tolist() if tracking else of_sums
+            logs = [replace(log, u=u) for log, u in zip(self._logs, sums, strict=True)]
+            summed = measure_following(logs, saturation)
         completed = []
         for k, (coordinate, report) in enumerate(zip(self._arm.chain.coordinates, reports, strict=True)):
             odd = None
-            if following is not None:
+            if following is not None and summed is not None:
                 report = replace(report, following=following.joints[k])
-                odd = _odd_command(k, report, following, self._logs, of_sums[k])
+                odd = _odd_command(k, report, following, self._logs, summed.correlation[k, k])
             completed.append(report)
             if k in exchanged:
                 continue
@@ -262,30 +262,25 @@ class ServoLogs:
             summary.add(check, finding.message, "all joints", keys=finding.keys)
 
 
-def _exchanged_commands(following: Following) -> dict[int, int | None]:
-    """Return the joints whose command another joint tracks, with the joint whose column has their own command.
+def _exchanged_commands(
+    following: Following, joints: Sequence[str], mapping: LogMapping
+) -> tuple[list[int], LogError] | None:
+    """Return the joints whose commands are tracked by other joints, and the error about them; None if there are none.
 
-    The latter is None if no command moves as the joint does.
+    The error has the columns of the commands that these joints track.
     """
     tracks = following.correlation > FOLLOWS
-    exchanged: dict[int, int | None] = {}
-    for k in np.flatnonzero(following.moves & tracks.any(axis=1)).tolist():
-        if following.correlation[k, k] < 0.5:
-            exchanged[k] = next(iter(np.flatnonzero(tracks[:, k]).tolist()), None)
-    return exchanged
-
-
-def _exchange_error(exchanged: dict[int, int | None], joints: Sequence[str], mapping: LogMapping) -> LogError:
-    entries = {}
-    for k, source in exchanged.items():
-        if source is not None:
+    odd = following.moves & tracks.any(axis=1) & (following.correlation.diagonal() < 0.5)
+    exchanged, entries = np.flatnonzero(odd).tolist(), {}
+    for k in exchanged:
+        for source in np.flatnonzero(tracks[:, k])[:1].tolist():
             entries[joints[k]] = {"columns": {"u": mapping.column("u", joints[source])}}
-    names = ", ".join(repr(joints[k]) for k in exchanged)
     do = mapping_line({"joints": entries}) if entries else "check the names of the columns"
-    return LogError(
-        "commands that other joints follow, and these do not", element=f"joint {names}", expected="their own commands",
-        do=do,
-    )  # fmt: skip
+    where = f"joint {', '.join(repr(joints[k]) for k in exchanged)}"
+    got = "commands that other joints follow, and these do not"
+    return (
+        (exchanged, LogError(got, element=where, expected="their own commands", do=do)) if exchanged else None
+    )
 
 
 def _odd_command(
