@@ -192,12 +192,16 @@ class TorqueUnit(WrongScale):
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield the fits with each candidate, and with a factor of its own for each joint if the factors differ."""
+        if self in base.hypothesis.faults or not self.factors:
+            return
         fits = list(super().fits(problem, base))
         yield from fits
-        best = lowest = min(fits, key=lambda fit: fit.cost, default=base)
-        n = len(base.hypothesis.offset)
+        best = lowest = min(fits, key=lambda fit: fit.cost)
+        is_open = np.any(
+            [factor[1] != 1 for factor in self.factors], axis=0
+        )  # not of a unit that is declared
         # the couplings of the joints show the ratios of the factors, and the URDF's masses a common factor
-        for joints in (*np.eye(n), np.ones(n)) if fits else ():
+        for joints in (*np.eye(len(is_open))[is_open], 1.0 * is_open):
             exponent = minimize_scalar(
                 lambda x, fit=best, joints=joints: self._scaled(problem, fit, np.exp(x * joints)).cost,
                 bounds=(-np.log(10), np.log(10)), method="bounded", options={"xatol": 0.05},
@@ -208,10 +212,10 @@ class TorqueUnit(WrongScale):
             yield best
 
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
-        """Return the fit with torques that are multiplied by further factors (n,), rounded to two digits."""
-        motion, torque = fit.hypothesis.scale
-        rounded = np.array([float(f"{x:.2g}") for x in torque * factors])
-        return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded])))
+        """Return the fit with torques that are multiplied by further factors (n,), rounded to two digits in all."""
+        (motion, torque), present = fit.hypothesis.scale, problem.unchanged.scale[1]
+        rounded = np.array([float(f"{x:.2g}") for x in torque * factors / present])
+        return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * present])))
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints whose torque has another unit."""
