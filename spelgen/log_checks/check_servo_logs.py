@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -213,29 +213,27 @@ class ServoLogs:
         if following is None:
             message = f"no {FILTER_SAMPLES} samples without a gap: no servo is determined"
             summary.notes.append(Diagnostic("warning", "idle-command", "logs", None, message))
-        exchanged = list[int]()
-        if following is not None and (wrong := _exchanged_commands(following, names, mapping)):
-            exchanged, error = wrong
-            summary.errors.append(error)
-        summed = following
+        exchanged, summed = list[int](), following
         if following is not None and (following.correlation.diagonal() < FOLLOWS).any():
+            exchanged = _exchanged_commands(following)
+            if exchanged:
+                summary.errors.append(_exchange_error(exchanged, names, following, mapping))
             sums = [x.q[0] + np.cumsum(require_commands(x), axis=0).clip(-1e6, 1e6) for x in self._logs]
             logs = [replace(log, u=u) for log, u in zip(self._logs, sums, strict=True)]
             summed = measure_following(logs, saturation)
         completed = []
         for k, (coordinate, report) in enumerate(zip(self._arm.chain.coordinates, reports, strict=True)):
-            odd = None
-            if following is not None and summed is not None:
+            if following is not None:
                 report = replace(report, following=following.joints[k])
-                odd = _odd_command(k, report, following, self._logs, summed.correlation[k, k])
             completed.append(report)
             if k in exchanged:
                 continue
-            if isinstance(odd, LogError):
-                summary.errors.append(odd)
-                continue
-            if odd is not None:
-                summary.notes.append(odd)
+            if following is not None and summed is not None:
+                wrong = _command_error(k, report, following, summed.correlation[k, k])
+                if wrong is not None:
+                    summary.errors.append(wrong)
+                    continue
+                summary.notes.extend(_command_warning(k, report, following, self._logs))
             for check, found in run_checks(POSITION_CHECKS, JointEvidence(coordinate, report)):
                 summary.add(check, found.message, f"joint {coordinate.name!r}")
         for log in self._logs:
@@ -262,77 +260,75 @@ class ServoLogs:
             summary.add(check, finding.message, "all joints", keys=finding.keys)
 
 
-def _exchanged_commands(
-    following: Following, joints: Sequence[str], mapping: LogMapping
-) -> tuple[list[int], LogError] | None:
-    """Return the joints whose commands are tracked by other joints, and the error about them; None if there are none.
+def _exchanged_commands(following: Following) -> list[int]:
+    """Return the joints whose commands other joints track."""
+    is_tracked = following.moves & (following.correlation > FOLLOWS).any(axis=1)
+    return np.flatnonzero(is_tracked & (following.correlation.diagonal() < 0.5)).tolist()
 
-    The error has the columns of the commands that these joints track.
-    """
-    tracks = following.correlation > FOLLOWS
-    odd = following.moves & tracks.any(axis=1) & (following.correlation.diagonal() < 0.5)
-    exchanged, entries = np.flatnonzero(odd).tolist(), {}
+
+def _exchange_error(
+    exchanged: Sequence[int], joints: Sequence[str], following: Following, mapping: LogMapping
+) -> LogError:
+    """Return the error about joints whose commands other joints track, with the columns that these joints track."""
+    entries = {}
     for k in exchanged:
-        for source in np.flatnonzero(tracks[:, k])[:1].tolist():
+        for source in np.flatnonzero(following.correlation[:, k] > FOLLOWS)[:1].tolist():
             entries[joints[k]] = {"columns": {"u": mapping.column("u", joints[source])}}
     do = mapping_line({"joints": entries}) if entries else "check the names of the columns"
     where = f"joint {', '.join(repr(joints[k]) for k in exchanged)}"
     got = "commands that other joints follow, and these do not"
-    return (
-        (exchanged, LogError(got, element=where, expected="their own commands", do=do)) if exchanged else None
-    )
+    return LogError(got, element=where, expected="their own commands", do=do)
 
 
-def _odd_command(
-    k: int, report: JointReport, following: Following, logs: Sequence[Trajectory], of_sum: float
-) -> LogError | Diagnostic | None:
-    """Return the finding about the logged command of joint k, or None.
+def _command_error(k: int, report: JointReport, following: Following, of_sum: float) -> LogError | None:
+    """Return the error that the column cannot contain the commands of joint k; None if it can.
 
-    The finding is an error if the column cannot contain the commands of this joint, otherwise a warning. of_sum:
-    correlation of the sum of the commands with the position.
+    of_sum: correlation of the sum of the commands with the position.
     """
-    where = f"joint {report.name!r}"
     # correlation and gain at the delay with the largest correlation, so that a slow servo is not reported as a fault
-    correlation, gain, offset = following.correlation[k, k], following.gain[k], following.offset[k]
-    # the logger wrote measured positions in place of commands
-    if all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs):
-        code, message = (
-            "commands-are-positions",
-            "u is q, to the last bit: are the commands those that were sent?",
-        )
+    correlation, gain = following.correlation[k, k], following.gain[k]
     # a ratio of amplitudes of about 57.3 or 1/57.3 shows that the command or the position is in degrees
-    elif correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
+    if correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         units = {"q": "deg", "u": "rad"} if gain > 1 else {"q": "rad", "u": "deg"}
-        do = mapping_line({"joints": {report.name: {"units": units}}})
-        return LogError(got, element=where, expected="both in radians", do=do)
+        expected, do = "both in radians", mapping_line({"joints": {report.name: {"units": units}}})
     elif of_sum > FOLLOWS > correlation:
         got = f"increments: the position follows the sum of the commands (correlation {of_sum:.2g})"
-        do = "log the commanded positions, or add the increments up"
-        return LogError(got, element=where, expected="commanded positions", do=do)
-    # a constant command contains no information on the servo
+        expected, do = "commanded positions", "log the commanded positions, or add the increments up"
+    elif following.moves[k] and correlation < -FOLLOWS:
+        got = f"positions that move against commands (correlation {correlation:.2g})"
+        expected = "one sense"
+        do = "multiply one of both columns by -1: the setting 'sign' applies to q and u alike"
+    else:
+        return None
+    return LogError(got, element=f"joint {report.name!r}", expected=expected, do=do)
+
+
+def _command_warning(
+    k: int, report: JointReport, following: Following, logs: Sequence[Trajectory]
+) -> Iterator[Diagnostic]:
+    """Yield the warning that the logged command of joint k may not be what its servo tracks, if there is one."""
+    correlation, offset, delay = following.correlation[k, k], following.offset[k], following.delay[k, k]
+    if all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs):
+        # the logger wrote measured positions in place of commands
+        code = "commands-are-positions"
+        message = "u is q, to the last bit: are the commands those that were sent?"
     elif not following.moves[k]:
+        # a constant command contains no information on the servo
         width = report.high["u"] - report.low["u"]
         code, message = "idle-command", f"its command moves by only {width:.3g}: its servo is not determined"
-    elif correlation < -FOLLOWS:
-        got = f"positions that move against commands (correlation {correlation:.2g})"
-        do = "multiply one of both columns by -1: the setting 'sign' applies to q and u alike"
-        return LogError(got, element=where, expected="one sense", do=do)
     elif correlation < 0.5:
         code, message = "not-following", f"it does not follow its command (correlation {correlation:.2g})"
     elif abs(offset) > OTHER_ZERO:
-        unit = UNITS[report.kind].position
-        code, message = (
-            "command-offset",
-            f"its command is {abs(offset):.3g} {unit} {'above' if offset > 0 else 'below'} its position throughout: "
-            "q and u have different zeros, or the servo is too soft for its load",
-        )
-    elif following.delay[k, k] >= 0:
-        return None
+        side = f"{UNITS[report.kind].position} {'above' if offset > 0 else 'below'} its position throughout"
+        code = "command-offset"
+        message = f"its command is {abs(offset):.3g} {side}: other zeros of q and u, or a servo too soft for its load"
+    elif delay < 0:
+        code = "ahead-of-command"
+        message = f"positions come {-1000 * delay:.0f} ms before commands: are rows shifted?"
     else:
-        early = f"{-1000 * following.delay[k, k]:.0f} ms"
-        code, message = "ahead-of-command", f"positions come {early} before commands: are rows shifted?"
-    return Diagnostic("warning", code, where, None, message)
+        return
+    yield Diagnostic("warning", code, f"joint {report.name!r}", None, message)
 
 
 def _following_table(joints: Sequence[JointReport]) -> Listing:
