@@ -15,10 +15,7 @@ def test_the_legend_has_the_curves_that_are_visible():
         ],
         "title", "t [s]", "torque [Nm]", limits=(0.0, 1.0),
     )  # fmt: skip
-    assert [(entry.style, entry.label) for entry in chart.legend] == [
-        ("line model", "inside"),
-        ("band model", "spread"),
-    ]
+    assert chart.legend == (("line model", "inside"), ("band model", "spread"))
     assert "partly outside: far above" in chart.svg
 
 

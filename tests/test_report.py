@@ -237,7 +237,7 @@ def test_a_folder_without_a_run_is_refused_with_a_remedy(tmp_path):
     with pytest.raises(RunError) as told:
         write_report(tmp_path / "nothing")
     assert str(told.value).endswith(
-        "got no run, expected a folder with spec.json; make one with `spelgen train`"
+        "got no such run, expected a folder with spec.json; make one with `spelgen train`"
     )
     assert not (tmp_path / "nothing").exists()
 

@@ -15,7 +15,7 @@ from spelgen.settings.simulation import TrackingSettings
 from spelgen.simulation import tracking
 from spelgen.simulation.protocol import initial_range, make_friction, paths, sines
 from spelgen.simulation.simulate import simulate
-from spelgen.simulation.tracking import measured, record, track, tuned_gains
+from spelgen.simulation.tracking import measured, record, track
 from tests.hand_built import arm, body, coordinate, point, slider
 
 N = 6
@@ -195,7 +195,7 @@ def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
     engine = arm_dynamics(loaded.chain, loaded.settings, friction)
     still = sines(np.full(N, 0.4), 0.0, 0.125, np.zeros(N), np.arange(50) / 125)
     settings = changed(loaded.settings, duration=0.4)
-    held = record(engine, friction, np.eye(N), still, tuned_gains(np.zeros(N), 3.0), settings)
+    held = record(engine, friction, np.eye(N), still, settings, np.zeros(N), 0.0)
     np.testing.assert_allclose(held.states[:, :N], 0.4, atol=1e-12)
     assert np.abs(held.tau).max() > 1
 

@@ -19,6 +19,7 @@ from spelgen.fitting.train import train
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import Rollout
+from spelgen.simulation.as_built import urdf_without
 from spelgen.urdf import xacro_input
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf
@@ -102,6 +103,14 @@ class TestExpansion:
         arm.write_text(ARM.replace("<link", '<xacro:property name="pi" value="3"/><link'))
         (warning,) = [each for each in read_urdf(arm).diagnostics if each.code == "xacro-warning"]
         assert warning.message == "redefining global symbol: pi"
+
+    def test_simulated_arms_are_of_the_expanded_document(self, arm):
+        """`compare` and `simulate --as-built` write URDFs without some elements, and without comments."""
+        root = urdf_without(arm, "inertial")
+        assert {element.tag for element in root.iter()} == {
+            "robot", "link", "joint", "parent", "child", "origin", "axis",
+        }  # fmt: skip
+        assert [link.get("name") for link in root.iter("link")] == ["base", "link1", "link2"]
 
     def test_gives_the_same_bytes_from_every_folder(self, arm, monkeypatch):
         absolute = urdf_bytes(arm)

@@ -5,9 +5,7 @@ configuration fails this test with a probability above 1 - 1e-9 (Schwartz 1980, 
 """
 
 import random
-from collections.abc import Sequence
 from fractions import Fraction
-from functools import cached_property
 
 import numpy as np
 
@@ -29,17 +27,34 @@ class Axes:
 
     A test is True if the relation holds at every configuration. assume: ``inertials`` for the inertial parameters of
     the URDF; with ``kinematics`` they are unknown, and all tests of the last body's balance are False.
+
+    Attributes:
+        centred: Whether the centre of mass of the last body in the URDF is on the axis of the last joint.
+        balanced: Whether the last body is dynamically balanced: the axis of the last joint is then a principal axis of
+            inertia through the centre of mass of the body.
+        symmetric: Whether the inertia of the last body, in the frame of its parent, does not depend on the last joint.
+        without_inertia: Whether the last body has no moment of inertia about the axis of the last joint.
     """
 
     def __init__(self, arm: Chain, assume: Assume = "kinematics"):
         self.arm = arm
-        self.assume = assume
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
         generator = random.Random(0)  # The seed is fixed, so that reports are reproducible.
         # Each configuration has the directions (n, 3) and the twists (n, 6) of the axes. Two configurations suffice:
         # the probability that a false relation holds by chance at one of them is about (degree of its polynomial) /
         # 1e6.
         self._configurations = [_configuration(arm, generator) for _ in range(2)]
+        # The tests of balance are for a revolute joint with known inertials. In all other cases the inertial parameters
+        # are set to 1, for which all these tests are False.
+        last = arm.bodies[-1]
+        inertia: tuple[Fraction, ...] = (Fraction(1),) * 10
+        if assume == "inertials" and last.inertia is not None and last.joint_type == "revolute":
+            inertia = last.inertia
+        _, hx, hy, _, xx, xy, xz, yy, yz, zz = inertia
+        self.centred = not hx and not hy
+        self.balanced = self.centred and not xz and not yz
+        self.symmetric = self.balanced and xx == yy and not xy
+        self.without_inertia = not zz
 
     def parallel(self, a: int, b: int) -> bool:
         return all(_are_parallel(axes[a], axes[b]) for axes, _ in self._configurations)
@@ -88,40 +103,6 @@ class Axes:
             if not all(_is_orthogonal(twists[joint], normal) for joint in later):
                 return False
         return True
-
-    @cached_property
-    def centred(self) -> bool:
-        """Whether the centre of mass of the last body in the URDF is on the axis of the last joint."""
-        return not any(self._last_inertia[1:3])
-
-    @cached_property
-    def balanced(self) -> bool:
-        """Whether the last body is dynamically balanced.
-
-        The axis of the last joint is then a principal axis of inertia through the centre of mass of the body.
-        """
-        xz, yz = self._last_inertia[6], self._last_inertia[8]
-        return self.centred and not xz and not yz
-
-    @cached_property
-    def symmetric(self) -> bool:
-        """Whether the inertia of the last body, in the frame of its parent, does not depend on the last joint."""
-        xx, xy, yy = self._last_inertia[4], self._last_inertia[5], self._last_inertia[7]
-        return self.balanced and xx == yy and not xy
-
-    @cached_property
-    def without_inertia(self) -> bool:
-        """Whether the last body has no moment of inertia about the axis of the last joint."""
-        return not self._last_inertia[9]
-
-    @cached_property
-    def _last_inertia(self) -> Sequence[Fraction]:
-        body = self.arm.bodies[-1]
-        if self.assume == "inertials" and body.inertia is not None and body.joint_type == "revolute":
-            return body.inertia
-        # The tests of balance are for a revolute joint with known inertials. In all other cases the inertial parameters
-        # are set to 1, for which all these tests are False.
-        return (Fraction(1),) * 10
 
     def is_weightless(self, joint: int) -> bool:
         """Whether the joint does no work against gravity: it slides horizontally, or rotates about a vertical axis."""

@@ -117,7 +117,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
     powers: one tuple (angle, power of its sine, power of its cosine) per angle of the product.
     """
     # A key (angle, k) of `waves` represents cos(angle - k pi/2), for example k = 1: cos(x - pi/2) = sin(x).
-    waves: dict[tuple[Expr, int], fmpq] = {(Integer(0), 0): fmpq(1)}
+    waves = {(Integer(0), 0): fmpq(1)}
     for angle, sines, cosines in powers:
         for quarter in [1] * sines + [0] * cosines:
             products: dict[tuple[Expr, int], fmpq] = {}

@@ -26,7 +26,7 @@ from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name, parameter_name
 from spelgen.listing import Listing
 from spelgen.structure.base_parameters import BaseParameter, base_parameters, rational
-from spelgen.structure.expansion import Budget, Expansion, TooLarge
+from spelgen.structure.expansion import Expansion, TooLarge
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 
@@ -127,11 +127,9 @@ class Formulas:
     @property
     def trusted(self) -> str:
         """Text about the inertial parameters for which the formulas are valid: any, or with the zeros of the URDF."""
-        return (
-            "the URDF's inertial zeros and symmetries"
-            if self.assume == "inertials"
-            else "any inertial values"
-        )
+        if self.assume == "inertials":
+            return "the URDF's inertial zeros and symmetries"
+        return "any inertial values"
 
     @property
     def written(self) -> tuple[Formula, ...]:
@@ -172,7 +170,7 @@ def formulas(
     n = len(arm.coordinates)
     entries: list[Entry] = [*((row + 1, column + 1) for row, column in triangle(n)), "V"]
     if entry is not None:
-        lower: Entry = entry if entry == "V" else (max(entry), min(entry))
+        lower = entry if entry == "V" else (max(entry), min(entry))
         # M is symmetric, and only its lower triangle is computed: entry 2,1 is returned for 1,2.
         if lower not in entries:
             expected = f"a row and a column from 1 to {n}, or V"
@@ -182,10 +180,9 @@ def formulas(
         # Entries of up to 40 terms, about three lines of a terminal, can be read.
         longest = 40 if entry is None else WRITABLE
     writer = _Writer(arm, structure)
-    budget = Budget(2_000_000)  # number of multiplications of terms, about 2 s
-    # Entries of joints close to the tip are short. They are expanded first, so that they are complete if the budget
-    # does not suffice for all entries.
-    rows = [writer.formula(x, longest, budget) for x in reversed(entries)]
+    # Entries of joints close to the tip are short. They are expanded first, so that they are complete if the budget of
+    # the expansion does not suffice for all entries.
+    rows = [writer.formula(x, longest) for x in reversed(entries)]
     # For a single entry, only the base parameters in its expression are listed.
     base = writer.base
     if entry is not None:
@@ -203,26 +200,26 @@ class _Writer:
         self._expansion = Expansion(arm)
         self._writer = PolynomialWriter(arm, self._expansion.context)
 
-    def formula(self, entry: Entry, longest: int, budget: Budget) -> Formula:
+    def formula(self, entry: Entry, longest: int) -> Formula:
         """Return the closed form of an entry, without expression if it has more than ``longest`` terms.
 
         An expansion that exceeds the budget has no expression either.
         """
         try:
-            polynomials = self._polynomials(entry, budget)
+            polynomials = self._polynomials(entry)
         except TooLarge:
             return Formula(entry, None, None)
         # The terms are counted before the conversion to SymPy, which would be slow for an entry that is too long.
         terms = sum(map(len, polynomials.values()))
         if terms > longest:
             return Formula(entry, terms, None)
-        present = {name: polynomial for name, polynomial in polynomials.items() if polynomial}
-        functions = [
-            (parameter(name), self._writer.terms(polynomial)) for name, polynomial in present.items()
-        ]
+        functions = []
+        for name, polynomial in polynomials.items():
+            if polynomial:
+                functions.append((parameter(name), self._writer.terms(polynomial)))
         return Formula(entry, terms, grouped(functions))
 
-    def _polynomials(self, entry: Entry, budget: Budget) -> dict[str, fmpq_mpoly]:
+    def _polynomials(self, entry: Entry) -> dict[str, fmpq_mpoly]:
         """Return {base parameter: coefficient of this parameter in an entry of M, or in V without its constant}.
 
         A coefficient is a polynomial in sines, cosines and positions of the joints. Raises TooLarge if the expansion
@@ -235,7 +232,7 @@ class _Writer:
         for base in self.base:
             # The first inertial parameter of a base parameter occurs in no other base parameter. Its coefficient in M
             # or V is therefore the coefficient of the base parameter.
-            polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index, budget))
+            polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index))
             # V is determined up to a constant: constant terms are omitted.
             if entry == "V":
                 polynomial -= polynomial[(0,) * self._expansion.context.nvars()]

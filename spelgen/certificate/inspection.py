@@ -82,7 +82,8 @@ class Inspection:
         is_fixed = self.structure.assume == "inertials"
         trusted = "the URDF's inertial values" if is_fixed else "any inertial values"
         heading = f"{printable(self.arm.name)}: structure for {trusted}"
-        paragraphs = [heading, self._joint_table(), self._matrix(), self._needs()]
+        needs = [f"{name:<5} {need}" for name, need in self.needs().items()]
+        paragraphs = [heading, self._joint_table(), self._matrix(), _indented("The model needs", needs, 8)]
         if self.facts:
             paragraphs.append(_indented("In words", map(str, self.facts)))
         if self.diagnostics:
@@ -113,7 +114,7 @@ class Inspection:
         n = len(self.structure.joints)
         # The JSON object contains zero entries of G too, unlike `actuation.entries`.
         values = {(entry.row, entry.column): (entry.kind, entry.value) for entry in self.actuation.entries}
-        entries: list[dict[str, object]] = []
+        entries = []
         for row, column in product(range(n), repeat=2):
             kind, value = values.get((row, column), ("zero", 0.0))
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
@@ -216,22 +217,16 @@ class Inspection:
             "base": f"{structure.base_parameter_count} base inertial parameters",
         }
 
-    def _needs(self) -> str:
-        lines = ["The model needs"]
-        for name, need in self.needs().items():
-            lines += textwrap.wrap(need, WIDTH, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
-        return "\n".join(lines)
-
 
 def _rows(entries: Iterable[InputEntry]) -> str:
     """Return the joints in whose rows of G these entries are, as text."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
 
 
-def _indented(title: str, paragraphs: Iterable[str]) -> str:
+def _indented(title: str, paragraphs: Iterable[str], indent: int = 4) -> str:
     lines = [title]
     for paragraph in paragraphs:
-        lines += textwrap.wrap(paragraph, WIDTH, initial_indent="  ", subsequent_indent="    ")
+        lines += textwrap.wrap(paragraph, WIDTH, initial_indent="  ", subsequent_indent=" " * indent)
     return "\n".join(lines)
 
 

@@ -39,17 +39,13 @@ class NumericSamples:
             configurations; for mass[1 + k], coordinate k has another random position.
         scale: (n(n+1)/2,), sqrt(mean M_ii * mean M_jj) for the entry (i, j), with means over the samples.
         gravity: (S, n), gravity torque dV/dq divided by its largest magnitude.
+        changes: changes of M / scale due to a change of one coordinate, (n, S, n(n+1)/2): mass[1:] - mass[0].
     """
 
     mass: np.ndarray
     scale: np.ndarray
     gravity: np.ndarray
-
-    @property
-    def changes(self) -> np.ndarray:
-        """Changes of M / scale due to a change of one coordinate, (n, S, n(n+1)/2): mass[1:] - mass[0]."""
-        result: np.ndarray = self.mass[1:] - self.mass[0]
-        return result
+    changes: np.ndarray
 
 
 def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:
@@ -75,7 +71,8 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
     scale[scale == 0] = 1.0
     # Without gravity, all torques are zero and are divided by 1.
     largest = np.abs(gravity).max() or 1.0
-    return NumericSamples(mass[:, :, rows, columns] / scale, scale, gravity / largest)
+    mass = mass[:, :, rows, columns] / scale
+    return NumericSamples(mass, scale, gravity / largest, mass[1:] - mass[0])
 
 
 def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:

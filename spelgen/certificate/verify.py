@@ -14,13 +14,7 @@ from typing import Literal
 import numpy as np
 
 from spelgen.arm.arm import Chain
-from spelgen.certificate.numeric_samples import (
-    ENGINE,
-    NumericSamples,
-    differences_of_reading,
-    draw,
-    regressor,
-)
+from spelgen.certificate import numeric_samples
 from spelgen.errors import shortened
 from spelgen.labels import entry_name, joints_in_ranges
 from spelgen.listing import WIDTH, Listing
@@ -162,25 +156,25 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
     rng = np.random.default_rng(seed)
     is_random = structure.assume == "kinematics"
     # All facts are checked on the same samples: with other samples for each fact, an error could pass by chance.
-    samples = draw(arm, count, rng, random_inertials=is_random)
+    samples = numeric_samples.draw(arm, count, rng, random_inertials=is_random)
     facts = [
         *_entries(structure, samples),
         _smallest_form(structure, samples),
         *_ranks(structure, samples),
         _potential(structure, samples),
-        _rank("base parameters", regressor(arm, rng), structure.base_parameter_count),
+        _rank("base parameters", numeric_samples.regressor(arm, rng), structure.base_parameter_count),
     ]
     is_fine = _is_fine(arm, structure)
     checks = [fact.check(is_fine) for fact in facts]
     inertials = "inertial values of its own" if is_random else "the URDF's inertial values"
-    means = f"{ENGINE} at {count} random configurations, each with {inertials}"
+    means = f"{numeric_samples.ENGINE} at {count} random configurations, each with {inertials}"
     return Verification(means, count, seed, (*checks, *_reading_checks(robot, arm, seed)))
 
 
 def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
     """Yield checks that compare the chain with the reading of the URDF by Pinocchio."""
     try:
-        differences = differences_of_reading(robot, arm, seed)
+        differences = numeric_samples.differences_of_reading(robot, arm, seed)
     except Exception as problem:  # A failure of Pinocchio is no evidence about the chain.
         text = " ".join(str(problem).split())[:120]
         result = f"Pinocchio cannot read it ({type(problem).__name__}: {text})"
@@ -200,13 +194,13 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
         yield FactCheck(f"{difference.quantity} in the file", "as Pinocchio reads them", result, verdict)
 
 
-def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
+def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
     """Yield two facts: which entries of M are zero, and on which joints each entry depends."""
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     # (entries, n), largest change of each entry of M when only one joint moves
     largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()
-    zeros: list[Magnitude] = []
-    pairs: list[Magnitude] = []
+    zeros = []
+    pairs = []
     dependent = 0
     for entry, size, changes in zip(structure.entries, largest, largest_changes, strict=True):
         name = entry_name(entry.row, entry.column)
@@ -221,7 +215,7 @@ def _entries(structure: Structure, samples: NumericSamples) -> Iterator[_Derived
     yield _DerivedFact("dependence on joints", derived, pairs)
 
 
-def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFact:
+def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
     """Return the fact that M = sum_k c_k A_k + sum_j f_j(q) B_j with constants c_k and outputs f_j.
 
     Each f_j must depend only on its own joints, the c_k on none. A_k and B_j are constant matrices.
@@ -247,7 +241,7 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFac
     return _DerivedFact("smallest form", derived, magnitudes, rounding=1e-6)
 
 
-def _ranks(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFact]:
+def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
     """Yield facts about numbers of terms of M; each number must be equal to the rank of a matrix of samples.
 
     The numbers are: outputs (terms that vary with q); outputs and constants; and, for k = 0, 1, ..., the outputs that
@@ -270,7 +264,7 @@ def _ranks(structure: Structure, samples: NumericSamples) -> Iterator[_DerivedFa
     yield _DerivedFact("outputs without the first 0, 1, ... joints", ", ".join(counts), magnitudes)
 
 
-def _potential(structure: Structure, samples: NumericSamples) -> _DerivedFact:
+def _potential(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
     """Return the fact that V depends only on the derived joints: the gravity torque of all other joints is zero."""
     magnitudes = []
     for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):

@@ -1,20 +1,18 @@
 """The arms, models and logs of a comparison, which is specified by a URDF with options, or by a YAML file."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Self
 
 import numpy as np
 import yaml
 from lxml import etree
 from pydantic import Field, StringConstraints
 
-from spelgen.arm.configured_arm import load_arm
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.design import PRESET_NAMES, Design, load_design
 from spelgen.errors import LogError, RunError, SettingsError, collect, suggestion
 from spelgen.files import read_json, remove, write_bytes, write_json, write_text
@@ -27,10 +25,6 @@ from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group
 from spelgen.settings.yaml_document import Location, dotted, read_document, validated
-
-if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import Arm
-
 
 YAML = (".yaml", ".yml")
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,60}$")]
@@ -49,14 +43,7 @@ class ComparedArm(Group):
     joints: tuple[str, ...] | None = None
     tip: str | None = None
 
-    def files(self) -> Iterator[tuple[str, Path]]:
-        """Yield (key, path) for each path of the arm, with the key of the path in the YAML file of the comparison."""
-        yield "urdf", self.urdf
-        yield from (("data", path) for path in self.data)
-        if self.mapping is not None:
-            yield "mapping", self.mapping
-
-    def in_folder(self, folder: Path) -> ComparedArm:
+    def in_folder(self, folder: Path) -> Self:
         """Return the arm with its relative paths resolved against a folder."""
         mapping = None if self.mapping is None else folder / self.mapping
         data = tuple(folder / path for path in self.data)
@@ -134,9 +121,11 @@ def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Loca
         if preset not in (*PRESET_NAMES, *ablation_designs()) and not _is_file(preset):
             yield ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
     for name, arm in comparison.arms.items():
-        for key, file in arm.files():
-            if not (folder / file).exists():
-                yield ("arms", name, key), f"no such file: {file}", "check the path"
+        paths = {"urdf": [arm.urdf], "data": arm.data, "mapping": [arm.mapping] if arm.mapping else []}
+        for key, files in paths.items():
+            for file in files:
+                if not (folder / file).exists():
+                    yield ("arms", name, key), f"no such file: {file}", "check the path"
 
 
 Progress = Callable[[int, int], None]
@@ -225,7 +214,8 @@ def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress |
     no model starts from the true parameters.
     """
     # The simulation needs Pinocchio, an optional dependency. A comparison on logs of the user does not need it, so the
-    # import is in this function.
+    # imports are in this function.
+    from spelgen.simulation.as_built import urdf_without
     from spelgen.simulation.simulate import simulate
 
     if loaded.settings.input == "position":
@@ -245,16 +235,7 @@ def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress |
         training = [log[: int((log.t - log.t[0] < first - 1e-9).sum())] for log in training]
     write_logs(folder / "train.parquet", training, loaded.chain.joint_names)
     write_logs(folder / "test.parquet", logs.test, loaded.chain.joint_names)
-    write_bytes(inputs.urdf, _kinematics(loaded.robot.path))
+    kinematics = urdf_without(loaded.robot.path, "dynamics", "visual", "collision", "inertial")
+    write_bytes(inputs.urdf, etree.tostring(kinematics, xml_declaration=True, encoding="utf-8"))
     write_text(inputs.urdf.with_suffix(".yaml"), yaml.safe_dump({"gravity": list(loaded.settings.gravity)}))
     write_json(complete, {"digest": inputs.digest})
-
-
-def _kinematics(urdf: Path) -> bytes:
-    """Return a URDF without inertials, friction, visuals and collision bodies."""
-    # The parser needs no limits of size and entities, because `load_arm` has checked them when it read the URDF.
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
-    tree = etree.ElementTree(etree.fromstring(urdf.read_bytes(), parser))
-    for element in list(tree.iter("dynamics", "visual", "collision", "inertial")):
-        element.getparent().remove(element)
-    return bytes(etree.tostring(tree, xml_declaration=True, encoding="utf-8"))

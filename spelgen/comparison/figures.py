@@ -3,31 +3,26 @@
 Source: Wang, Chen and Ding, Sci Rep 15:33179 (2025).
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.dynamics.parameters import parameter_count
+from spelgen.emission.assemble import ArmModel
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
 from spelgen.evaluation.plain import Curve, finite
 from spelgen.evaluation.rollout import energy_rise, mass_error, smallest_eigenvalue, true_mass
+from spelgen.fitting.fitted import Fit
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import DEFAULTS, Rollout
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-    from spelgen.fitting.fitted import Fit
 
 
 @dataclass(frozen=True)
@@ -97,7 +92,7 @@ def simulated_figures(
     example = predict_example(of_dynamics("", model, far), testing, steps, decimation)
     mass = None if example is None else model.mass_matrix(torch.from_numpy(example.q)).numpy()
     loss, position, velocity = prediction_loss(model, far, substeps)
-    losses: Figures = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
+    losses = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
     losses["M, relative error"] = mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints))
     # The training loss and the test loss are computed from windows as long as the windows of the training, and not from
     # windows of 1 s.

@@ -1,12 +1,10 @@
 """One run of a comparison: build a model from a preset, train it, and evaluate it on the test logs."""
 
-from __future__ import annotations
-
 import hashlib
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import Self, cast
 
 import torch
 from pydantic import TypeAdapter, ValidationError
@@ -14,10 +12,12 @@ from pydantic import TypeAdapter, ValidationError
 from spelgen.comparison.arms import ArmInputs, ablation_designs
 from spelgen.comparison.figures import SimulatedFigures, simulated_figures
 from spelgen.design import Design, load_design
+from spelgen.emission.assemble import ArmModel
 from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.plain import record
+from spelgen.evaluation.results import Results
 from spelgen.files import read_json, write_json
 from spelgen.fitting.fit import FitOptions, RunOptions, fit
 from spelgen.fitting.run_folder import RunFolder
@@ -25,15 +25,10 @@ from spelgen.fitting.tuning import TUNING as WINDOWS
 from spelgen.labels import MODEL, observed, thousandths
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-from spelgen.settings.fits import Rollout, fit_config
+from spelgen.settings.fits import FitConfig, Rollout, fit_config
 from spelgen.settings.training import ComparisonSettings, TrainingSettings
 from spelgen.settings.values import Group
 from spelgen.version import __version__
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-    from spelgen.evaluation.results import Results
-    from spelgen.settings.fits import FitConfig
 
 Errors = dict[str, dict[str, float | None]]
 """Measure -> predictor -> error; None for an error that is not finite. The first measure ranks the models."""
@@ -59,7 +54,7 @@ class RunResult:
     simulated: SimulatedFigures | None
 
     @classmethod
-    def read(cls, path: Path) -> RunResult:
+    def read(cls, path: Path) -> Self:
         """Return the result in a file result.json. Raises RunError if the file is malformed."""
         try:
             return TypeAdapter(cls).validate_python(read_json(path, RunError))

@@ -40,15 +40,6 @@ class Study:
     failures: dict[str, str]
     estimates: dict[str, float]
 
-    @property
-    def arms(self) -> dict[str, list[RunResult]]:
-        """Return {name of an arm: results of its finished runs}, in the order of the jobs."""
-        arms: dict[str, list[RunResult]] = {}
-        for job in self.jobs:
-            if job.name in self.results:
-                arms.setdefault(job.arm, []).append(self.results[job.name])
-        return arms
-
     def announcement(self, parallel: int) -> str:
         """Return a text with the number of runs, and the estimated duration of the unfinished runs.
 
@@ -76,8 +67,8 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     # Presets are checked first, so that a misspelt name is an error before logs are simulated.
     for preset in set(comparison.presets or ()) - ablation_designs().keys():
         load_design(preset)
-    jobs: list[Job] = []
-    failures: dict[str, str] = {}
+    jobs = []
+    failures = {}
     for name, arm in comparison.arms.items():
         try:
             inputs = arm_inputs(arm, folder / "arms" / name, comparison.splits, progress)

@@ -33,10 +33,14 @@ class ArmResults:
 
 def arm_sections(study: Study) -> list[ArmResults]:
     """Return a section for each arm with finished runs."""
+    arms: dict[str, list[RunResult]] = {}
+    for job in study.jobs:
+        if job.name in study.results:
+            arms.setdefault(job.arm, []).append(study.results[job.name])
+    published = {job.arm: job.protocol.published for job in study.jobs}
     sections = []
-    for name, results in study.arms.items():
-        published = next(job.protocol.published for job in study.jobs if job.arm == name)
-        tables = tuple(arm_tables(results, published))
+    for name, results in arms.items():
+        tables = tuple(arm_tables(results, published[name]))
         sections.append(ArmResults(name, arm_sentence(results), tables, tuple(results)))
     return sections
 

@@ -118,7 +118,7 @@ def _link(spec: ModelSpec, link: LinkSpec) -> Call:
 
 def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
     """Return the keyword arguments of the class of a rigid-body model, without ``joints`` and ``inputs``."""
-    arguments: dict[str, object] = {"links": LINKS, "gravity": spec.gravity, "friction": _friction_laws(spec)}
+    arguments = {"links": LINKS, "gravity": spec.gravity, "friction": _friction_laws(spec)}
     if spec.motor_speeds:
         arguments["motor_speeds"] = spec.motor_speeds
     if spec.servos:
@@ -155,7 +155,7 @@ def _networks(spec: ModelSpec) -> dict[str, object]:
     # A constant V also has a network: with one output, which depends on no joint.
     potential = _potential(spec) if spec.potential else _network(spec, ((),), (ones, ones), width=1, depth=0)
     scale = spec.potential_scale if spec.potential else 1.0
-    arguments: dict[str, object] = {"mass": mass, "potential": potential, "potential_scale": scale}
+    arguments = {"mass": mass, "potential": potential, "potential_scale": scale}
     arguments["friction"] = _friction(spec)
     if spec.design.input == "dense-3n":
         arguments["input_network"] = _network(spec, (spec.joint_names,) * (3 * n), (ones, ones))
@@ -173,7 +173,7 @@ def _mass(spec: ModelSpec) -> Call:
     constants = CONSTANTS if spec.constants else ()
     if not spec.outputs:
         return call("ConstantMass", JOINTS, MASS_ENTRIES, constants=constants)
-    options: dict[str, object] = {"functions": FUNCTIONS, "constants": constants, "margin": spec.margin}
+    options = {"functions": FUNCTIONS, "constants": constants, "margin": spec.margin}
     return call("DerivedMass", JOINTS, MASS_ENTRIES, **options, network=_mass_network(spec))
 
 

@@ -25,7 +25,7 @@ class Call:
 
 def call(callee: str, *positional: object, **named: object) -> Call:
     """Return a ``Call`` of ``callee`` with these positional and keyword arguments."""
-    arguments: list[tuple[str | None, object]] = [(None, value) for value in positional]
+    arguments = [(None, value) for value in positional]
     return Call(callee, (*arguments, *named.items()))
 
 

@@ -87,7 +87,7 @@ def load_runtime() -> Runtime:
     trees = {name: ast.parse(texts[name]) for name in sorted(texts)}
     public = [alias.name for node in _imported(trees.pop("__init__")) for alias in node.names]
     order: TopologicalSorter[str] = TopologicalSorter()
-    imports: list[ast.Import | ast.ImportFrom] = []
+    imports = []
     for name, tree in trees.items():
         order.add(name)
         for node in _imported(tree):
@@ -96,7 +96,7 @@ def load_runtime() -> Runtime:
                 order.add(name, module.removeprefix(_OURS))
             elif module != "__future__":
                 imports.append(node)
-    definitions: dict[str, Definition] = {}
+    definitions = {}
     for name in order.static_order():
         for statement in trees[name].body:
             if (defined := _defined(statement)) is not None:
@@ -136,7 +136,7 @@ def _text(node: ast.stmt, source: str) -> str:
 
 def _imports(used: set[str], runtime: Runtime) -> str:
     """Return the import statements of the used names: standard library, then torch, each in ruff's order."""
-    plain: set[str] = set()
+    plain = set()
     members: defaultdict[str, set[str]] = defaultdict(set)
     for node in runtime.imports:
         aliases = [alias for alias in node.names if (alias.asname or alias.name) in used]

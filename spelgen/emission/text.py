@@ -10,15 +10,7 @@ import re
 from pathlib import Path
 from textwrap import fill, wrap
 
-from spelgen.emission.parts import (
-    GENERATOR,
-    MASS_ENTRIES,
-    ModelParts,
-    Sums,
-    entry_sums,
-    model_parts,
-    term_names,
-)
+from spelgen.emission import parts
 from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call
 from spelgen.emission.standalone import bundle, load_runtime, names_in
 from spelgen.errors import ModuleError
@@ -58,17 +50,17 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     The module imports torch and ``spelgen.runtime``. A standalone module contains the runtime's definitions and imports
     torch only.
     """
-    assembly = model_parts(spec)
+    assembly = parts.model_parts(spec)
     call = listed_call("super().__init__", Call("", assembly.model.arguments), 8) + SKIP
     names = names_in(ast.parse(call))
     arm = "\n\n".join(_rows(spec, assembly))
-    if MASS_ENTRIES.text in names:
+    if parts.MASS_ENTRIES.text in names:
         arm += f"\n\n\n{_mass_entries(spec)}"
     model = render(
         "model.py.jinja",
         base=assembly.model.callee,
         summary=class_summary(spec),
-        has_networks=GENERATOR.text in names,
+        has_networks=parts.GENERATOR.text in names,
         call=call,
     )
     title = f"Port-Hamiltonian model of an arm with {counted(len(spec.joints), 'joint')}, by `spelgen build`."
@@ -79,7 +71,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     used = names_in(ast.parse(f"{arm}\n{model}")) & load_runtime().public
     # ruff's order of imported names: classes first.
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
-    return render("module.py.jinja", names=ordered, has_tensor=MASS_ENTRIES.text in names, **context)
+    return render("module.py.jinja", names=ordered, has_tensor=parts.MASS_ENTRIES.text in names, **context)
 
 
 def class_summary(spec: ModelSpec) -> str:
@@ -133,11 +125,10 @@ def module_name(spec: ModelSpec) -> str:
 
 def _picture(spec: ModelSpec) -> str:
     """Return a picture of the lower triangle of M as text: per entry, the joints that the entry depends on."""
-    cells, width = {}, 2
+    cells = {}
     for row, column, kind, joints in spec.entries:
-        cell = {"varying": joint_ranges(joints), "constant": "C", "zero": "0"}[kind]
-        cells[row, column] = cell
-        width = max(width, len(cell))
+        cells[row, column] = {"varying": joint_ranges(joints), "constant": "C", "zero": "0"}[kind]
+    width = max(2, *map(len, cells.values()))
     lines = ["Mass matrix: numbers of the joints that each entry depends on; C constant, 0 always zero", ""]
     for row in range(len(spec.joints)):
         line = "  ".join(cells[row, column].ljust(width) for column in range(row + 1))
@@ -165,7 +156,7 @@ def _quoted(name: str) -> str:
     return json.dumps(name)
 
 
-def _rows(spec: ModelSpec, assembly: ModelParts) -> list[str]:
+def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
     """Return the statements that define the tables ``JOINTS``, ``LINKS``, ..., with comments about units above."""
     statements = []
     for name, rows in assembly.rows.items():
@@ -183,7 +174,7 @@ def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
     """Return {name of a term of M: entries of M that contain the term, and the unit of the first entry}."""
     descriptions = {}
     bases = [x.basis for x in spec.outputs] + [x.basis for x in spec.constants]
-    for name, basis in zip(term_names(spec), bases, strict=True):
+    for name, basis in zip(parts.term_names(spec), bases, strict=True):
         entries = [entry_name(row, column) for row, column, _ in basis]
         row, column, _ = basis[0]
         # The unit of an entry is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
@@ -195,7 +186,7 @@ def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
 
 def _mass_entries(spec: ModelSpec) -> str:
     """Return the source of the function ``mass_entries``, which computes M from functions and constants."""
-    names = term_names(spec)
+    names = parts.term_names(spec)
     arguments = ", ".join(f"{name}: Tensor" for name in names)
     start = f"def mass_entries({arguments}) -> Tensor:"
     if len(start) > WIDTH:
@@ -204,7 +195,7 @@ def _mass_entries(spec: ModelSpec) -> str:
     result = "the residual of M" if spec.links else "M without armature"
     about = f'    """Return {result}, (..., n, n), from functions of q and constants."""'
     body, rows = [], []
-    for row, cells in enumerate(entry_sums(spec)):
+    for row, cells in enumerate(parts.entry_sums(spec)):
         texts = [_sum(sums, names) for sums in cells]
         for column, text in enumerate(texts):
             # Sums are assigned to variables, so that a row of M fits on a line; single terms are used
@@ -219,7 +210,7 @@ def _mass_entries(spec: ModelSpec) -> str:
     return "\n".join([start, about, *body, end])
 
 
-def _sum(sums: Sums, names: list[str]) -> str:
+def _sum(sums: parts.Sums, names: list[str]) -> str:
     """Return the expression of a linear combination of terms; ``0`` if there are no terms."""
     text = ""
     for factor, index in sums:

@@ -165,7 +165,7 @@ def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
     """Return the torques of all predictors on these samples, and the terms of the model's torque."""
-    model: Any = dynamics[MODEL]
+    model = dynamics[MODEL]
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
         inputs = np.eye(q.shape[-1])
@@ -211,5 +211,4 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
 
 def _at_joints(inputs: np.ndarray, torques: np.ndarray) -> np.ndarray:
     """Return joint torques (T, n) [Nm, N] for motor torques (T, n); inputs: input matrix G, (n, n) or (T, n, n)."""
-    by_joint: np.ndarray = (inputs @ torques[..., None])[..., 0]
-    return by_joint
+    return np.asarray((inputs @ torques[..., None])[..., 0])

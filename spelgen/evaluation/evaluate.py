@@ -17,7 +17,6 @@ from spelgen.errors import Diagnostic, LogError, SpelgenError, in_one_line
 from spelgen.evaluation.horizons import (
     EvaluatedLogs,
     Horizon,
-    Predictions,
     TipPosition,
     horizon_lengths,
     predict,
@@ -25,8 +24,8 @@ from spelgen.evaluation.horizons import (
 from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.rollout import mass_errors
-from spelgen.evaluation.subject import Subject, subject
-from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_errors
+from spelgen.evaluation.subject import Subject
+from spelgen.evaluation.torque import coarse_torques, torque_errors
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
 from spelgen.evaluation.tuning import TUNING
 from spelgen.evaluation.verdict import SEEN
@@ -87,7 +86,7 @@ def evaluate(
     Raises LogError.
     """
     # Model and logs are checked before the rollouts, because rollouts take minutes.
-    tested = subject(model, arm)
+    tested = Subject(model, arm)
     logs = [logs] if isinstance(logs, Trajectory) else list(logs)
     # Joints are matched by name: the order of the joints in a log may differ, but a missing joint is an error.
     for trajectory in logs:
@@ -105,7 +104,11 @@ def evaluate(
         if baselines:
             expected = "none: the model is one of position servos"
             raise LogError("baselines that take torques", expected=expected)
-        results = _evaluate_commands(tested, logs, notes)
+        for trajectory in logs:
+            require_commands(trajectory)
+        followers = command_followers(tested.linear_servos, notes)
+        errors, missed = replays(tested.model, logs, followers, notes)
+        results = replace(_results(tested, logs, notes, replay_traces(missed)), replays=errors)
     else:
         require_torques(logs)
         used = _preprocessing(tested.preprocessing, preprocessing, logs)
@@ -158,7 +161,7 @@ def _evaluate_torques(
     predictors += [of_dynamics(name, dynamics, probe) for name, dynamics in baselines.items()]
     tip = _tip(tested, notes)
     horizons: list[Horizon] = []
-    longest: Predictions | None = None
+    longest = None
     for name, k in lengths.items():
         if progress is not None:
             progress(len(horizons), len(lengths), f"predicting {name} ahead")
@@ -168,7 +171,7 @@ def _evaluate_torques(
         if k == max(lengths.values()):
             longest = predictions
     all_dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
-    torque: dict[str, TorqueErrors] = {}
+    torque = {}
     if samples:
         torque = {name: torque_errors(dynamics, samples) for name, dynamics in all_dynamics.items()}
     if not horizons and not torque:
@@ -202,22 +205,13 @@ def _results(
     """
     return Results(
         robot=tested.spec.robot if tested.spec else type(tested.model).__name__,
-        joints=tuple(tested.joints),
+        joints=tested.joints,
         joint_types=tuple(tested.model.joint_types),
         trajectories=tuple(trajectory.name for trajectory in logs),
         parameters=used_parameter_count(tested.model),
         diagnostics=tuple(notes),
         traces=traces,
     )
-
-
-def _evaluate_commands(tested: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
-    """Return the errors of the positions that are predicted under the logged position commands."""
-    for trajectory in logs:
-        require_commands(trajectory)
-    followers = command_followers(tested.linear_servos, notes)
-    errors, missed = replays(tested.model, logs, followers, notes)
-    return replace(_results(tested, logs, notes, replay_traces(missed)), replays=errors)
 
 
 def _tip(tested: Subject, notes: list[Diagnostic]) -> TipPosition | None:

@@ -86,8 +86,8 @@ def replays(
     along each gap-free segment of the logs. A description of each baseline is appended to `notes`.
     """
     pieces = [piece for log in logs for piece in split_at_gaps(log, shortest=3)]
-    windows: list[LogRows] = []
-    first_qd: list[np.ndarray] = []
+    windows = []
+    first_qd = []
     for piece in pieces:
         length, qd = round(TUNING.replay_window * piece.sample_rate) + 1, velocities(piece)
         for start in range(0, len(piece) - length + 1, length - 1):
@@ -98,7 +98,7 @@ def replays(
     # The model is treated as one of the predictors, so that the same code measures all errors.
     predictors = {MODEL: ServoModel(model), **baselines}
     # Whole logs are replayed from zero velocity, as they begin at rest. Windows start with the velocity of the log.
-    logs_from_rest: list[LogRows] = [(piece, slice(0, len(piece))) for piece in pieces]
+    logs_from_rest = [(piece, slice(0, len(piece))) for piece in pieces]
     at_rest = np.zeros((len(pieces), pieces[0].q.shape[1]))
     replay, missed = _replay("whole log", predictors, logs_from_rest, at_rest)
     results = [replay]

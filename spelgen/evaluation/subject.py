@@ -2,14 +2,14 @@
 
 import copy
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from spelgen.arm.configured_arm import Arm, urdf_path
 from spelgen.baselines.registry import FittedBaselines, LinearServoRecord
-from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
+from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.emission.specify import arm_of_spec
 from spelgen.evaluation.results import Results
@@ -23,16 +23,17 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import OnWindows
 from spelgen.settings.settings import load_mapping
-from spelgen.spec import ModelSpec
 from spelgen.urdf.read import read_urdf
 
 
-@dataclass(frozen=True)
 class Subject:
-    """The evaluated model, with data about its fit. A model without a fit has the default values.
+    """The evaluated model, with data about its fit; a model without a fit has none.
 
     Attributes:
         model: The evaluated model.
+        spec: Specification of the model; None for a model that was not built from a URDF.
+        joints: Names of the joints in the URDF and in logs.
+        reach: Break-away displacements of the K friction bristles of each joint, (n, K) [rad, m].
         urdf: URDF of the robot; None if unknown.
         preprocessing: Filter and delay that the fit used.
         window: Number of samples of the training windows, or `TUNING.model_window` if the model was not fitted to
@@ -43,34 +44,34 @@ class Subject:
         linear_servos: Parameters of the linear servos that were fitted to the training logs.
     """
 
-    model: ArmModel
-    urdf: Path | None
-    preprocessing: Preprocessing | None = None
-    window: int = TUNING.model_window
-    trained_on: frozenset[str] = frozenset()
-    baselines: FittedBaselines = field(default_factory=dict)
-    fitted_urdf: Path | None = None
-    linear_servos: LinearServoRecord | None = None
+    def __init__(self, tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None) -> None:
+        """Initialize from a model, a fit or the folder of a run.
 
-    @property
-    def spec(self) -> ModelSpec | None:
-        """Specification of the model; None for a model that was not built from a URDF."""
-        return spec_of(self.model)
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the joints in the URDF and in logs."""
-        return tuple(self.model.joint_names)
-
-    @property
-    def reach(self) -> BristleReach:
-        """Break-away displacements of the K friction bristles of each joint, (n, K) [rad, m].
-
-        If the model has no bristles, the values are the default values for the joint types.
+        arm: arm, or path of its URDF; None: the arm of the fit.
         """
+        fit = load_run(tested) if isinstance(tested, str | Path) else tested
+        self.model = fit.model if isinstance(fit, Fit) else fit
+        # Logs are read as float64 on the CPU, so the model must have the same type and device.
+        if any(weights.dtype != torch.float64 or not weights.is_cpu for weights in self.model.parameters()):
+            self.model = copy.deepcopy(self.model).double().cpu()
+        self.spec = spec_of(self.model)
+        self.joints = tuple(self.model.joint_names)
         reach = bristle_reach(self.model)
-        # Defaults are needed although the model has no bristles: the baseline of least squares may have bristles.
-        return reach if reach.elements else reach_of(self.model.joint_types)
+        # Defaults are needed if the model has no bristles: the baseline of least squares may have bristles.
+        self.reach = reach if reach.elements else reach_of(self.model.joint_types)
+        self.urdf, self.window = urdf_path(arm), TUNING.model_window
+        self.fitted_urdf: Path | None = None
+        self.preprocessing: Preprocessing | None = None
+        self.trained_on: set[str] = set()
+        self.baselines: FittedBaselines = {}
+        self.linear_servos: LinearServoRecord | None = None
+        if isinstance(fit, Fit):
+            self.urdf, self.fitted_urdf = self.urdf or fit.urdf, fit.urdf
+            self.preprocessing, self.baselines = fit.preprocessing, fit.baselines
+            if isinstance(fit.config, OnWindows):
+                self.window = fit.config.window
+            self.trained_on = {*fit.record.training, *fit.record.validation}
+            self.linear_servos = fit.record.servo and fit.record.servo["linear"]
 
     @property
     def fitted_arm(self) -> Arm | None:
@@ -91,31 +92,6 @@ class Subject:
                 if k not in depends:
                     independent.append(joint.name)
         return replace(results, assessment=verdict(results, self.baselines, limits, independent))
-
-
-def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = None) -> Subject:
-    """Return the model to be evaluated, with data about its fit.
-
-    tested: a model, a fit or the folder of a run. arm: arm, or path of its URDF; None: the arm of the fit.
-    """
-    fit = load_run(tested) if isinstance(tested, str | Path) else tested
-    model = fit.model if isinstance(fit, Fit) else fit
-    # Logs are read as float64 on the CPU, so the model must have the same type and device.
-    if any(weights.dtype != torch.float64 or not weights.is_cpu for weights in model.parameters()):
-        model = copy.deepcopy(model).double().cpu()
-    if not isinstance(fit, Fit):
-        return Subject(model, urdf_path(arm))
-    record = fit.record
-    return Subject(
-        model,
-        urdf_path(arm) or fit.urdf,
-        preprocessing=fit.preprocessing,
-        window=fit.config.window if isinstance(fit.config, OnWindows) else TUNING.model_window,
-        trained_on=frozenset([*record.training, *record.validation]),
-        baselines=fit.baselines,
-        fitted_urdf=fit.urdf,
-        linear_servos=record.servo and record.servo["linear"],
-    )
 
 
 def read_test_logs(

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, URDF, observed, share, thousandths
 from spelgen.listing import Listing, number
 
-# `spelgen --help` imports this module for LIMITS. An import of the measurements would also load torch.
+# `spelgen --help` imports this module for LIMITS. An import of the results would also load torch.
 if TYPE_CHECKING:
-    from spelgen.evaluation.measurements import Measurements
+    from spelgen.evaluation.results import Results
 
 OBSERVER = (
     "+ observer: with the constant disturbance that a momentum observer estimates from the 0.1 s before; "
@@ -85,7 +85,7 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
     return Table(title, tuple(map(Row, rows, rows.values())), note)
 
 
-def result_tables(results: Measurements) -> list[Table]:
+def result_tables(results: Results) -> list[Table]:
     """Return the tables of an evaluation: replays, errors per horizon and per joint, torques."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     if results.mass_errors:
@@ -104,7 +104,7 @@ def _without_empty_baselines(full: Table) -> Table:
     return replace(full, rows=tuple(rows))
 
 
-def joined(runs: Mapping[str, Measurements]) -> list[Table]:
+def joined(runs: Mapping[str, Results]) -> list[Table]:
     """Return the tables and rows that all runs have, with a column for the model of each run."""
     tables: dict[str, dict[str, dict[str, float | None]]] = {}
     for run, results in runs.items():
@@ -121,7 +121,7 @@ def joined(runs: Mapping[str, Measurements]) -> list[Table]:
     return common
 
 
-def csv_text(results: Measurements) -> str:
+def csv_text(results: Results) -> str:
     """Return the numbers of all tables as CSV, one line per number; an unknown number is an empty cell."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
@@ -132,7 +132,7 @@ def csv_text(results: Measurements) -> str:
     return file.getvalue()
 
 
-def summary(results: Measurements) -> Listing | None:
+def summary(results: Results) -> Listing | None:
     """Return a small table that compares the URDF, least squares and the model; None without torque errors.
 
     Its rows are the unexplained fraction of the torque variance and, if the true M is known, the error of M.
@@ -152,7 +152,7 @@ def summary(results: Measurements) -> Listing | None:
     return Listing(f"{results.robot} on the test logs", ("", *names), tuple(lines))
 
 
-def _horizon_tables(results: Measurements) -> list[Table]:
+def _horizon_tables(results: Results) -> list[Table]:
     """Return tables of the errors per horizon, and of the errors per joint at the last horizon."""
     if not results.horizons:
         return []
@@ -177,7 +177,7 @@ def _horizon_tables(results: Measurements) -> list[Table]:
     return [*tables, _by_joint(results, f"Velocity error{{}} after {head}", "velocity", qd)]
 
 
-def _torque_tables(results: Measurements) -> list[Table]:
+def _torque_tables(results: Results) -> list[Table]:
     """Return tables of the nMSE of the torques, and of the torque errors per joint."""
     if not results.torque:
         return []
@@ -195,11 +195,11 @@ def _torque_tables(results: Measurements) -> list[Table]:
     return [table(title, rows), by_joint]
 
 
-def _replay_tables(results: Measurements) -> list[Table]:
+def _replay_tables(results: Results) -> list[Table]:
     """Return the tables of replayed commands: per trajectory and per joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
-        rows: dict[str, Numbers] = {}
+        rows = {}
         for log in replay.errors[MODEL].trajectories:
             rows[log] = {name: 1000 * errors.trajectories[log] for name, errors in replay.errors.items()}
         # The mean of all logs is the last row of the table.
@@ -213,7 +213,7 @@ def _replay_tables(results: Measurements) -> list[Table]:
 
 
 def _by_joint(
-    results: Measurements,
+    results: Results,
     title: str,
     quantity: str,
     errors: Mapping[str, Sequence[float | None]],
@@ -258,9 +258,9 @@ class Figure:
         return f"{number(self.value)} {self.unit}"
 
 
-def figures(results: Measurements) -> list[Figure]:
+def figures(results: Results) -> list[Figure]:
     """Return the known figures of the model: nMSE of torques, errors of the longest rollout and of replays."""
-    candidates: list[tuple[str, str, str, float | None]] = []
+    candidates = []
     if MODEL in results.torque:
         torque = results.torque[MODEL]
         candidates.append(("torque.nmse", "nMSE of torques", "variance", torque.mean_nmse))

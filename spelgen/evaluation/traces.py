@@ -121,7 +121,7 @@ def motion_traces(
 
     dynamics: dynamics by the name of the predictor. predictions: predictions over the longest horizon.
     """
-    growth: Growth | None = None
+    growth = None
     predicted: tuple[PredictedMotion, ...] = ()
     # If the arm is at rest, relative errors would be divided by a change of zero, so the curves of predicted motion are
     # omitted.
@@ -130,7 +130,7 @@ def motion_traces(
         growth = _growth(predictions, errors, tip)
         predicted = _predicted_motions(predictions, errors[MODEL][:, -1])
     torques = typical_and_worst([torque_trace(dynamics, motion) for motion in torque_motions(logs)])
-    drawn: tuple[DrawnMotion, ...] = (*torques, *predicted)
+    drawn = (*torques, *predicted)
     return Traces(
         coverage=coverage(logs.pieces),
         growth=growth,

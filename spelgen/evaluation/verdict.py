@@ -1,7 +1,5 @@
 """The assessment of an evaluation in words: suitable uses, failures, and the motions to record next."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +10,7 @@ import numpy as np
 from spelgen.baselines.registry import FittedBaselines
 from spelgen.errors import shortened
 from spelgen.evaluation.horizons import StateErrors
-from spelgen.evaluation.measurements import Measurements, Verdict
+from spelgen.evaluation.results import Results, Verdict
 from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import CONSTANT_VELOCITY, MODEL, listed, observed, share, thousandths
 from spelgen.listing import number
@@ -45,7 +43,7 @@ class _Uses:
 
 
 def verdict(
-    results: Measurements,
+    results: Results,
     identified: FittedBaselines | None = None,
     limits: Limits = (),
     independent: Collection[str] = (),
@@ -92,7 +90,7 @@ def verdict(
     return Verdict(f"{sentence}.", " ".join(filter(None, because)))
 
 
-def _assess_torques(results: Measurements, uses: _Uses) -> None:
+def _assess_torques(results: Results, uses: _Uses) -> None:
     """Add the uses that the torque error of the worst joint permits, since a mean over joints would hide this joint."""
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
@@ -111,7 +109,7 @@ def _assess_torques(results: Measurements, uses: _Uses) -> None:
     uses.proofs.append(proof)
 
 
-def _worst_torque(results: Measurements) -> tuple[str, float]:
+def _worst_torque(results: Results) -> tuple[str, float]:
     """Return the joint of the model's largest nMSE, and the nMSE; joints of coarsely quantised torque are omitted."""
     torque = results.torque.get(MODEL)
     pairs = [] if torque is None else zip(results.joints, torque.joint_nmse, strict=False)
@@ -122,7 +120,7 @@ def _worst_torque(results: Measurements) -> tuple[str, float]:
     return worst
 
 
-def _assess_motion(results: Measurements, uses: _Uses) -> None:
+def _assess_motion(results: Results, uses: _Uses) -> None:
     # The longest horizon with a finite error is assessed, because predictions may diverge over longer horizons.
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
     if results.horizons and not finite:
@@ -144,7 +142,7 @@ def _assess_motion(results: Measurements, uses: _Uses) -> None:
         uses.proofs.append(proof)
 
 
-def _assess_replays(results: Measurements, uses: _Uses) -> None:
+def _assess_replays(results: Results, uses: _Uses) -> None:
     # Only the first replay is assessed, which is over whole logs: windows of one second do not show drift.
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
@@ -160,9 +158,9 @@ def _relative(errors: StateErrors | None) -> float:
     return math.inf if error is None else error
 
 
-def _better_baselines(results: Measurements) -> list[str]:
+def _better_baselines(results: Results) -> list[str]:
     """Return sentences about the horizons at which constant velocity or another baseline has a smaller error."""
-    times: list[str] = []
+    times = []
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
         errors = {name: _relative(of_predictor) for name, of_predictor in horizon.errors.items()}
@@ -186,7 +184,7 @@ def _better_baselines(results: Measurements) -> list[str]:
     return [*statements, f"But {listed(reasons)}."] if reasons else statements
 
 
-def _worst_joint(results: Measurements) -> tuple[str, str, str]:
+def _worst_joint(results: Results) -> tuple[str, str, str]:
     """Return the name of the worst joint, words for its worst speed, and a sentence about its error.
 
     The worst joint has the largest torque error. If all torque errors are small, but the motion error is not, it is the
@@ -206,7 +204,7 @@ def _worst_joint(results: Measurements) -> tuple[str, str, str]:
     return joint, speed, f"At {joint} the torque residual is {amount}."
 
 
-def _worst_motion(results: Measurements) -> tuple[str, float]:
+def _worst_motion(results: Results) -> tuple[str, float]:
     """Return the joint of the largest relative position error at the longest horizon, and this error.
 
     The relative error is the RMS error divided by the RMS change over the horizon.
@@ -218,7 +216,7 @@ def _worst_motion(results: Measurements) -> tuple[str, float]:
     return "", math.inf
 
 
-def _slow_or_fast(results: Measurements, k: int) -> str:
+def _slow_or_fast(results: Results, k: int) -> str:
     """Return " near standstill" or " at speed", if the torque residual of joint k is larger in slow or in fast motion.
 
     The result is "" if the residuals are similar, or if the curves contain too few slow or fast samples.
@@ -241,7 +239,7 @@ def _slow_or_fast(results: Measurements, k: int) -> str:
 
 
 def _recommendations(
-    results: Measurements,
+    results: Results,
     identified: FittedBaselines,
     limits: Limits,
     independent: Collection[str],

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from spelgen.arm.arm import Chain
-from spelgen.errors import ArmError, SpelgenError, collect
+from spelgen.errors import ArmError, collect
 from spelgen.excitation.tuning import TUNING
 from spelgen.settings.values import Group, Number, Positive
 from spelgen.settings.yaml_document import read_document, validated
@@ -77,7 +77,7 @@ def motion_bounds(
             limits[k] = max(low, limits[k, 0]), min(high, limits[k, 1])
         if mimic.velocity:
             speeds[k] = min(speeds[k], mimic.velocity / abs(factor))
-    errors: list[SpelgenError] = []
+    errors = []
     for coordinate, (low, high) in zip(arm.coordinates, limits, strict=True):
         if not low < high:
             errors.append(range_error(coordinate.name, None if np.isnan(low) else (low, high)))
@@ -87,14 +87,11 @@ def motion_bounds(
 
 def range_error(joint: str, limits: tuple[float, float] | None) -> ArmError:
     """Return the error about a joint without a range to move in; limits: [rad, m], None if there are none."""
-    line = f"write 'simulation: {{positions: {{{joint}: [LOWEST, HIGHEST]}}}}' into the robot's YAML"
-    if limits is None:
-        got, do = "no position limits", line
-    else:
-        got, do = (
-            f"the limits {limits[0]:g} .. {limits[1]:g}",
-            f"correct them, omit the joint by --joints, or {line}",
-        )
+    got = "no position limits"
+    do = f"write 'simulation: {{positions: {{{joint}: [LOWEST, HIGHEST]}}}}' into the robot's YAML"
+    if limits is not None:
+        got = f"the limits {limits[0]:g} .. {limits[1]:g}"
+        do = f"correct them, omit the joint by --joints, or {do}"
     return ArmError(got, element=f"joint {joint!r}", expected="a range to move in", do=do)
 
 

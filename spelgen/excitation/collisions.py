@@ -178,8 +178,7 @@ class Collisions:
                 # relative to the nearest point of the first, along the normal, which points from first to second.
                 arm = np.cross(point - self._data.oMi[joint].translation, result.normal)
                 gradient += sign * (result.normal @ jacobian[:3] + arm @ jacobian[3:])
-        derivative: np.ndarray = gradient @ self._constraint.jacobian
-        return derivative
+        return np.asarray(gradient @ self._constraint.jacobian)
 
     def _add(self, name: str, body: int, pose: np.ndarray, geometry: coal.CollisionGeometry) -> None:
         """Add an object that is fixed to a body. pose: pose of the object in the frame of the body, (4, 4)."""
@@ -204,7 +203,7 @@ class Collisions:
 
         links: number of objects that are shapes of links; they are the first objects.
         """
-        neighbour: dict[int, int] = {}
+        neighbour = {}
         for index, body in enumerate(chain.bodies):
             # The shapes of a body and of its parent overlap. A parent without a shape is replaced by its own parent.
             parent = body.parent

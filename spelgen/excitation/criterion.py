@@ -64,7 +64,7 @@ class Criterion:
         The result is NaN for a joint without an effort limit.
         """
         largest = self._efforts(self._rows(states)).abs().amax(dim=0)
-        return np.asarray(torch.where(self.limits.isinf(), torch.nan, largest).numpy())
+        return torch.where(self.limits.isinf(), torch.nan, largest).numpy()
 
     def value(self, parameters: np.ndarray) -> float:
         """Return the value of the criterion for parameters (size,)."""

@@ -77,7 +77,7 @@ def excite(
         bounds = replace(bounds, acceleration=strongest)
     collisions, statement = _collisions(arm, surroundings, limits)
     beginning = _start(start, arm.chain, limits, collisions)
-    contacts: list[str] = []
+    contacts = []
     for attempt in range(TUNING.attempts):
         fraction = TUNING.range_factor**attempt
         trajectory = ExcitationTrajectory(duration, harmonics, bounds.narrowed(fraction))
@@ -95,7 +95,11 @@ def excite(
     else:
         do = "use less of the ranges (--reach), begin elsewhere (--from), or lower the clearance"
         raise ArmError(f"no motion without a contact: {'; '.join(contacts)}", element="excite", do=do)
-    statement += _other_designs(seed, attempt, reach * fraction)
+    if attempt:
+        statement += (
+            f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed {seed + attempt} and "
+            f"{reach * fraction:.0%} of the ranges."
+        )
     first, states = criterion.states(starts[0]), np.stack([motion.q, motion.qd, motion.qdd])
     return Excitation(
         arm=arm.chain,
@@ -110,28 +114,15 @@ def excite(
     )
 
 
-def _other_designs(seed: int, attempt: int, reach: float) -> str:
-    """Return a sentence about earlier attempts, whose designs had contacts; "" if there was no earlier attempt."""
-    if attempt == 0:
-        return ""
-    return (
-        f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed {seed + attempt} and "
-        f"{reach:.0%} of the ranges."
-    )
-
-
 def _checked_harmonics(
     duration: float, sample_rate: float, harmonics: int | None, reach: float, speed: float
 ) -> int:
     """Return the number of harmonics of a motion. Raises SettingsError for an invalid argument of ``excite``."""
-    fraction, positive = (1.0, "more than 0, at most 1"), (inf, "a positive number")
-    for name, value, (largest, expected) in (
-        ("duration", duration, positive),
-        ("sample_rate", sample_rate, positive),
-        ("reach", reach, fraction),
-        ("speed", speed, fraction),
-    ):
+    bounded = {"duration": (duration, inf), "sample_rate": (sample_rate, inf)}
+    bounded |= {"reach": (reach, 1.0), "speed": (speed, 1.0)}
+    for name, (value, largest) in bounded.items():
         if not 0 < value <= largest or value == inf:
+            expected = "a positive number" if largest == inf else "more than 0, at most 1"
             raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
     if harmonics is None:
         return max(TUNING.min_harmonics, round(TUNING.harmonics_per_second * duration))

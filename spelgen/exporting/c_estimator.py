@@ -123,11 +123,10 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     # The generated code contains a checksum of all constants. With it, the code refuses a saved state of an estimator
     # with other constants.
     identity = zlib.crc32(repr(sorted((name, str(value)) for name, value in values.items())).encode())
-    files: dict[str, str] = {}
-    for suffix in (".h", ".c"):
-        text = render(f"estimator{suffix}.jinja", **values, identity=identity)
-        files[f"{model.name}_estimator{suffix}"] = text
-    return files
+    return {
+        f"{model.name}_estimator{suffix}": render(f"estimator{suffix}.jinja", **values, identity=identity)
+        for suffix in (".h", ".c")
+    }
 
 
 def _numbers(values: Iterable[float]) -> list[str]:

@@ -92,7 +92,7 @@ def called_by_c(
         arguments = []
         for key in function.entry.inputs:
             arguments.append(np.ascontiguousarray(inputs[key], dtype=dtypes.get(key, dtype)))
-        outputs: Values = {}
+        outputs = {}
         for key, shape in function.shapes.items():
             # Outputs start as NaN, so that the parity check fails if a function does not write an entry.
             outputs[key] = np.full((states, *shape), np.nan, dtypes.get(key, dtype))

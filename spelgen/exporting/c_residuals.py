@@ -36,8 +36,8 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
     """Return the C declarations of the residual terms ``names``, and the C calls that compute these terms."""
     uncomputed = set(names)
     symbols = residual_symbols(model)
-    variables: list[str] = []
-    calls: list[str] = []
+    variables = []
+    calls = []
     for needed, call, computed in _CALLS:
         if not uncomputed.intersection(needed):
             continue
@@ -61,8 +61,8 @@ def network_source(model: TrainedModel) -> list[str]:
     networks = {name: network for name, network in named.items() if network is not None}
     if not networks:
         return []
-    tables: list[str] = []
-    shapes: dict[str, list[tuple[int, ...]]] = {}
+    tables = []
+    shapes = {}
     for name, network in networks.items():
         shapes[name] = [weight.shape for weight in network.weights]
         for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
@@ -93,7 +93,7 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
         weight: weights of the layer, (outputs, inputs).
         bias: biases of the layer, (outputs,).
     """
-    spans: list[tuple[int, int]] = []
+    spans = []
     for column in weight.T:
         nonzero = np.flatnonzero(column).tolist() or [0, -1]
         spans.append((nonzero[0], nonzero[-1] + 1))
@@ -112,7 +112,7 @@ def joint_function_source(model: TrainedModel) -> list[str]:
     torque, factor = residuals.torque, residuals.friction
     if not (residuals.has_torque or factor):
         return []
-    tables: list[str] = []
+    tables = []
     intervals = 0
     for name, splines in (("torque", torque), ("factor", factor)):
         if splines:

@@ -117,7 +117,7 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
     sizes = dict.fromkeys(entry.inputs, f"{model.name.upper()}_N") | {"load": "10"}
     parameters = [f"const {_parameter(model, name, sizes[name])}" for name in entry.inputs]
     shapes: dict[str, tuple[int, ...]] = {}
-    results: list[str] = []
+    results = []
     for k, (name, unit) in enumerate(entry.outputs.items()):
         rows, columns = function.size_out(k)
         shapes[name] = (rows, columns) if columns > 1 else (rows,)
@@ -158,7 +158,7 @@ def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str
     # CasADi numbers the entries of a matrix in column-major order, the C arrays are row-major.
     shapes = [function.size_out(k) for k in range(function.n_out())]
     variables: dict[str, None] = {}
-    lines: list[str] = []
+    lines = []
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
         reads, writes = function.instruction_input(k), function.instruction_output(k)

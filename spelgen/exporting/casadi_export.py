@@ -52,7 +52,7 @@ def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> 
     # function, the residual terms are symbols, so a derivative would omit their dependence on q.
     bases = {name: ENTRY_POINTS[name.removesuffix("_derivatives")] for name in entries}
     expressions = expression_functions(model, {base.name: base for base in bases.values()})
-    functions: dict[str, ca.Function] = {}
+    functions = {}
     for name, entry in entries.items():
         base = bases[name]
         function = _with_residuals(base, model, expressions[base.name])
@@ -105,7 +105,7 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
         states = zip(*(inputs[key] for key in function.name_in()), strict=True)
         # A loop over states calls the exported function itself; CasADi's `map` would make another function.
         results = [function.call(list(map(ca.DM, state))) for state in states]
-        outputs: Values = {}
+        outputs = {}
         for key, values in zip(function.name_out(), zip(*results, strict=True), strict=True):
             array = np.array([value.full() for value in values])
             # CasADi returns vectors as columns: the second axis, of length one, is removed.
@@ -121,7 +121,7 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
     q, qd: symbols, (n, 1) each; qd is None if no term that depends on velocity is needed.
     """
     residuals = model.residuals
-    values: dict[str, ca.MX] = {}
+    values = {}
     encoded = ca.vertcat(ca.cos(q), ca.sin(q), q)
     if residuals.mass is not None:
         mass = values["mass"] = _network(residuals.mass, encoded)

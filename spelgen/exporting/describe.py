@@ -1,13 +1,10 @@
 """``Trained``, a model with its arm, which every exporter gets as argument, and its conversion to NumPy arrays."""
 
-from __future__ import annotations
-
 import copy
 import keyword
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,29 +13,18 @@ from torch import Tensor
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.protocol import motors_of, residual_terms
-from spelgen.dynamics.tip import last_link, tip_kinematics
+from spelgen.dynamics.tip import last_link
 from spelgen.dynamics.tip_frame import tip_frame
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
-from spelgen.exporting.description import (
-    EntryPoint,
-    Harmonics,
-    Residuals,
-    Servos,
-    SigmoidNetwork,
-    TrainedModel,
-    entry_points,
-)
+from spelgen.exporting import description
 from spelgen.listing import Listing
 from spelgen.live.noise import NoiseLevels
 from spelgen.runtime.friction_laws import FrictionConstants
+from spelgen.runtime.networks import JointEncoding
+from spelgen.runtime.parts import Layers
+from spelgen.runtime.residual_terms import ResidualTerms
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-
-if TYPE_CHECKING:
-    from spelgen.dynamics.prepared import PreparedModel
-    from spelgen.emission.assemble import ArmModel
-    from spelgen.runtime.networks import JointEncoding
-    from spelgen.runtime.parts import Layers
-    from spelgen.runtime.residual_terms import ResidualTerms
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,37 +46,19 @@ class Trained:
     levels: NoiseLevels | None = None
 
     @cached_property
-    def described(self) -> TrainedModel:
+    def described(self) -> description.TrainedModel:
         """The model with NumPy arrays in place of PyTorch modules. Raises RunError for a model without rigid bodies."""
         return describe(self.model, self.arm)
 
     @cached_property
-    def entry_points(self) -> dict[str, EntryPoint]:
+    def entry_points(self) -> dict[str, description.EntryPoint]:
         """The entry points to export, by name. Raises RunError for unknown names in ``entries``."""
-        return entry_points(self.described, self.entries)
-
-    @property
-    def robot(self) -> str:
-        """The name of the robot in the URDF."""
-        return self.arm.chain.name
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """The names of the joints in the URDF."""
-        return self.arm.chain.joint_names
+        return description.entry_points(self.described, self.entries)
 
     @property
     def tip(self) -> str:
         """The name of the tip link."""
-        return self.arm.tip or last_link(self.arm.robot, self.joint_names)
-
-    def prepared(self) -> PreparedModel:
-        """Return the copy of the model from which ONNX and torch programs are made.
-
-        It has precomputed parameters, the kinematics of the tip, and the number type of the programs.
-        """
-        dtype = torch.float32 if self.float32 else torch.float64
-        return self.model.prepared(tip_kinematics(self.arm), dtype=dtype)
+        return self.arm.tip or last_link(self.arm.robot, self.arm.chain.joint_names)
 
     @property
     def memory(self) -> int:
@@ -98,7 +66,7 @@ class Trained:
         return self.model.n * self.model.elements
 
 
-def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
+def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
     """Return a trained model as NumPy arrays. Raises RunError for a model without rigid bodies."""
     # A copy in double precision on the CPU: the user's model may be in single precision or on a GPU.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
@@ -111,13 +79,13 @@ def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
         )
     weights = exact.prepare()
     constant_mass = array(weights.armature)
-    residuals = Residuals((), None, None, {}, (), {})
+    residuals = description.Residuals((), None, None, {}, (), {})
     # A residual term of M may have a constant part, which is added to the armature, so that exports need not evaluate
     # it.
     if residual_terms(exact) is not None:
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
-    return TrainedModel(
+    return description.TrainedModel(
         name=identifier(loaded.chain.name),
         arm=loaded.chain,
         joint_labels=tuple(_letters_and_digits(name) or "joint" for name in model.joint_names),
@@ -155,15 +123,15 @@ def array(value: Tensor) -> np.ndarray:
     return np.array(value.detach().double().cpu().numpy())
 
 
-def servos_of(model: ArmModel) -> Servos | None:
+def servos_of(model: ArmModel) -> description.Servos | None:
     """Return the position servos of a model; None if it has none."""
     if model.input_quantity == "torque":
         return None
     kp, kd, limit, dead_zone = map(array, model.servo.prepare())
-    return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
+    return description.Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
 
 
-def _residuals(model: ArmModel) -> Residuals:
+def _residuals(model: ArmModel) -> description.Residuals:
     """Return the residual terms of a model, without the terms that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
@@ -172,7 +140,7 @@ def _residuals(model: ArmModel) -> Residuals:
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
         entries = entries[:0]
-    return Residuals(
+    return description.Residuals(
         entries=tuple(map(tuple, entries.tolist())),
         mass=mass,
         potential=_network(weights.potential, terms.encoding),
@@ -184,7 +152,7 @@ def _residuals(model: ArmModel) -> Residuals:
 
 def _network(
     layers: Layers | None, encoding: JointEncoding, functions: np.ndarray | None = None
-) -> SigmoidNetwork | None:
+) -> description.SigmoidNetwork | None:
     """Return a network of tanh units as a network of sigmoids; None if it has no layers or a zero last layer.
 
     The result computes y(q), the outputs of the given network, or tanh(y(q)) @ functions. Sigmoids take less time in C.
@@ -214,7 +182,7 @@ def _network(
         # after it, the weights are doubled, and the sum of the original weights is subtracted from the bias.
         weights[k - 1], biases[k - 1] = 2 * weights[k - 1], 2 * biases[k - 1]
         weights[k], biases[k] = 2 * weights[k], biases[k] - weights[k].sum(axis=1)
-    return SigmoidNetwork(tuple(weights), tuple(biases))
+    return description.SigmoidNetwork(tuple(weights), tuple(biases))
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
@@ -232,14 +200,14 @@ def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
     return splines
 
 
-def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
+def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[description.Harmonics, ...]:
     """Return the torque ripple: up to two elements per joint, for harmonics of the joint and of its motor.
 
     weights: (n, 2 H), coefficients of H cosines, then of H sines. The H frequencies are harmonics of a revolution of
     the joint, then harmonics of a revolution of the motor. An export computes the harmonics k = 1, 2, ... of one
     frequency in sequence. Harmonics with zero amplitude are therefore removed only after the last nonzero one.
     """
-    ripple: list[Harmonics] = []
+    ripple = []
     cosines, sines = map(array, weights.chunk(2, dim=-1))
     for joint, frequencies in enumerate(array(terms.frequencies)):
         count = len(frequencies)
@@ -252,5 +220,5 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
             # Each harmonic takes time in an export, so trailing harmonics with zero amplitude are removed.
             if used.size:
                 last = used[-1] + 1
-                ripple.append(Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))
+                ripple.append(description.Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))
     return tuple(ripple)

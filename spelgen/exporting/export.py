@@ -1,13 +1,11 @@
 """The function ``export``: write a trained model in the format of another tool."""
 
-from __future__ import annotations
-
 import pkgutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from spelgen.arm.configured_arm import Arm
+from spelgen.emission.assemble import ArmModel
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import RunError, suggestion
 from spelgen.exporting.describe import Trained
@@ -16,9 +14,6 @@ from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
 from spelgen.listing import Listing
 from spelgen.live.noise import stored_levels
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 def export(

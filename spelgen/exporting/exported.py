@@ -134,21 +134,21 @@ def with_readme(
         summary: results of the checks, one text without a full stop each.
         example: lines of Python that run in the folder of the README.
     """
+    exporter, arm = EXPORTERS[to], trained.arm.chain
     # Before examples and tables, the README has only the five lines that a user needs for the first call; details are
     # in docs/deploy.md.
-    exporter, conventions = EXPORTERS[to], f"{UNITS}; the tip is the link {trained.tip}; {about}"
-    title, result = f"Dynamics of {trained.robot} {exporter.title}", f"{'; '.join(summary)}."
-    name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"
-    text = readme(title, use, trained.joint_names, conventions, result)
+    head = [
+        f"# Dynamics of {arm.name} {exporter.title}",
+        use,
+        f"Joints, in this order: {', '.join(arm.joint_names)}.",
+        f"{UNITS}; the tip is the link {trained.tip}; {about}",
+        f"{'; '.join(summary)}.",
+    ]
+    # Names come from an untrusted URDF, so characters that are not printable are replaced.
+    text = "\n".join(map(printable, head)) + "\n"
     blocks = [("python", example)] if example else []
     blocks += [("text", list(map(printable, table.text().splitlines()))) for table in trained.intervals]
     for language, lines in blocks:
-        text += "\n".join(["", f"```{language}", *lines, "```", ""]).encode()
-    return Exported(to, trained.robot, {**files, name: text}, tuple(summary))
-
-
-def readme(title: str, use: str, joints: Sequence[str], conventions: str, checked: str) -> bytes:
-    """Return the first five lines of a README: title, use, order of the joints, conventions, result of the checks."""
-    # Names come from an untrusted URDF, so characters that are not printable are replaced.
-    lines = [f"# {title}", use, f"Joints, in this order: {', '.join(joints)}.", conventions, checked]
-    return ("\n".join(map(printable, lines)) + "\n").encode()
+        text += "\n".join(["", f"```{language}", *lines, "```", ""])
+    name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"
+    return Exported(to, arm.name, {**files, name: text.encode()}, tuple(summary))

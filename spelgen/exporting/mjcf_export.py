@@ -1,11 +1,8 @@
 """Export with ``--to mjcf``: a file for MuJoCo, whose dynamics in MuJoCo are compared with the model."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -17,6 +14,7 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_constraint import body_constraint
 from spelgen.dynamics.body_regressor import about_center, quaternion
 from spelgen.dynamics.tip_frame import link_poses, tip_frame
+from spelgen.emission.assemble import ArmModel
 from spelgen.emission.build import build
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import Servos
@@ -26,9 +24,6 @@ from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_b
 from spelgen.exporting.tuning import TUNING
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.urdf.geometry import LinkShape, link_shapes
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 _SECTIONS = ("worldbody", "equality", "tendon", "actuator")
 _CONTACTS = {

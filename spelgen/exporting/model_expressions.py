@@ -40,7 +40,7 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
     # Derivatives take most of the time of an export and are built only if selected.
     if any(name.endswith("_derivatives") for name in entries):
         expressions |= _derivatives(model, inputs, residuals)
-    functions: dict[str, ca.Function] = {}
+    functions = {}
     for name, entry in entries.items():
         functions[name] = named_function(entry, expressions[name], inputs, residuals)
     return functions
@@ -254,7 +254,7 @@ def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:
     # The elimination changes matrices in place, so it works on copies.
     matrix = ca.SX(matrix)
     right = ca.SX(right)
-    factors: list[ca.SX] = []
+    factors = []
     for k in range(n):
         inverse = 1 / matrix[k, k]
         row = matrix[k, k + 1 :]

@@ -15,38 +15,30 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from spelgen.dynamics.prepared import PreparedModel
+from spelgen.exporting import torch_export
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values
-from spelgen.exporting.torch_export import (
-    calls,
-    check_programs,
-    export_program,
-    number_type,
-    program_inputs,
-    program_names,
-    program_output,
-)
 from spelgen.exporting.tuning import TUNING
 
 
 def export_onnx(trained: Trained) -> Exported:
     """Return an .onnx file for each entry point. Raises RunError if results of ONNX Runtime and the model differ."""
-    model = trained.prepared()
+    model = torch_export.prepared(trained)
     models, files = {}, {}
-    for name in program_names(trained):
+    for name in torch_export.program_names(trained):
         models[name] = files[f"{name}.onnx"] = onnx_model(model, name)
-    parity = check_programs(called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance)
+    parity = torch_export.check_programs(called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance)
     checked = f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}"
-    use = f"ONNX files for any runtime, {number_type(model)} (batch, n), any batch."
+    use = f"ONNX files for any runtime, {torch_export.number_type(model)} (batch, n), any batch."
     size = model.n * model.elements
     about = f"one file per entry point: {', '.join(models)}."
     if size:
         about = f"z, the friction state, is (batch, {size}); {about}"
     example = ["import numpy as np", "import onnxruntime", "", "", "def run(name, **inputs):"]
     example += ['    return onnxruntime.InferenceSession(f"{name}.onnx").run(None, inputs)[0]', "", ""]
-    number = f"np.{number_type(model)}"
-    example += calls(
+    number = f"np.{torch_export.number_type(model)}"
+    example += torch_export.calls(
         model, list(models), f"np.zeros((5, {model.n}), {number})", f"np.zeros((5, {size}), {number})"
     )
     return with_readme(trained, "onnx", files, use=use, about=about, summary=[checked], example=example)
@@ -57,12 +49,12 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
     # Functions without an ONNX operator are replaced already while torch traces the program.
     with _silent_exporter():
         with _Decomposed():
-            program = export_program(model, name, flat_state=True)
+            program = torch_export.export_program(model, name, flat_state=True)
         exported = torch.onnx.export(
             program,
             dynamo=True,
-            input_names=program_inputs(model, name),
-            output_names=[program_output(name)],
+            input_names=torch_export.program_inputs(model, name),
+            output_names=[torch_export.program_output(name)],
             custom_translation_table={torch.ops.aten.scalar_tensor.default: _scalar_tensor},
             verbose=False,
         )
@@ -185,7 +177,7 @@ def called_by_onnx(files: Mapping[str, bytes]) -> Called:
         types = {"tensor(float)": np.float32, "tensor(double)": np.float64}
         arrays = {node.name: inputs[node.name].astype(types[node.type]) for node in session.get_inputs()}
         (output,) = session.run(None, arrays)
-        return {program_output(name): output}
+        return {torch_export.program_output(name): output}
 
     return called
 

@@ -1,12 +1,9 @@
 """Parity check: the largest difference between an export and the torch model at random states."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,13 +11,11 @@ from torch import Tensor
 
 from spelgen.arm.arm import Coordinate
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.tuning import TUNING
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 Values = dict[str, np.ndarray]
 """Inputs or outputs of an entry point by name, (states, ...) each."""
@@ -108,7 +103,7 @@ def check_parity(
     inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
     # The torch model computes in double precision, since rounding errors in float32 exceed the tolerance.
     exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
-    differences: dict[str, float] = {}
+    differences = {}
     for name in names:
         outputs = called(name, inputs)
         expected = _expected(exact, trained, name, inputs)
@@ -162,7 +157,7 @@ def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> V
     name: name of the entry point. inputs: {input: array (states, n)}.
     """
     entry = ENTRY_POINTS[name]
-    arguments: list[Tensor] = []
+    arguments = []
     for key in entry.inputs:
         value = torch.from_numpy(inputs[key])
         if key != "z":

@@ -50,7 +50,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
         "factor": (factors, factors, 1),
         "factor_slope": (factors, factors, 1),
     }
-    symbols: Symbols = {}
+    symbols = {}
     for name, (exists, *size) in sizes.items():
         symbols[name] = ca.SX.sym(name, *size) if exists else ca.SX(*size)
     return symbols

@@ -1,10 +1,8 @@
 """Approximation of a trained model by rigid bodies with viscous and Coulomb friction."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +13,7 @@ from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.parameters import without_residuals
 from spelgen.dynamics.protocol import motors_of
+from spelgen.emission.assemble import ArmModel
 from spelgen.emission.build import build
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.description import Servos
@@ -22,9 +21,6 @@ from spelgen.exporting.parity import nominal_speeds, random_inputs
 from spelgen.exporting.tuning import TUNING
 from spelgen.fitting.optimizers import minimise
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 class NearestFriction(NamedTuple):
@@ -100,7 +96,7 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     q = sampled_positions(arm.chain)
     # The rigid bodies of a model are used if it has some; its residual terms are omitted, as the summary states.
     exact = isinstance(model, RigidBodyDynamics)
-    bodies: ArmModel = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
+    bodies = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
         arm=arm,
         inertias=bodies.inertial_parameters.numpy(),
@@ -173,7 +169,7 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
     positions = positions.unsqueeze(1).expand(-1, len(speeds), -1)  # (positions, speeds, n)
     qd = torch.from_numpy(speeds).expand_as(positions)
     torques = model.friction_torque(positions, qd).numpy()  # (positions, speeds, n)
-    rows: list[tuple[float, float, float, float]] = []
+    rows = []
     for joint, speed in enumerate(speeds.T):
         # Torques are multiplied by the direction of motion, so that viscous and Coulomb friction are not
         # negative.

@@ -5,9 +5,7 @@ Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002,
 with structural zeros: zeros of the geometry, and all velocities if qd is ``ca.SX(n, 1)``.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import casadi as ca
 import numpy as np
@@ -31,7 +29,7 @@ def constant(values: object) -> ca.DM:
 
 def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[Frame]:
     """Return (rotation (3, 3), position (3, 1) [m]) of each body's frame relative to its parent, at q (n, 1)."""
-    frames: list[Frame] = []
+    frames = []
     for body in bodies:
         rotation = ca.SX(constant(body.rotation))
         position = ca.SX(constant(body.translation))
@@ -70,7 +68,7 @@ class RigidBodies:
         # Gravity is represented by an upward acceleration of the base.
         gravity = np.array(self.arm.gravity, dtype=float)
         motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
-        wrenches: list[Wrench] = []
+        wrenches = []
         for body, (mass, moment, inertia), (rotation, position) in self._rows():
             w, rate, acceleration, spin = motions[body.parent + 1]
             ratio = float(body.multiplier)
@@ -109,7 +107,7 @@ class RigidBodies:
         # The twist of the base and then of each body, in its own frame: angular velocity, and velocity of the
         # origin.
         twists = [(ca.SX(3, 1), ca.SX(3, 1))]
-        momenta: list[Wrench] = []
+        momenta = []
         for body, (mass, moment, inertia), (rotation, position) in self._rows():
             w, v = twists[body.parent + 1]
             w, v = rotation.T @ w, rotation.T @ (v + ca.cross(w, position))
@@ -128,7 +126,7 @@ class RigidBodies:
             gradient[body.coordinate] += ratio * turned
         return momentum, gradient
 
-    def _rows(self) -> zip[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
+    def _rows(self) -> Iterator[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
         """Return (body, (mass, first moment (3, 1), inertia tensor (3, 3)), frame) of each body, parents first."""
         return zip(self.bodies, self.inertias, self.frames, strict=True)
 

@@ -22,18 +22,9 @@ _CONTROLLER_DEPENDENCIES = (
     "controller_interface", "geometry_msgs", "hardware_interface", "rcl_interfaces", "rclcpp_lifecycle",
     "sensor_msgs", "std_msgs", "trajectory_msgs",
 )  # fmt: skip
-_PATHS = {
-    "package.xml": "package.xml",
-    "CMakeLists.txt": "CMakeLists.txt",
-    "solver.xml": "solver.xml",
-    "solver.cpp": "src/solver.cpp",
-}
-_CONTROLLER_PATHS = {
-    "controller.xml": "controller.xml",
-    "controller.yaml": "config/controller.yaml",
-    "controller.cpp": "src/controller.cpp",
-    "control.hpp": "src/control.hpp",
-}
+# Paths in the package; each file has a template of its name.
+_PATHS = ("package.xml", "CMakeLists.txt", "solver.xml", "src/solver.cpp")
+_CONTROLLER_PATHS = ("controller.xml", "config/controller.yaml", "src/controller.cpp", "src/control.hpp")
 
 
 def export_ros2(trained: Trained) -> Exported:
@@ -48,13 +39,13 @@ def export_ros2(trained: Trained) -> Exported:
     context = {"package": package, "controller": controller, "name": model.name, "upper": model.name.upper()}
     context |= {"joints": ", ".join(model.joint_labels), "estimator": estimator}
     context["dependencies"] = sorted(_DEPENDENCIES + (_CONTROLLER_DEPENDENCIES if controller else ()))
-    paths = _PATHS
+    paths = [*_PATHS]
     if controller:
-        paths = _PATHS | _CONTROLLER_PATHS
+        paths += _CONTROLLER_PATHS
         context |= _controller_numbers(trained)
     files = {f"src/{name}": content for name, content in sources.items()}
-    for template, path in paths.items():
-        files[path] = render(f"ros2/{template}.jinja", **context).encode()
+    for path in paths:
+        files[path] = render(f"ros2/{path.rpartition('/')[2]}.jinja", **context).encode()
     about = (
         "getTorques includes friction, and updates its state by the positions of successive calls; "
         "initialize resets it."
@@ -101,14 +92,15 @@ def _use(package: str, name: str, *, controller: bool) -> str:
 def _controller_numbers(trained: Trained) -> dict[str, object]:
     """Return {variable of the templates: C++ or YAML text} with names, limits and the pose of the tip."""
     model, coordinates = trained.described, trained.arm.chain.coordinates
+    names = trained.arm.chain.joint_names
     revolute = np.array([joint.joint_type == "revolute" for joint in coordinates])
     continuous = [str(joint.continuous).lower() for joint in coordinates]
     rotation = (f"{{{_listed(row)}}}" for row in model.tip.pose[:3, :3])
     return {
-        "joint_names": ", ".join(map(cpp_string, trained.joint_names)),
+        "joint_names": ", ".join(map(cpp_string, names)),
         # A JSON string is also a valid YAML string.
-        "yaml_joints": ", ".join(map(json.dumps, trained.joint_names)),
-        "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in trained.joint_names),
+        "yaml_joints": ", ".join(map(json.dumps, names)),
+        "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in names),
         # An effort limit that the URDF does not specify is 0; the user must set it.
         "efforts": _listed(joint.effort or 0.0 for joint in coordinates),
         "velocities": _listed(_velocity_limit(joint.velocity) for joint in coordinates),
@@ -138,7 +130,7 @@ def _listed(numbers: Iterable[float] | np.ndarray) -> str:
 
 def cpp_string(text: str) -> str:
     """Return a C++ string literal of an untrusted text; all bytes except ASCII letters, digits and _-/ are escaped."""
-    characters: list[str] = []
+    characters = []
     for character in text:
         plain = character.isascii() and (character.isalnum() or character in "_-/")
         # Escapes are octal, since an octal escape ends after three digits; a hexadecimal one would include a

@@ -10,6 +10,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from spelgen.dynamics.prepared import PreparedModel
+from spelgen.dynamics.tip import tip_kinematics
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import ENTRY_POINTS, select_names
 from spelgen.exporting.exported import Exported, with_readme
@@ -35,7 +36,7 @@ FRICTION_STATE = ("friction_step", "friction_memory")
 
 def export_torch(trained: Trained) -> Exported:
     """Return a .pt2 file per entry point and model.safetensors. Raises RunError if results differ from the model's."""
-    model = trained.prepared()
+    model = prepared(trained)
     programs, files = {}, {}
     for name in program_names(trained):
         programs[name] = files[f"{name}.pt2"] = _saved(export_program(model, name))
@@ -54,6 +55,15 @@ def export_torch(trained: Trained) -> Exported:
     example += calls(model, list(programs), zeros, f"torch.zeros(5, {model.n}, {model.elements}).to(q)")
     files["model.safetensors"] = save(parameters)
     return with_readme(trained, "torch", files, use=use, about=about, summary=[checked], example=example)
+
+
+def prepared(trained: Trained) -> PreparedModel:
+    """Return the copy of the model from which programs are made.
+
+    It has precomputed parameters, the kinematics of the tip, and the number type of the programs.
+    """
+    dtype = torch.float32 if trained.float32 else torch.float64
+    return PreparedModel(trained.model, tip_kinematics(trained.arm), dtype=dtype)
 
 
 def program_names(trained: Trained) -> list[str]:

@@ -115,7 +115,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         gains = {"kp": servos.kp, "kd": servos.kd, "limit": servos.limit, "dead_zone": servos.dead_zone}
         sections["servo"] = gains
     joints: dict[str, dict[str, object]] = {}
-    for index, name in enumerate(trained.joint_names):
+    for index, name in enumerate(trained.arm.chain.joint_names):
         joints[name] = {}
         for section, constants in sections.items():
             joints[name][section] = {key: _plain(values[index]) for key, values in constants.items()}

@@ -124,5 +124,4 @@ def tip_force(jacobian: np.ndarray, torque: np.ndarray, threshold: np.ndarray) -
     matrix = weighted @ jacobian.T
     # With this regularization, a force component that affects no joint torque is estimated as zero.
     matrix += 1e-3 * np.trace(matrix) / 3 * np.eye(3)
-    force: np.ndarray = np.linalg.solve(matrix, weighted @ torque)
-    return force
+    return np.linalg.solve(matrix, weighted @ torque)

@@ -78,16 +78,12 @@ class Blocks:
         # The block ends at the sample at which its duration is nearest to `TUNING.block`.
         if len(self.samples) == 1 or self.duration < TUNING.block - step / 2:
             return None
-        block = self._block(self.duration)
+        times, terms = zip(*self.samples, strict=True)
+        duration, first, last = self.duration, terms[0], terms[-1]
         # Blocks are contiguous: the last sample of a block is the first one of the next block.
         self.samples, self.duration = self.samples[-1:], 0.0
-        return block
-
-    def _block(self, duration: float) -> Block:
-        t, terms = zip(*self.samples, strict=True)
-        sums = [np.trapezoid(np.array(term), t, axis=0) / duration for term in zip(*terms, strict=True)]
-        _, torque, friction, uncertainty, _, load_torque, *_ = sums
-        first, last = terms[0], terms[-1]
+        means = [np.trapezoid(np.array(term), times, axis=0) / duration for term in zip(*terms, strict=True)]
+        _, torque, friction, uncertainty, _, load_torque, *_ = means
         load = (last.load_momentum - first.load_momentum) / duration - load_torque
         y = torque - friction - (last.momentum - first.momentum) / duration
         fastest = np.abs([term.velocity for term in terms[1:]]).max(axis=0)

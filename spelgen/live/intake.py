@@ -133,7 +133,7 @@ def balance_along(
         prepared: parameter cache of the model; None: the function computes it.
     """
     refusals: list[Refusal] = []
-    states: list[tuple[int, np.ndarray, np.ndarray]] = []
+    states = []
     for k, sample in enumerate(zip(t.tolist(), *samples, strict=True)):
         refusals.append(intake.accept(*sample))
         if refusals[-1] not in IGNORED:

@@ -262,7 +262,7 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
 
     peaks: peaks of each log in W time windows, (W, n) [1].
     """
-    excess: list[float] = []
+    excess = []
     for k, peaks_of_log in enumerate(peaks):
         others = levels.model_copy(update=_peak_tail([*peaks[:k], *peaks[k + 1 :]]))
         excess += (peaks_of_log / others.thresholds(TUNING.alarms_per_minute)).max(axis=1).tolist()
@@ -276,7 +276,7 @@ def _observer_residuals(
     """Return the residual of the momentum observer, the variance of the residual, and qd, (T, n) each, at T samples."""
     observer = ContactObserver(levels, TUNING.alarms_per_minute)
     drift = JointFilters.of_drift(levels.drift)
-    columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    columns = []
     for t, at, is_resumed, block in samples:
         if is_resumed:
             observer.restart()

@@ -99,24 +99,12 @@ def balance(
     with torch.no_grad():
         prepared = prepared or model.prepare()
         columns = [torch.from_numpy(x).split(_BLOCK) for x in (*samples, *bounds)]
-        blocks = [
-            _terms(model, prepared, torch.from_numpy(point), *block) for block in zip(*columns, strict=True)
-        ]
+        blocks = []
+        for q, qd, tau, *limits in zip(*columns, strict=True):
+            at = model.at(q, qd, prepared=prepared)
+            torque = model.input_force(at, qd, tau) + model.lagrangian_gradient(at, qd)
+            states = (torch.stack(limits),) if is_stateful(model) else ()
+            low, high = model.friction_torque(at, qd, *states).expand(2, *qd.shape)
+            terms = model.momentum(at, qd), torque, (high + low) / 2, (high - low).abs() / 2
+            blocks.append([*terms, *load_terms(model.chain, q, qd, torch.from_numpy(point)), qd])
         return Balance(*(torch.cat(term).numpy() for term in zip(*blocks, strict=True)))
-
-
-def _terms(
-    model: RigidBodyDynamics,
-    prepared: RigidParameters,
-    point: Tensor,
-    q: Tensor,
-    qd: Tensor,
-    tau: Tensor,
-    *bounds: Tensor,
-) -> list[Tensor]:
-    at = model.at(q, qd, prepared=prepared)
-    torque = model.input_force(at, qd, tau) + model.lagrangian_gradient(at, qd)
-    states = (torch.stack(bounds),) if is_stateful(model) else ()
-    low, high = model.friction_torque(at, qd, *states).expand(2, *qd.shape)
-    terms = model.momentum(at, qd), torque, (high + low) / 2, (high - low).abs() / 2
-    return [*terms, *load_terms(model.chain, q, qd, point), qd]

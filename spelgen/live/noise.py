@@ -119,8 +119,7 @@ class NoiseLevels(BaseModel):
         This bound is added once to a threshold. The standard deviation of the noise, which has rare peaks, is
         multiplied by a factor (see `thresholds`).
         """
-        torque: np.ndarray = self.resting * np.exp(-np.abs(qd) / self.resting_speed)
-        return torque
+        return np.asarray(self.resting * np.exp(-np.abs(qd) / self.resting_speed))
 
     @property
     def tail_peaks(self) -> float:
@@ -138,8 +137,7 @@ class NoiseLevels(BaseModel):
         """
         odds = self.tail_peaks / alarms_per_minute
         excess = self.peak_count * (odds ** (1 / self.peak_count) - 1)
-        thresholds: np.ndarray = np.maximum(self.peak_start + self.peak_scale * excess, 1.0)
-        return thresholds
+        return np.asarray(np.maximum(self.peak_start + self.peak_scale * excess, 1.0))
 
 
 def keep_levels(fit: Fit, levels: NoiseLevels) -> None:

@@ -89,14 +89,24 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
     limit = theta[0] + quantile * math.sqrt(spread[0, 0])
     if log_odds > TUNING.payload_odds:
         return Payload("no payload" if log_odds > TUNING.no_payload_odds else "not yet", log_odds, limit)
-    return _described(theta, spread, quantile, log_odds, limit)
+    # The intervals follow from the derivatives of mass, centre of mass and inertia with respect to theta. Complex-step
+    # derivatives have no cancellation errors (Squire and Trapp, SIAM Review 40:110, 1998).
+    values, tiny = _mass_center_inertia(theta), 1e-30
+    steps = [_mass_center_inertia(theta + tiny * 1j * unit).imag for unit in np.eye(10)]
+    jacobian = np.array(steps).T / tiny
+    half = quantile * np.sqrt(np.einsum("ki,ij,kj->k", jacobian, spread, jacobian))
+    intervals = np.stack([values - half, values + half], axis=1)
+    low, high = intervals[0].tolist()
+    return Payload(
+        "payload", log_odds, limit, float(values[0]), (max(low, 0.0), high), values[1:4], intervals[1:4],
+        values[4:], intervals[4:], theta, spread,
+    )  # fmt: skip
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
     """Return the inverse of a positive definite matrix whose entries may differ by orders of magnitude."""
     root = solve_triangular(np.linalg.cholesky(matrix), np.eye(len(matrix)), lower=True)
-    inverse: np.ndarray = root.T @ root
-    return inverse
+    return np.asarray(root.T @ root)
 
 
 def _at_scale(
@@ -144,27 +154,6 @@ def _at_scale(
     log_width, log_hessian, log_inertia = (np.linalg.slogdet(x)[1] for x in (width, hessian, inertia))
     cost = 0.5 * theta @ precision @ theta - linear @ theta - 0.5 * log_inertia + pull @ theta
     return theta, inverse, float(TUNING.evidence - TUNING.degrees / 2 * log_width - cost - 0.5 * log_hessian)
-
-
-def _described(
-    theta: np.ndarray, covariance: np.ndarray, quantile: float, log_odds: float, limit: float
-) -> Payload:
-    """Return the payload with parameters theta (10,) and their covariance (10, 10).
-
-    Its intervals are computed from the derivatives of mass, centre of mass and inertia with respect to theta.
-    """
-    values = _mass_center_inertia(theta)
-    # Complex-step derivatives have no cancellation errors (Squire and Trapp, SIAM Review 40:110, 1998).
-    tiny = 1e-30
-    steps = [_mass_center_inertia(theta + tiny * 1j * unit).imag for unit in np.eye(10)]
-    jacobian = np.array(steps).T / tiny
-    half = quantile * np.sqrt(np.einsum("ki,ij,kj->k", jacobian, covariance, jacobian))
-    intervals = np.stack([values - half, values + half], axis=1)
-    low, high = intervals[0].tolist()
-    return Payload(
-        "payload", log_odds, limit, float(values[0]), (max(low, 0.0), high), values[1:4], intervals[1:4],
-        values[4:], intervals[4:], theta, covariance,
-    )  # fmt: skip
 
 
 def _mass_center_inertia(theta: np.ndarray) -> np.ndarray:

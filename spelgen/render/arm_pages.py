@@ -9,6 +9,8 @@ import numpy as np
 
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
+from spelgen.certificate import formula_files
+from spelgen.certificate.formulas import Formulas
 from spelgen.certificate.inspection import Inspection, range_text
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.excitation.excitation import ADVICE, Excitation
@@ -25,7 +27,6 @@ from spelgen.structure.structure import derive
 from spelgen.templates import render_page
 
 if TYPE_CHECKING:
-    from spelgen.certificate.formulas import Formulas
     from spelgen.certificate.verify import Verification
     from spelgen.identification.identification import Identification
 
@@ -44,18 +45,13 @@ def inspection_page(
         proof: Verification of the structure; None: the structure was not verified.
         urdf: URDF of the arm, from which the picture of the arm is drawn; None: the page has no picture.
     """
-    text = None
-    if closed:  # SymPy is slow to import, so it is imported only if the page has formulas.
-        from spelgen.certificate.formula_files import text as written
-
-        text = written(closed, width=100)
     return render_page(
         "inspection.html.jinja",
         found=inspection,
         cells=matrix(inspection.arm, inspection.structure),
         arm=None if urdf is None else arm_section(inspection.arm, urdf),
         joints=[(joint.name, joint.joint_type, range_text(joint)) for joint in inspection.arm.coordinates],
-        closed=text,
+        closed=None if closed is None else formula_files.text(closed, width=100),
         proof=proof,
     )
 
@@ -149,5 +145,4 @@ def _derivative(segment: Trajectory) -> np.ndarray:
     """Return dq/dt, (T, n) [rad/s, m/s], by central differences of the positions; NaN for a segment of one sample."""
     if len(segment.t) < 2:
         return np.full_like(segment.q, np.nan)
-    derivative: np.ndarray = np.gradient(segment.q, segment.t, axis=0)
-    return derivative
+    return np.asarray(np.gradient(segment.q, segment.t, axis=0))

@@ -72,13 +72,11 @@ class Axis:
         # Values are clipped, because browsers limit the range of coordinates.
         scale = np.log if self.log else np.asarray
         low, high, clipped = map(scale, (self.low, self.high, np.clip(values, self.low, self.high)))
-        pixels: np.ndarray = self.start + (clipped - low) / (high - low) * (self.end - self.start)
-        return pixels
+        return np.asarray(self.start + (clipped - low) / (high - low) * (self.end - self.start))
 
     def contains(self, values: np.ndarray) -> np.ndarray:
         """Return a mask (T,): true for the values (T,) within the axis."""
-        inside: np.ndarray = (values >= self.low) & (values <= self.high)
-        return inside
+        return (values >= self.low) & (values <= self.high)
 
     def ticks(self) -> list[tuple[float, str]]:
         """Return the ticks at about five round values within the axis: pixel and label of each tick."""
@@ -174,19 +172,11 @@ Mark = Line | Band
 
 
 @dataclass(frozen=True)
-class LegendEntry:
-    """An entry of a legend: CSS classes of the mark, and the label of the mark."""
-
-    style: str
-    label: str
-
-
-@dataclass(frozen=True)
 class Chart:
-    """A chart: an SVG element, and the legend of its visible marks."""
+    """A chart: an SVG element, and its legend: CSS classes and label of each visible mark."""
 
     svg: str
-    legend: tuple[LegendEntry, ...]
+    legend: tuple[tuple[str, str], ...]
 
     def __html__(self) -> str:
         """Return the SVG element; templates call this method to insert it without escaping."""
@@ -235,7 +225,7 @@ def line_chart(
     for mark in marks:
         inside = y_axis.contains(_shown([mark.heights], log))
         if inside.any():
-            legend.append(LegendEntry(f"{mark.shape} {mark.style}", mark.label))
+            legend.append((f"{mark.shape} {mark.style}", mark.label))
         if mark.shape == "line" and not inside.all():
             beyond.append(mark.label)
     svg = render(
@@ -265,8 +255,7 @@ def _spaced(pixels: np.ndarray) -> str:
 def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
     """Return the finite values of all columns as one vector; if `positive`, only the positive values."""
     values = np.concatenate([np.zeros(0), *columns])
-    drawable: np.ndarray = values[np.isfinite(values) & ((values > 0) | (not positive))]
-    return drawable
+    return np.asarray(values[np.isfinite(values) & ((values > 0) | (not positive))])
 
 
 def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool) -> Axis:

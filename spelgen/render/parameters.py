@@ -1,10 +1,7 @@
 """Tables of the numerical parameters of a model: inertial parameters, drives, friction, constants of M."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,6 +11,7 @@ from spelgen.dynamics.body_regressor import about_center
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
 from spelgen.dynamics.regressor_dynamics import urdf_parameters
+from spelgen.emission.assemble import ArmModel
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
 from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.run_record import Content
@@ -24,9 +22,6 @@ from spelgen.listing import Listing
 from spelgen.runtime.derived_mass import ConstantMass, DerivedMass
 from spelgen.runtime.network_dynamics import NetworkDynamics
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 Rows = tuple[tuple[str, ...], ...]
 

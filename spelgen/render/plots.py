@@ -6,32 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spelgen import labels
 from spelgen.evaluation.drawn_motions import PredictedMotion
 from spelgen.evaluation.traces import Growth, Quantiles
-from spelgen.labels import (
-    CONSTANT_VELOCITY,
-    LEAST_SQUARES,
-    LEAST_SQUARES_WITH_MEMORY,
-    MODEL,
-    UNITS,
-    URDF,
-    URDF_WITH_DRIVES,
-    NamedJoint,
-    entry_name,
-    observed,
-)
 from spelgen.render.charts import MARGINS, TUNING, Band, Chart, Line, Mark, Values, line_chart
 
 STYLES = defaultdict(
     lambda: "c6",
     {
-        MODEL: "model",
-        URDF: "urdf",
-        URDF_WITH_DRIVES: "drives",
-        LEAST_SQUARES: "squares",
-        LEAST_SQUARES_WITH_MEMORY: "remembering",
-        CONSTANT_VELOCITY: "hold",
-        observed(MODEL): "going-on",
+        labels.MODEL: "model",
+        labels.URDF: "urdf",
+        labels.URDF_WITH_DRIVES: "drives",
+        labels.LEAST_SQUARES: "squares",
+        labels.LEAST_SQUARES_WITH_MEMORY: "remembering",
+        labels.CONSTANT_VELOCITY: "hold",
+        labels.observed(labels.MODEL): "going-on",
     },
 )
 """Predictor -> CSS class of its lines."""
@@ -69,7 +58,7 @@ class JointRow:
 
 
 def stacks(
-    t: Values, rows: Sequence[JointRow], joints: Sequence[NamedJoint], motion: str = ""
+    t: Values, rows: Sequence[JointRow], joints: Sequence[labels.NamedJoint], motion: str = ""
 ) -> list[Panel]:
     """Return a column of charts per joint; only the last chart has the numbers of the common time axis.
 
@@ -108,7 +97,7 @@ def growth_panels(
     panels = []
     for title, label, errors_of in MEASURES:
         marks: list[Mark] = []
-        errors: dict[str, Quantiles] = {}
+        errors = {}
         for name, (growth, predictor) in growths.items():
             error = errors_of(growth).get(predictor)
             if error is None:
@@ -133,9 +122,9 @@ def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None
     excluded.
     """
     # A page of several runs has one line per run and no baselines, so its axis is not limited.
-    if MODEL not in errors:
+    if labels.MODEL not in errors:
         return None
-    model_errors = np.concatenate([errors[MODEL].low, errors[MODEL].high])
+    model_errors = np.concatenate([errors[labels.MODEL].low, errors[labels.MODEL].high])
     values = np.concatenate([model_errors, *(error.median for error in errors.values())])
     # Zeros are excluded from the logarithmic axis. Diverged baselines are excluded, as they would compress all lines.
     values = values[(values > 0) & (values <= TUNING.outlier * np.nanmax(model_errors))]
@@ -147,7 +136,7 @@ def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None
 def trajectory_panels(
     predictions: Mapping[str, PredictedMotion],
     styles: Mapping[str, str],
-    joints: Sequence[NamedJoint],
+    joints: Sequence[labels.NamedJoint],
     motion: str = "",
 ) -> list[Panel]:
     """Return the charts of each joint: position and position error and, if logged, velocity and velocity error.
@@ -202,9 +191,9 @@ def mass_panels(
     for number, (i, j) in enumerate(np.argwhere(np.tri(len(joint_types))).tolist()):
         lines = [Line(label, t, mass[number], styles[label]) for label, mass in masses.items()]
         if np.nanmax(np.abs([line.heights for line in lines])) > zero:
-            name = entry_name(i, j)
+            name = labels.entry_name(i, j)
             # An entry between a revolute and a prismatic joint has the unit of a first moment.
-            unit = UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
+            unit = labels.UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
             chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=width)
             panels.append(Panel(name, (chart,)))
     return panels

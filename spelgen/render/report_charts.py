@@ -21,7 +21,7 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
     """Return {section of the report: charts}; the value is None or empty if the evaluation has no curves for it."""
     joints = named_joints(spec.joint_names, spec.joint_types)
     # Every section has a value, None by default, because an undefined name is an error in the template.
-    drawn: dict[str, object] = dict.fromkeys(("growth", "mass", "friction", "energy"))
+    drawn = dict.fromkeys(("growth", "mass", "friction", "energy"))
     growth, mass = traces.growth, traces.mass
     if growth is not None:
         growths = {name: (growth, name) for name in growth.relative}
@@ -135,7 +135,7 @@ def coverage_panels(
     traces: Traces, identified: Content | None, joints: Sequence[NamedJoint], limits: Limits
 ) -> list[Panel]:
     """Return charts per joint: histograms of position and velocity in training and test logs, and position limits."""
-    logs: dict[str, Content | None] = {"training": (identified or {}).get("coverage")}
+    logs = {"training": (identified or {}).get("coverage")}
     logs["test"] = traces.coverage
     panels = []
     for k, joint in enumerate(joints):

@@ -21,7 +21,7 @@ from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
 from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.plots import growth_panels
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
-from spelgen.render.run_facts import Run, open_run
+from spelgen.render.run_facts import Run
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.structure.structure import derive
 from spelgen.templates import render_page
@@ -54,7 +54,7 @@ def write_report(
 
 def report_data(folder: Path | str) -> Content:
     """Return the data of the page for programs: assessment, evaluation, baselines and parameters."""
-    run = open_run(folder)
+    run = Run(folder)
     tables = parameter_tables(run.model, run.arm, run.baselines, run.posterior)
     bodies = body_parameters(run.model).tolist() if isinstance(run.model, RigidBodyDynamics) else None
     return {
@@ -73,16 +73,12 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 
     robot: URDF with its meshes, for the picture of the arm; default: the URDF in the run folder.
     """
-    folder = Path(folder)
-    if not RunFolder(folder).path.is_dir():
-        expected = "a folder with spec.json"
-        raise RunError("no run", file=folder, expected=expected, do="make one with `spelgen train`")
     # Files of a run folder are untrusted and may have any content, so exceptions of any type are reported as errors.
     try:
-        return _rendered(open_run(folder), robot)
+        return _rendered(Run(folder), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
         got = f"files without the data of a report ({in_one_line(error)})"
-        raise RunError(got, file=folder, do="run `spelgen evaluate` again") from error
+        raise RunError(got, file=Path(folder), do="run `spelgen evaluate` again") from error
 
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
@@ -135,11 +131,11 @@ def write_runs(folders: Sequence[Path], output: Path) -> Path:
 def render_runs(folders: Sequence[Path]) -> str:
     """Return the page about several runs as HTML."""
     # All runs are read before the page is written, so that an unreadable run does not result in an incomplete page.
-    runs: dict[str, Run] = {}
-    results: dict[str, Results] = {}
+    runs = {}
+    results = {}
     for name, folder in zip(_names(folders), folders, strict=True):
         RunFolder(folder).read_record()  # This call only checks that the folder contains a run.
-        run = open_run(folder)
+        run = Run(folder)
         if run.results is None:
             raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
         runs[name], results[name] = run, run.results
@@ -162,7 +158,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
     """
     # Paths are resolved, because `.` has no name.
     paths = list(map(Path.resolve, folders))
-    names: list[str] = []
+    names = []
     for count in range(1, max(len(path.parts) for path in paths) + 1):
         names = ["/".join(path.parts[-count:]) for path in paths]
         if len(set(names)) == len(names):

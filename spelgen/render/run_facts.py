@@ -1,21 +1,18 @@
 """Facts about a run: most important figures, training, options, and the commands that reproduce the run."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.parameters import used_parameter_count
+from spelgen.emission.assemble import ArmModel
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import SpelgenError, shortened
-from spelgen.evaluation.measurements import Verdict
-from spelgen.evaluation.results import Results
+from spelgen.evaluation.results import Results, Verdict
 from spelgen.evaluation.tables import figures
 from spelgen.evaluation.verdict import Limits
 from spelgen.fitting.posterior import Posterior, posterior_of
@@ -32,36 +29,36 @@ from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
 from spelgen.spec import ModelSpec, Options
 
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
-
-@dataclass(frozen=True)
 class Run:
-    """The content of a run folder; a field is None if its file is absent.
+    """The content of a run folder; an attribute is None if its file is absent.
 
-    config: record of the fit. baselines: content of least_squares.json, {} if the file is absent. arm: arm of the URDF;
-    None also if the URDF cannot be read, in which case the page has no picture of the arm.
+    Attributes:
+        config: Record of the fit.
+        verdict: Assessment of the model.
+        baselines: Content of least_squares.json; {} if the file is absent.
+        arm: Arm of the URDF; None also if the URDF cannot be read, in which case the page has no picture of the arm.
+        limits: Lower and upper position limit of each joint [rad, m]; None for a joint without limits.
     """
 
-    folder: RunFolder
-    spec: ModelSpec
-    config: Record | None
-    results: Results | None
-    baselines: Content
-    arm: Arm | None
-
-    @property
-    def limits(self) -> Limits:
-        """Lower and upper position limit of each joint [rad, m]; None for a joint without limits."""
-        if self.arm is None:
-            return [None] * len(self.spec.joints)
-        return [joint.limits for joint in self.arm.chain.coordinates]
-
-    @property
-    def verdict(self) -> Verdict | None:
-        """Assessment of the model; None if the run is not evaluated."""
-        return None if self.results is None else self.results.assessment
+    def __init__(self, path: Path | str) -> None:
+        """Read the files. Raises RunError or ModuleError."""
+        folder = self.folder = RunFolder(path)
+        self.spec = folder.read_spec()
+        self.config = folder.read_record() if folder.config.is_file() else None
+        self.baselines = folder.read_baselines()
+        self.results: Results | None = None
+        self.verdict: Verdict | None = None
+        if folder.evaluation.is_file():
+            self.results = Results.from_dict(folder.read_json(folder.evaluation))
+            self.verdict = self.results.assessment
+        self.arm: Arm | None = None
+        self.limits: Limits = [None] * len(self.spec.joints)
+        if folder.urdf.exists():
+            # An unreadable URDF is no error: results do not depend on it, only the picture of the arm is omitted.
+            with suppress(SpelgenError):
+                self.arm = arm_of_spec(self.spec, folder.urdf)
+                self.limits = [joint.limits for joint in self.arm.chain.coordinates]
 
     @cached_property
     def metrics(self) -> list[Content]:
@@ -84,20 +81,6 @@ class Run:
         # The tables of the posterior state the torque delay, by which the fit has shifted the logged torques.
         delay = self.config.preprocessing.torque_delay or 0.0
         return None if content is None else posterior_of(self.model, content, delay, self.folder.checkpoint)
-
-
-def open_run(path: Path | str) -> Run:
-    """Return the content of a run folder. Raises RunError or ModuleError."""
-    folder = RunFolder(path)
-    spec, arm, results = folder.read_spec(), None, None
-    if folder.evaluation.is_file():
-        results = Results.from_dict(folder.read_json(folder.evaluation))
-    if folder.urdf.exists():
-        # An unreadable URDF is no error: results do not depend on it, only the picture of the arm is omitted.
-        with suppress(SpelgenError):
-            arm = arm_of_spec(spec, folder.urdf)
-    record = folder.read_record() if folder.config.is_file() else None
-    return Run(folder, spec, record, results, folder.read_baselines(), arm)
 
 
 def head_numbers(run: Run) -> list[tuple[str, str]]:

@@ -128,7 +128,7 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
     that are fixed to another drawn link.
     """
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
-    carried: set[str] = set()
+    carried = set()
     visible = [robot.root]
     for joint in robot.joints_from_root:
         # A link moves with the arm if its joint belongs to the arm or its parent link moves with the arm.
@@ -166,7 +166,7 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
 def _axis(joint: UrdfJoint) -> np.ndarray:
     """Return the unit vector of the joint axis (3,), in the joint frame."""
     axis = np.array(joint.axis, dtype=float)
-    return np.asarray(axis / (np.linalg.norm(axis) or 1.0))
+    return axis / (np.linalg.norm(axis) or 1.0)
 
 
 def _rotation(joint: UrdfJoint) -> np.ndarray:

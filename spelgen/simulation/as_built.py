@@ -17,7 +17,7 @@ from spelgen.excitation.bounds import SPEEDS, motion_bounds
 from spelgen.files import write_bytes, write_text
 from spelgen.simulation.tuning import AS_BUILT
 from spelgen.structure.nominal import parameters_of, pseudo_inertia
-from spelgen.urdf.document import urdf_bytes
+from spelgen.urdf.document import read_document
 
 ABOUT = "The arm as built, from seed {}: the ground truth of simulated logs. `spelgen simulate` on it makes more logs."
 
@@ -65,7 +65,7 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
         exclude_unset=True,
     )
     names = list(arm.chain.joint_names)
-    settings: dict[str, object] = {"about": ABOUT.format(seed), "moving_joints": names} | carried
+    settings = {"about": ABOUT.format(seed), "moving_joints": names} | carried
     # Other arms are simulated along prescribed paths. This is not possible with position servos and passive joints, so
     # such arms keep the protocol of their settings.
     if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
@@ -116,7 +116,7 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
     asymmetry = rng.uniform(-AS_BUILT.asymmetry, AS_BUILT.asymmetry, len(joints))
     viscous = rng.uniform(*AS_BUILT.viscous, len(joints)) * coulomb / speed
     armature = rng.uniform(*AS_BUILT.armature, len(joints)) * inertia
-    drives: dict[str, dict[str, object]] = {}
+    drives = {}
     for k, joint in enumerate(joints):
         drive = arm.settings.joint(joint.name)
         forward, backward = coulomb[k] * (1 + asymmetry[k]), coulomb[k] * (1 - asymmetry[k])
@@ -145,15 +145,20 @@ def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
         error: Relative standard deviation: 0.3 is 30 %.
         seed: Seed of the random factors; the same seed gives the same bytes.
     """
-    # Entities and network access are off, so that a malicious URDF cannot include other files.
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
-    tree = etree.ElementTree(etree.fromstring(urdf_bytes(robot), parser))
-    for element in list(tree.iter("dynamics", "visual", "collision")):
-        element.getparent().remove(element)
+    root = urdf_without(robot, "dynamics", "visual", "collision")
     rng = np.random.default_rng(seed)
-    for inertial in tree.iterfind(".//link/inertial"):
+    for inertial in root.iterfind(".//link/inertial"):
         _perturb(inertial, error * rng.normal(size=2), error * rng.normal(size=3))
-    return bytes(etree.tostring(tree, xml_declaration=True, encoding="utf-8"))
+    return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8"))
+
+
+def urdf_without(robot: Path, *tags: str) -> etree._Element:
+    """Return the root element of a URDF or xacro file, without comments and without elements of these tags."""
+    root = read_document(robot).root
+    etree.strip_tags(root, etree.Comment)
+    for element in list(root.iter(*tags)):
+        element.getparent().remove(element)
+    return root
 
 
 def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np.ndarray) -> None:

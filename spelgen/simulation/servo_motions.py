@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
@@ -13,14 +12,11 @@ from spelgen.simulation.protocol import (
     initial_range,
     make_friction,
     sample_times,
-    silent,
 )
 from spelgen.simulation.tuning import TUNING
 
 
-def servo_motions(
-    arm: Chain, settings: Settings, drives: Drives | None = None, *, progress: Progress = silent
-) -> SimulatedLogs:
+def servo_motions(arm: Chain, settings: Settings, progress: Progress) -> SimulatedLogs:
     """Return trajectories of an arm under position servos, whose commands are random sines and steps.
 
     The same settings give the same logs.
@@ -28,7 +24,6 @@ def servo_motions(
     Args:
         arm: The arm.
         settings: `simulation` and `joints` are used.
-        drives: Not used: each servo moves its own joint.
         progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     protocol = settings.simulation
@@ -38,7 +33,7 @@ def servo_motions(
     resolution = 2 * np.pi / TUNING.encoder_counts
     is_revolute = np.array([x.joint_type == "revolute" for x in arm.coordinates])
     encoder = np.where(is_revolute, resolution, resolution / 10)  # (n,) [rad, m]
-    logs: list[Trajectory] = []
+    logs = []
     for number, random in enumerate(np.random.default_rng(protocol.seed).spawn(protocol.trajectories)):
         u = middle + width * _commands(random, t, len(middle))
         q = _positions(arm, settings, t, u)

@@ -112,17 +112,18 @@ def simulate(
     values = arm.settings.simulation.model_dump(exclude_unset=True) | changes
     changed = validated(SimulationSettings, values, YamlDocument(Path("simulate"), None))
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
-    drives = arm.actuation.drives()
     progress = progress or silent
-    if motions:
-        if settings.input == "position":
+    if settings.input == "position":
+        if motions:
             raise SettingsError(
                 "motions of an arm with position servos", element="input", expected="input: torque",
                 do="simulate without motions: commands are random",
             )  # fmt: skip
+        return servo_motions(arm.chain, settings, progress)
+    drives = arm.actuation.drives()
+    if motions:
         return prescribed(arm.chain, settings, drives, motions=motions, progress=progress)
-    run = servo_motions if settings.input == "position" else PROTOCOLS[settings.simulation.protocol]
-    return run(arm.chain, settings, drives, progress=progress)
+    return PROTOCOLS[settings.simulation.protocol](arm.chain, settings, drives, progress=progress)
 
 
 def _controlled(settings: Settings) -> Settings:
@@ -139,7 +140,7 @@ def _controlled(settings: Settings) -> Settings:
         return settings
     simulation = ControlledSimulation(**simulation.model_dump(exclude_unset=True))
     rate = simulation.sample_rate
-    defaults: dict[str, object] = {
+    defaults = {
         "control": "computed-torque",
         "paths": "own" if {"amplitude", "frequency"} & tracking.model_fields_set else "excitation",
         "control_rate": rate / max(1, round(rate / TUNING.control_rate)),

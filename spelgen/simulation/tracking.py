@@ -25,19 +25,6 @@ from spelgen.simulation.tuning import TUNING
 
 
 @dataclass(frozen=True, eq=False)
-class Gains:
-    """Gains of the PID controllers of the joints, (n,) each.
-
-    proportional: torque per position error. integral: torque per integral of the position error. derivative: torque per
-    velocity error.
-    """
-
-    proportional: np.ndarray
-    integral: np.ndarray
-    derivative: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Recording:
     """One motion of T samples: the true states, and the signals of the sensors.
 
@@ -83,8 +70,7 @@ def track(
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
         # 1 / (M^-1)_jj is the inertia at joint j while all other joints move freely.
         inertia = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))
-        gains = tuned_gains(inertia, bandwidth)
-        recording = record(dynamics, friction, inputs, path, gains, settings, 2 * np.pi * bandwidth)
+        recording = record(dynamics, friction, inputs, path, settings, inertia, 2 * np.pi * bandwidth)
         log = measured(recording, settings.tracking, f"traj_{number:02d}")
         cut = max(1, len(log) - round(protocol.test_fraction * len(log)))
         train.append(log[:cut])
@@ -94,74 +80,41 @@ def track(
     return SimulatedLogs(train, test)
 
 
-def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
-    """Return PID gains that place both poles of the position loop at the bandwidth.
-
-    Args:
-        inertia: Inertias (n,) [kg m^2, kg] of the joints.
-        bandwidth: Bandwidth of the position loop [Hz].
-    """
-    omega = 2 * np.pi * bandwidth
-    # Without the integral term the characteristic polynomial of the position loop is s^2 + 2 omega s + omega^2. Its
-    # double pole -omega gives no overshoot.
-    return Gains(inertia * omega**2, TUNING.integral_gain * inertia * omega**3, 2 * inertia * omega)
-
-
-def computed_torque(
-    dynamics: PinocchioDynamics,
-    friction: DriveFriction,
-    motion: tuple[np.ndarray, np.ndarray, np.ndarray],
-    error: np.ndarray,
-    velocity_error: np.ndarray,
-    omega: float,
-) -> np.ndarray:
-    """Return the joint torques (n,) [Nm, N] of inverse-dynamics control (Siciliano et al., Robotics, 2009, 8.5.2).
-
-        M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
-
-    For a joint that viscous friction makes slower than omega, a stiffness viscous * omega is added.
-
-    Args:
-        dynamics: The simulated arm; the controller uses its true parameters.
-        friction: Friction of the drives.
-        motion: Measured q, desired qd* and qdd*, (n,) each.
-        error: Position error e (n,) [rad, m].
-        velocity_error: Velocity error e' (n,).
-        omega: Natural frequency of the error [rad/s].
-    """
-    q, qd, qdd = motion
-    mass = dynamics.mass_matrix(q)
-    # If viscous friction v dominates, an added stiffness k gives v de/dt = -k e for the position error e. The error
-    # then decays with the time constant v / k, which is 1 / omega for k = v omega.
-    slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
-    torque = mass @ (qdd + 2 * omega * velocity_error + omega**2 * error) + slow * error
-    return np.asarray(torque + dynamics.nonlinear_effects(q, qd) + friction(qd))
-
-
 def record(
     dynamics: PinocchioDynamics,
     friction: DriveFriction,
     inputs: np.ndarray,
     path: Motion,
-    gains: Gains,
     settings: Settings,
-    omega: float = 0.0,
+    inertia: np.ndarray,
+    omega: float,
 ) -> Recording:
     """Return the recording of a controlled motion along a path. The arm starts at rest, in equilibrium with gravity.
 
-    The controller reads the encoders at each tick of its clock, and its torques are constant between ticks.
+    The controller reads the encoders at each tick of its clock, and its torques are constant between ticks. It is a PID
+    controller per joint or, for `tracking.control: computed-torque`, inverse-dynamics control with the true parameters
+    of the arm (Siciliano et al., Robotics, 2009, 8.5.2):
+
+        M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
+
+    with the position error e = q* - q. For a joint that viscous friction makes slower than omega, a stiffness
+    viscous * omega is added.
 
     Args:
         dynamics: The arm, with friction.
         friction: Friction of the arm, as used by the controller.
         inputs: Input matrix G (n, n): joint torques = G times motor torques.
-        path: Desired motion at the ticks of the controller.
-        gains: Gains of the PID controllers.
+        path: Desired motion q*, qd*, qdd* at the ticks of the controller.
         settings: `simulation` and `tracking` are used.
-        omega: Natural frequency of inverse-dynamics control [rad/s]; only for `tracking.control: computed-torque`.
+        inertia: Inertias (n,) [kg m^2, kg] of the joints, which determine the gains of the PID controllers.
+        omega: Natural frequency of the position loop [rad/s].
     """
     tracking, n = settings.tracking, path.q.shape[1]
     tick, samples = 1.0 / tracking.control_rate, _samples_of_a_tick(settings)
+    # Without the integral term the characteristic polynomial of the position loop is s^2 + 2 omega s + omega^2. Its
+    # double pole -omega gives no overshoot.
+    proportional, derivative = inertia * omega**2, 2 * inertia * omega
+    integral_gain = TUNING.integral_gain * inertia * omega**3
     # Passive joints have no motor, so G is singular: the pseudo-inverse ignores the desired torque at these joints.
     to_motors = np.linalg.pinv(inputs)
     state = np.concatenate([path.q[0], np.zeros(n)])
@@ -174,10 +127,15 @@ def record(
         previous, encoders = encoders, quantized(state[:n], tracking)
         # The measured velocity is the difference of encoder positions divided by the tick, as in a servo drive.
         error, velocity_error = q - encoders, qd - (encoders - previous) / tick
-        integral = integral + tick * gains.integral * error
-        effort = gains.proportional * error + gains.derivative * velocity_error + integral
+        integral = integral + tick * integral_gain * error
+        effort = proportional * error + derivative * velocity_error + integral
         if tracking.control == "computed-torque":
-            effort = computed_torque(dynamics, friction, (encoders, qd, qdd), error, velocity_error, omega)
+            mass = dynamics.mass_matrix(encoders)
+            # If viscous friction v dominates, an added stiffness k gives v de/dt = -k e for the position error e. The
+            # error then decays with the time constant v / k, which is 1 / omega for k = v omega.
+            slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
+            effort = mass @ (qdd + 2 * omega * velocity_error + omega**2 * error) + slow * error
+            effort = effort + dynamics.nonlinear_effects(encoders, qd) + friction(qd)
         torques.append(to_motors @ effort)
         torque = np.tile(inputs @ torques[-1], (samples + 1, 1))
         passed = rollout(dynamics, state, k * tick + within, torque, TUNING.seen_loosening)

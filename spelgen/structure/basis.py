@@ -72,47 +72,32 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     for r, row, row_values in zip(functionals, basis, basis_values, strict=True):
         functional = _weights(spans, r.weights, r.values)
         outputs.append(Term(r.joints, functional, _weights(spans, row, row_values)))
-    # The constant terms are a basis of the span of M - sum_j f_j B_j, which does not depend on q.
+    # The constant terms are a basis of the span of M - sum_j f_j B_j, which does not depend on q. `constant` and
+    # `constant_values`, (S, entries), are samples of this difference.
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     constant_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
-    return tuple(outputs), _constants(spans, functionals, (constant, constant_values), (basis, basis_values))
-
-
-def _constants(
-    spans: Spans,
-    functionals: list[_Functional],
-    constant: tuple[np.ndarray, np.ndarray],
-    basis: tuple[np.ndarray, np.ndarray],
-) -> tuple[Term, ...]:
-    """Return the constant terms of M: a basis of the span of M - sum_j f_j B_j, with the varying terms f_j(q) B_j.
-
-    Matrices are lower triangles with entries = n(n+1)/2 elements.
-
-    Args:
-        constant: S samples of this difference, (S, entries), in the prime field and in double precision.
-        basis: the m matrices B_j, (m, entries), in the prime field and in double precision.
-    """
     # The entry of M at each pivot of the row reduction defines a constant. Row reduction places pivots in the first
     # possible columns: the entries that depend on the fewest joints come first.
-    order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))
-    echelon = field.row_basis(constant[0][:, order])
+    order = sorted(range(entries), key=lambda index: (len(spans.entry_joints[index]), -index))
+    echelon = field.row_basis(constant[:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
     rows = np.zeros_like(echelon)
     rows[:, order] = echelon
-    row_values = _solved(constant[1][:, bound], constant[1])
+    solutions = _solved(constant_values[:, bound], constant_values)
     constants = []
-    for pivot, row, values in zip(bound, rows, row_values, strict=True):
+    for pivot, row, row_values in zip(bound, rows, solutions, strict=True):
         # The constant is the entry of M at the pivot minus the contribution of the varying terms f_j B_j to this
         # entry.
-        weights, weight_values = _single(spans, pivot)
+        exact, approximate = _single(spans, pivot)
         for j, output in enumerate(functionals):
-            coefficient = int(basis[0][j, pivot])
+            coefficient = int(basis[j, pivot])
             if coefficient:
                 scaled = field.product(np.array([[coefficient]], dtype=np.uint64), output.weights[None])[0]
-                weights = field.difference(weights, scaled)
-                weight_values = weight_values - basis[1][j, pivot] * output.values
-        constants.append(Term((), _weights(spans, weights, weight_values), _weights(spans, row, values)))
-    return tuple(constants)
+                exact = field.difference(exact, scaled)
+                approximate = approximate - basis_values[j, pivot] * output.values
+        functional = _weights(spans, exact, approximate)
+        constants.append(Term((), functional, _weights(spans, row, row_values)))
+    return tuple(outputs), tuple(constants)
 
 
 def _functionals(spans: Spans) -> Iterator[_Functional]:

@@ -8,8 +8,6 @@ parameter, and an expansion is stopped before it exceeds its budget of multiplic
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from fractions import Fraction
 from typing import TypeAlias
 
 from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
@@ -62,47 +60,34 @@ class TooLarge(Exception):
     """An expansion needs more multiplications of terms than its budget has."""
 
 
-class Budget:
-    """Number of multiplications of polynomial terms that an expansion may still use."""
-
-    def __init__(self, remaining: int):
-        self.remaining = remaining
-
-    def spend(self, cost: int) -> None:
-        """Subtract ``cost`` from the remaining multiplications. Raises TooLarge if fewer remain.
-
-        It is called before the multiplications are made.
-        """
-        if cost > self.remaining:
-            raise TooLarge
-        self.remaining -= cost
-
-
 class Expansion:
     """The recorded operations of the recursion for M and V of ``arm``, which give polynomials in s1, c1, q1, s2, ...
 
     s, c and q with a number are sine, cosine and position of the coordinate with this number, from 1 (``Position``).
+    budget: number of multiplications of polynomial terms that all expansions together may use; 2e6 take about 2 s.
     """
 
-    def __init__(self, arm: Chain):
-        n = len(arm.coordinates)
+    def __init__(self, arm: Chain, budget: int = 2_000_000):
         names: list[str] = []
-        for k in range(n):
-            names += (f"s{k + 1}", f"c{k + 1}", f"q{k + 1}")
+        for k in range(1, len(arm.coordinates) + 1):
+            names += (f"s{k}", f"c{k}", f"q{k}")
+        self.budget = budget
         self.context = fmpq_mpoly_ctx.get(names, Ordering.lex)
         variables = [Deferred("constant", x) for x in self.context.gens()]
         self._parameters = [Deferred("parameter", index) for index in range(10 * len(arm.bodies))]
         positions = list(map(Position, variables[1::3], variables[::3], variables[2::3]))
-        inertias: list[Sequence[Deferred]] = []
-        for body in range(len(arm.bodies)):
-            inertias.append(self._parameters[10 * body : 10 * body + 10])
-        self.energies = energies(arm, positions, inertias, _number)
+        inertias = []
+        for first in range(0, len(self._parameters), 10):
+            inertias.append(self._parameters[first : first + 10])
+        self.energies = energies(
+            arm, positions, inertias, lambda value: Deferred("constant", rational(value))
+        )
 
-    def polynomial(self, element: Deferred | int, parameter: int, budget: Budget) -> fmpq_mpoly:
+    def polynomial(self, element: Deferred | int, parameter: int) -> fmpq_mpoly:
         """Return the coefficient, a polynomial, of an inertial parameter in an entry of M or in V.
 
         element: the recorded expression of the entry. parameter: the index of the inertial parameter, 10 body + i.
-        Raises TooLarge.
+        Raises TooLarge if the budget does not suffice.
         """
         # The keys are the id() of recorded operations, so that a subexpression that occurs twice is computed once.
         values: dict[int, Value] = {}
@@ -116,42 +101,32 @@ class Expansion:
             if isinstance(node, Deferred) and id(node) not in values:
                 missing = [x for x in node.operands if isinstance(x, Deferred) and id(x) not in values]
                 if not missing:
-                    values[id(node)] = _executed(node, values, budget)
+                    operands = [_value(operand, values) for operand in node.operands]
+                    values[id(node)] = self._executed(node.action, *operands)
             if missing:
                 stack += missing
             else:
                 stack.pop()
         return _value(element, values) + self.context.from_dict({})
 
-
-def _executed(node: Deferred, values: dict[int, Value], budget: Budget) -> Value:
-    if node.action == "constant":
-        return _value(node.operands[0], values)
-    x, y = (_value(operand, values) for operand in node.operands)
-    if node.action == "add":
-        return x + y
-    if _is_zero(x) or _is_zero(y):
-        return 0
-    # The cost is the number of products of two terms: FLINT computes all of them before it collects like terms.
-    budget.spend(_terms(x) * _terms(y))
-    return x * y
+    def _executed(self, action: str, x: Value, y: Value = 0) -> Value:
+        if action == "constant":
+            return x
+        if action == "add":
+            return x + y
+        # The cost is the number of products of two terms: FLINT computes all of them before it collects like terms. An
+        # integer is the value of an inertial parameter, and a product with 0 costs nothing.
+        cost = 1
+        for factor in (x, y):
+            if isinstance(factor, fmpq_mpoly):
+                cost *= max(1, len(factor))
+            elif factor == 0:
+                return 0
+        if cost > self.budget:
+            raise TooLarge
+        self.budget -= cost
+        return x * y
 
 
 def _value(operand: Deferred | Value, values: dict[int, Value]) -> Value:
-    if isinstance(operand, Deferred):
-        return values[id(operand)]
-    return operand
-
-
-def _is_zero(value: Value) -> bool:
-    return isinstance(value, int) and value == 0
-
-
-def _terms(value: Value) -> int:
-    if isinstance(value, fmpq_mpoly):
-        return max(1, len(value))
-    return 1
-
-
-def _number(value: Fraction) -> Deferred:
-    return Deferred("constant", rational(value))
+    return values[id(operand)] if isinstance(operand, Deferred) else operand

@@ -150,8 +150,7 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
     matrices = np.zeros((len(mass), n, n))
     rows, columns = np.tril_indices(n)
     matrices[:, rows, columns] = matrices[:, columns, rows] = mass
-    reference = np.zeros((n, n))
-    reference[rows, columns] = reference[columns, rows] = mass.mean(axis=0)
+    reference = matrices.mean(axis=0)
     if np.linalg.eigvalsh(reference)[0] <= 0:
         return 0.0
     # Generalised eigenvalues (relative to the mean of M) have no unit; eigenvalues of M would mix kg and kg m2.

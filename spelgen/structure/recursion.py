@@ -96,7 +96,7 @@ def energies(
     ]
     composites = [_Inertia(ten[0], tuple(ten[1:4]), tuple(ten[4:10])) for ten in inertias]
     total = _Inertia(0, (0, 0, 0), (0,) * 6)
-    mass: dict[tuple[int, int], Element] = dict.fromkeys(triangle(len(arm.coordinates)), 0)
+    mass = dict.fromkeys(triangle(len(arm.coordinates)), 0)
     # Parents precede children in `arm.bodies`. In reverse order, all children are added to the composite inertia of a
     # body before its column of M is computed.
     for index, body in reversed(list(enumerate(arm.bodies))):
@@ -182,7 +182,7 @@ def base_denominators(arm: Chain) -> list[int]:
 
 def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Element]:
     """Return cosine and sine of ``factor`` times an angle with the cosine ``c`` and the sine ``s``."""
-    result: tuple[Element, Element] = (1, 0)
+    result = (1, 0)
     # The angle is doubled for each bit of `factor`, and increased by one angle for each bit that is 1. This takes fewer
     # products than repeated addition: factors are as large as 20.
     for bit in bin(abs(factor))[2:]:
@@ -211,7 +211,7 @@ def _column(
     # revolute, (m z, h x z) if prismatic. Its component along the joint axis of an ancestor is the entry of M
     # (Featherstone, table 6.2).
     (hx, hy, _), tensor = inertia.moment, inertia.tensor
-    wrench: _Wrench = (-hy, hx, 0), (tensor[2], tensor[4], tensor[5])
+    wrench = (-hy, hx, 0), (tensor[2], tensor[4], tensor[5])
     if body.joint_type == "prismatic":
         wrench = (0, 0, inertia.mass), (hy, -hx, 0)
     while True:

@@ -5,13 +5,9 @@ random positions; the positions of block 1 + k differ from these in coordinate k
 differs between block 0 and block 1 + k depends on coordinate k.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from fractions import Fraction
-from functools import cached_property
 from itertools import accumulate
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,9 +15,7 @@ from spelgen.arm.arm import Chain
 from spelgen.structure import field
 from spelgen.structure.field import PRIME, Residues, difference, random_residues, residue
 from spelgen.structure.recursion import Element, Position, base_denominators, coefficients, energies, triangle
-
-if TYPE_CHECKING:
-    from spelgen.urdf.robot import Assume
+from spelgen.urdf.robot import Assume
 
 Ten = Sequence[Element]
 
@@ -83,7 +77,7 @@ def float_samples(arm: Chain, assume: Assume, samples: int, seed: int = 2) -> np
     rng = np.random.default_rng(seed)
     n = len(arm.coordinates)
     q = [_one_moved(rng.uniform(-3.0, 3.0, 2 * samples), index, 1 + n) for index in range(n)]
-    inertias: list[Ten] = [list(rng.normal(size=(10, samples))) for _ in arm.bodies]
+    inertias = [list(rng.normal(size=(10, samples))) for _ in arm.bodies]
     if assume == "inertials":
         inertias = [list(map(float, body.inertia or (0,) * 10)) for body in arm.bodies]
     mass, _ = float_energies(arm, np.stack(q, axis=-1), inertias)
@@ -134,9 +128,20 @@ def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarr
 class Spans:
     """Spans of M and of its changes in the prime field.
 
-    A row has the n(n+1)/2 entries of the lower triangle of M. The S rows of ``mass``, (S, entries), are samples that
-    span W, the space of all M(q); the S rows of ``changes[k]``, (S, entries), span T_k, the changes of M if only
-    coordinate k moves. U is the sum of all T_k. A basis has one row per dimension of the spanned space.
+    A row has the n(n+1)/2 entries of the lower triangle of M. W is the span of all M(q), T_k the span of the changes of
+    M if only coordinate k moves, and U the sum of all T_k. A basis has one row per dimension of the spanned space.
+
+    Attributes:
+        n: Number of coordinates.
+        keys: (row, column) of each entry.
+        mass: S samples of M that span W, (S, entries).
+        potential_changes: Whether V depends on each coordinate.
+        entry_joints: Set of the joints on which an entry of M depends, for each entry.
+        order: Order in which entries of M are eliminated: entries that depend on many joints first.
+        change_bases: Echelon basis of each T_k, (dim T_k, entries), with the entries in the order ``order``.
+        varying: Basis of U, (dim U, entries).
+        floats: Samples of M in double precision, (1 + n, 2 S, entries). They determine the values of nonzero
+            coefficients; zeros and ranks are determined in the prime field.
     """
 
     def __init__(self, arm: Chain, assume: Assume):
@@ -145,42 +150,19 @@ class Spans:
         # A span has at most as many dimensions as M has entries; four more samples make a deficient rank less likely.
         count = len(self.keys) + 4
         mass, potential = field_samples(arm, assume, count)
-        self._arm, self._assume, self._count = arm, assume, count
         self.mass = mass[0]
-        self.changes = [difference(block, mass[0]) for block in mass[1:]]
         self.potential_changes = (potential[1:] != potential[0]).any(axis=1).tolist()
-
-    @cached_property
-    def entry_joints(self) -> list[frozenset[int]]:
-        """Set of the joints on which an entry of M depends, for each entry of the lower triangle."""
-        depends = np.array([change.any(axis=0) for change in self.changes])  # (n, entries)
-        return [frozenset(np.flatnonzero(column).tolist()) for column in depends.T]
-
-    @cached_property
-    def change_bases(self) -> list[np.ndarray]:
-        """Echelon basis, for each joint k, of T_k, the span of the changes of M if only joint k moves.
-
-        Each basis is (dim T_k, entries), with the entries in the order ``order``.
-        """
-        return [field.row_basis(change[:, self.order]) for change in self.changes]
-
-    @cached_property
-    def order(self) -> list[int]:
-        """Order in which entries of M are eliminated: entries that depend on many joints first."""
-        return sorted(range(len(self.keys)), key=lambda index: (-len(self.entry_joints[index]), index))
-
-    @cached_property
-    def varying(self) -> np.ndarray:
-        """Basis of U, the span of all changes of M, (dim U, entries)."""
-        return field.row_basis(np.concatenate(self.change_bases))[:, np.argsort(self.order)]
-
-    @cached_property
-    def floats(self) -> np.ndarray:
-        """Samples of M in double precision, (1 + n, 2 S, entries).
-
-        They determine the values of nonzero coefficients; zeros and ranks are determined in the prime field.
-        """
-        return float_samples(self._arm, self._assume, 2 * self._count)
+        changes = [difference(block, mass[0]) for block in mass[1:]]
+        depends = np.array([change.any(axis=0) for change in changes])  # (n, entries)
+        self.entry_joints = [frozenset(np.flatnonzero(column).tolist()) for column in depends.T]
+        self.order = sorted(range(len(self.keys)), key=lambda index: (-len(self.entry_joints[index]), index))
+        self.change_bases = [field.row_basis(change[:, self.order]) for change in changes]
+        self.varying = field.row_basis(np.concatenate(self.change_bases))[:, np.argsort(self.order)]
+        self.floats = float_samples(arm, assume, 2 * count)
+        # Echelon bases, for each joint, of the changes of M caused by joints nearer the root, and nearer the tip, which
+        # `outside` needs for many sets of joints.
+        self._nearer_root = _sums(self.change_bases)
+        self._nearer_tip = _sums(self.change_bases[::-1])[::-1]
 
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
         """Return rows (2 S joints, entries) that span the changes of M caused by ``joints``, in double precision."""
@@ -193,20 +175,8 @@ class Spans:
         The entries of M are in the order ``order``.
         """
         first, last = min(joints), max(joints)
-        # Echelon forms for all joints before `first`, and for all after `last`, are cached: this saves most of the
-        # time.
         between = [self.change_bases[k] for k in range(first, last) if k not in joints]
         return field.row_basis(np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]]))
-
-    @cached_property
-    def _nearer_root(self) -> list[np.ndarray]:
-        """Echelon basis, for each joint, of the changes of M caused by joints nearer the root, (dimension, entries)."""
-        return _sums(self.change_bases)
-
-    @cached_property
-    def _nearer_tip(self) -> list[np.ndarray]:
-        """Echelon basis, for each joint, of the changes of M caused by joints nearer the tip, (dimension, entries)."""
-        return _sums(self.change_bases[::-1])[::-1]
 
 
 def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -7,21 +7,17 @@ every k outside J; this test selects the functionals that define the f_j. All te
 prime field (``field``): exact with an error probability of about 1e-16, without tolerances.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import compress
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from spelgen.arm.arm import Chain
 from spelgen.errors import ArmError
 from spelgen.structure.base_parameters import base_parameter_count
 from spelgen.structure.basis import Term, smallest_form
 from spelgen.structure.sampling import Spans
-
-if TYPE_CHECKING:
-    from spelgen.urdf.robot import Assume
+from spelgen.urdf.robot import Assume
 
 
 class MassEntry(NamedTuple):
