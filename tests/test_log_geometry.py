@@ -241,11 +241,14 @@ def test_a_slow_arm_with_right_torques_is_not_refused(arm):
     assert check_logs([slow], arm).errors == ()
 
 
-def test_gravity_along_all_axes_is_called_compensated(robots, tmp_path):
+def test_gravity_along_all_axes_is_called_compensated(tmp_path):
     """With both axes horizontal, gravity along the axes gives the same torques as none."""
-    arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
-    upright = replace(arm, chain=replace(arm.chain, gravity=(0.0, -9.81, 0.0)))
-    error = told(upright, recorded(upright, 5, gravity=0.0))
+    rows = (
+        ("shoulder", "revolute", "base", "0 0 0", "0 1 0", -3, 3, 2),
+        ("elbow", "revolute", "shoulder_link", "0.3 0 0", "0 1 0", -3, 3, 1),
+    )
+    arm = made_arm(tmp_path, rows)
+    error = told(arm, recorded(arm, 5, gravity=0.0))
     assert "--accept gravity-compensated" in error and "'gravity: [0, 0, 0]' in the robot's YAML" in error
     assert "or 'gravity" not in error
 
@@ -261,7 +264,7 @@ def test_factors_of_torques_that_differ_are_stated_per_joint(robots, tmp_path):
     np.testing.assert_allclose(np.log(gains * [37.0, 11.0]), 0.0, atol=np.log(2))  # by the masses of the URDF
 
 
-LIFT = """<robot name="lift">
+ROBOT = """<robot name="made">
   <link name="base"/>
   {joints}
 </robot>"""
@@ -273,19 +276,22 @@ JOINT = """<joint name="{name}" type="{kind}">
     <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 
 
+def made_arm(folder, rows):
+    fields = ("name", "kind", "parent", "xyz", "axis", "lower", "upper", "mass")
+    joints = "\n  ".join(JOINT.format(**dict(zip(fields, row, strict=True))) for row in rows)
+    (folder / "made.urdf").write_text(ROBOT.format(joints=joints))
+    return load_arm(folder / "made.urdf")
+
+
 @pytest.fixture(scope="module")
 def lift(tmp_path_factory):
     """Return an arm whose first joint moves along gravity."""
-    fields = ("name", "kind", "parent", "xyz", "axis", "lower", "upper", "mass")
     rows = (
         ("slide", "prismatic", "base", "0 0 0", "0 0 1", 0, 0.4, 3),
         ("shoulder", "revolute", "slide_link", "0.1 0 0", "0 0 1", -3, 3, 2),
         ("elbow", "revolute", "shoulder_link", "0.3 0 0", "0 0 1", -3, 3, 1),
     )
-    joints = "\n  ".join(JOINT.format(**dict(zip(fields, row, strict=True))) for row in rows)
-    path = tmp_path_factory.mktemp("lift") / "lift.urdf"
-    path.write_text(LIFT.format(joints=joints))
-    return load_arm(path)
+    return made_arm(tmp_path_factory.mktemp("lift"), rows)
 
 
 def lifting(arm, rng):
@@ -322,7 +328,7 @@ def lifted(arm):
 
 
 def test_a_lift_whose_position_runs_the_other_way_is_named(lift):
-    """Gravity loads a vertical joint alike in both senses: its limits and its friction are the evidence."""
+    """The load by gravity is the same in both senses: limits and friction are the evidence."""
     log = lifted(lift)
     assert check_logs([log], lift).errors == ()
     assert "'joints: {slide: {sign: -1, gain: -1}}'" in told(lift, flipped(log, 0, True, False))

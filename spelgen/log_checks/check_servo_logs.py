@@ -298,7 +298,7 @@ def _command_error(k: int, report: JointReport, following: Following, of_sum: fl
     elif following.moves[k] and correlation < -FOLLOWS:
         got = f"positions that move against commands (correlation {correlation:.2g})"
         expected = "one sense"
-        do = "multiply one of both columns by -1: the setting 'sign' applies to q and u alike"
+        do = "multiply the column of u or that of q by -1: the setting 'sign' applies to both"
     else:
         return None
     return LogError(got, element=f"joint {report.name!r}", expected=expected, do=do)
@@ -307,7 +307,7 @@ def _command_error(k: int, report: JointReport, following: Following, of_sum: fl
 def _command_warning(
     k: int, report: JointReport, following: Following, logs: Sequence[Trajectory]
 ) -> Iterator[Diagnostic]:
-    """Yield the warning that the logged command of joint k may not be what its servo tracks, if there is one."""
+    """Yield the warning that the logged command of joint k may not be the command that its servo tracks."""
     correlation, offset, delay = following.correlation[k, k], following.offset[k], following.delay[k, k]
     if all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs):
         # the logger wrote measured positions in place of commands
