@@ -385,7 +385,7 @@ def kill_two(folder: Path, killed: list[int]) -> None:
 def test_runs_of_killed_workers_are_resumed_and_end_with_the_same_weights(listed_arms, tmp_path):
     pytest.importorskip("ray")
     folder, killed = tmp_path / "out", []
-    comparison = listed_arms(training={"epochs": 12, "patience": 12, "momentum_steps": 0})
+    comparison = listed_arms(training={"epochs": 5, "momentum_steps": 0})
     killer = threading.Thread(target=kill_two, args=(folder, killed))
     killer.start()
     study = compared(comparison, folder, jobs=2)

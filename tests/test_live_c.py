@@ -24,7 +24,7 @@ PACKAGE = Path(__file__).parents[1] / "spelgen"
 SHARED = Path(__file__).parents[1] / ".." / "shared"
 RECORDED = ("ur10e", "panda", "shanghai", "xmate3", "ar5", "airbot", "tx40")
 """Arms with measured torques: logs of position commands have no estimator."""
-SAMPLES = 2800
+SAMPLES = 2000
 
 
 def randomised(urdf, preset="hybrid"):

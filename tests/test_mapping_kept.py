@@ -89,6 +89,7 @@ def test_the_lines_that_reproduce_a_run_give_the_same_model(folder, monkeypatch)
     run = RunFolder(folder / "run")
     (work := folder / "again").mkdir()
     monkeypatch.chdir(work)
+    monkeypatch.setattr("spelgen.evaluation.evaluate.SECONDS", ())  # no long predictions
     for line in commands(run, run.read_spec(), run.read_record()):
         program, *words = shlex.split(
             line.replace("RUN/", f"{run.path}/").replace("LOGS", str(folder / "log.csv"))

@@ -56,6 +56,17 @@ def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
     np.testing.assert_allclose(combination, exact.combination[common, :count], atol=1e-7)
 
 
+def test_base_parameters_are_equal_in_every_bit(robots):
+    """Intervals in reports are the same bytes each time, for all contents of the memory."""
+    model = build(robots / "rpr.urdf", "closed-form")
+    draw = torch.Generator().manual_seed(0)
+    results = set()
+    for size in range(1, 40):
+        torch.randint(-9, 9, (size, 50), generator=draw)  # memory that is freed, and used again
+        results.add(base_combinations(model.chain, motors_of(model))[1].numpy().tobytes())
+    assert len(results) == 1
+
+
 def test_the_larger_covariance_bounds_both():
     draw = torch.Generator().manual_seed(0)
     scale = torch.logspace(-3, 3, 5).double()  # units differ

@@ -372,6 +372,15 @@ def test_weak_evidence_of_a_joint_yields_to_that_of_all(evidence, unlikely):
     assert stages._rejected(torch.tensor(evidence)).tolist() == unlikely
 
 
+def test_a_residual_that_is_smaller_in_one_part_of_a_log_is_no_evidence_of_another_friction():
+    """A third of the squared residual in each block of joint 1; of joint 2 a hundredth, but in two blocks only."""
+    other = torch.ones(1000, 2).double()
+    residual = other.clone()
+    residual[:, 0] /= 3**0.5
+    residual[:200, 1] /= 10.0
+    assert stages._smaller_in_most_blocks(residual, other).tolist() == [True, False]
+
+
 def test_freedom_that_samples_narrow_speaks_against_memory():
     """Of two joints with two elements each: samples narrow one fraction of the second to a tenth."""
     rigid = SimpleNamespace(

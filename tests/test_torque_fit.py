@@ -264,7 +264,7 @@ def test_a_fit_is_not_behind_least_squares_for_any_urdf(emitted, robots, tmp_pat
     """Inertials in other units: a fit that would be behind starts again from ridge regression, and reports it."""
     true = emitted["rpr"][0].Model()
     urdf = with_unit_error(robots / "rpr.urdf", mass, center, tmp_path / "rpr.urdf")
-    logs, test = [recorded(true, 20.0, 0.02, seed=1)], recorded(true, 10.0, 0.0, seed=9)
+    logs, test = [recorded(true, 10.0, 0.02, seed=1)], recorded(true, 10.0, 0.0, seed=9)
     found = build(urdf, "closed-form")
     solution = fit_torque(found, logs)
     reference = least_squares(load_arm(urdf).chain, logs, LeastSquares("range"))
@@ -278,7 +278,7 @@ def test_a_fit_is_not_behind_least_squares_for_any_urdf(emitted, robots, tmp_pat
 def test_torques_that_no_bodies_have_are_named(emitted):
     """Negative inertia at one joint: ridge regression explains it, and physically consistent bodies do not."""
     model = emitted["rpr"][0].Model()
-    log = recorded(emitted["rpr"][0].Model(), 20.0, 0.02, seed=1)
+    log = recorded(emitted["rpr"][0].Model(), 10.0, 0.02, seed=1)
     tau = log.tau.copy()
     tau[:, 2] -= 2 * tau[:, 2].std() / log.qdd[:, 2].std() * log.qdd[:, 2]
     logs = [replace(log, tau=tau)]
@@ -800,7 +800,7 @@ def test_functions_of_a_joint_and_bodies_are_fitted_together(emitted, robots):
     scale = recorded(true, 20.0, 0.0).tau.std(axis=0)
 
     def moved(noise, seed):
-        sample = recorded(true, 20.0, noise, seed)
+        sample = recorded(true, 10.0, noise, seed)
         q, qd = torch.from_numpy(sample.q), torch.from_numpy(sample.qd)
         with torch.no_grad():
             friction = true.friction_torque(q, qd).numpy()

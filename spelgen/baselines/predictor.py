@@ -1,7 +1,8 @@
 """Predictors of the motion of an arm under torques or position commands, and an integrator for stiff friction."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -164,12 +165,12 @@ TUNING = PredictorTuning()
 States = tuple[Tensor, Tensor]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solver:
-    """The Rosenbrock method, with `substeps` steps per sample interval."""
+    """The Rosenbrock method, with the fewest steps per sample interval that are accurate in the `probe` windows."""
 
     dynamics: RigidDynamics
-    substeps: int
+    probe: Windows
 
     def __call__(self, windows: Windows, disturbance: Tensor | None = None) -> States:
         """Return predicted q and qd at samples 1 to K-1 of W windows of K samples, (W, K-1, n) each.
@@ -178,31 +179,33 @@ class Solver:
 
         disturbance: constant disturbance (W, n) from `observe`.
         """
+        return self._integrated(windows, self.substeps, disturbance)
+
+    def _integrated(self, windows: Windows, substeps: int, disturbance: Tensor | None = None) -> States:
         with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
-            return roll_out_stiff(self.dynamics, windows, self.substeps, disturbance)
+            return roll_out_stiff(self.dynamics, windows, substeps, disturbance)
 
+    @cached_property
+    def substeps(self) -> int:
+        """Number of steps per sample interval, chosen at the first use: torque errors need no rollouts.
 
-def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
-    """Return the solver with the fewest steps per sample interval that is accurate enough.
-
-    A number of steps is accurate enough if twice as many steps change the predictions of the `probe` windows by less
-    than `TUNING.tolerance` times the error of the predictions.
-    """
-    windows = thinned(probe, TUNING.probed_windows)
-    motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
-    solver = Solver(dynamics, 1)
-    coarse = solver(windows)[1]
-    # The step length has a lower bound, because no step length is accurate enough for dynamics that diverge.
-    max_substeps = min(TUNING.most_substeps, windows.dt.mean().item() / TUNING.shortest_step)
-    while 2 * solver.substeps <= max_substeps:
-        finer = replace(solver, substeps=2 * solver.substeps)
-        fine = finer(windows)[1]
-        error = (fine - windows.qd[:, 1:]).square().mean().sqrt()
-        allowed = TUNING.tolerance * torch.maximum(TUNING.least_error * motion, error)
-        if (fine - coarse).square().mean().sqrt() < allowed:
-            break
-        solver, coarse = finer, fine
-    return solver
+        A number of steps is accurate enough if twice as many steps change the predictions of the `probe` windows by
+        less than `TUNING.tolerance` times the error of the predictions.
+        """
+        windows = thinned(self.probe, TUNING.probed_windows)
+        motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
+        substeps = 1
+        coarse = self._integrated(windows, substeps)[1]
+        # The step length has a lower bound, because no step length is accurate enough for dynamics that diverge.
+        max_substeps = min(TUNING.most_substeps, windows.dt.mean().item() / TUNING.shortest_step)
+        while 2 * substeps <= max_substeps:
+            fine = self._integrated(windows, 2 * substeps)[1]
+            error = (fine - windows.qd[:, 1:]).square().mean().sqrt()
+            allowed = TUNING.tolerance * torch.maximum(TUNING.least_error * motion, error)
+            if (fine - coarse).square().mean().sqrt() < allowed:
+                break
+            substeps, coarse = 2 * substeps, fine
+        return substeps
 
 
 @dataclass(frozen=True)
@@ -220,7 +223,7 @@ class Predictor:
 
 def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
     """Return the predictor of `dynamics`, with the number of integration steps chosen on the probe windows."""
-    return Predictor(name, accurate_solver(dynamics, probe), dynamics)
+    return Predictor(name, Solver(dynamics, probe), dynamics)
 
 
 class CommandFollower(Protocol):

@@ -104,7 +104,8 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     order += range(inertial, inertial + n)
     # There are twice as many equations as parameters, so that the samples do not limit the rank.
     shape = (3, 2 * len(order) // n + 1, n)
-    motion = torch.from_numpy(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
+    # The array is copied, since results on memory of NumPy depend in the last digit on its alignment.
+    motion = torch.tensor(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
     columns = constants_regressor(chain, motors, *motion).flatten(0, 1)
     # Norm of each column after projection onto the orthogonal complement of all preceding columns.
     remainder = torch.linalg.qr(columns[:, order]).R.diagonal().abs()
@@ -112,7 +113,8 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     # the column. Rounding errors are smaller than this.
     is_base = remainder > 1e-8 * columns[:, order].norm(dim=0).clamp(min=1.0)
     base = torch.tensor(order)[is_base]
-    combination = torch.linalg.lstsq(columns[:, base], columns).solution
+    # The default driver, gelsy, differs in the last digit from call to call. The columns have full rank, as gels needs.
+    combination = torch.linalg.lstsq(columns[:, base], columns, driver="gels").solution
     # Coefficients below the threshold are rounding errors.
     combination[combination.abs() < 1e-9] = 0.0
     names = []

@@ -92,7 +92,7 @@ def tip_kinematics(
 ) -> TipKinematics:
     """Return the kinematics of ``link``, by default the tip of the arm.
 
-    If no tip was specified, the default is the result of `last_link`.
+    If no tip was specified, the default is the result of `Robot.last_link`.
 
     arm: result of ``load_arm``, or the path of a URDF together with the names of its ``joints``. Raises ValueError if
     the link is not moved by these joints.
@@ -104,18 +104,4 @@ def tip_kinematics(
         link = link or arm.tip
     if not names:
         raise ValueError("no joints are named")
-    return TipKinematics(robot, names, link or last_link(robot, names))
-
-
-def last_link(robot: Robot, joints: Sequence[str]) -> str:
-    """Return the last link behind the given joints, for example a flange.
-
-    The search starts at the child link of the last joint. It follows fixed joints from parent to child, and ends at a
-    link with no fixed joint, or with several.
-    """
-    link = robot.joint[joints[-1]].child
-    while True:
-        fixed = [joint.child for joint in robot.joints_below[link] if joint.type == "fixed"]
-        if len(fixed) != 1:
-            return link
-        link = fixed[0]
+    return TipKinematics(robot, names, link or robot.last_link(names))

@@ -7,7 +7,6 @@ import numpy as np
 from spelgen.arm.arm import Body, lump_links, make_arm
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.dynamics.tip import last_link
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +29,7 @@ class Tip:
 def tip_frame(loaded: Arm) -> Tip:
     """Return the frame of the tip link, with the unrounded angles of the URDF."""
     names = loaded.chain.joint_names
-    link = loaded.tip or last_link(loaded.robot, names)
+    link = loaded.tip or loaded.robot.last_link(names)
     # Rounded angles would displace the tip by up to the tolerance of the rounding times the extent of the arm.
     bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
     return Tip(link, *link_poses(loaded)[link], bodies)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 from torch import Tensor
 
-from spelgen import runtime
+import spelgen.runtime as runtime
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.emission.parts import Sums, base_class, entry_sums, model_parts
 from spelgen.emission.source import Call, Code

@@ -1,5 +1,6 @@
 """Source text of values: calls, tuples and dictionaries, broken into readable lines."""
 
+import ast
 import json
 from dataclasses import dataclass
 
@@ -103,3 +104,8 @@ def _alike(value: object) -> bool:
 
 def _joined(value: object) -> str:
     return ", ".join(key + flat(item) for key, item in _items(value))
+
+
+def names_in(tree: ast.AST) -> set[str]:
+    """Return all names that occur in a syntax tree, including names in annotations."""
+    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}

@@ -9,6 +9,8 @@ from graphlib import TopologicalSorter
 from importlib.resources import files
 from typing import NamedTuple
 
+from spelgen.emission.source import names_in
+
 _OURS = "spelgen.runtime."
 
 
@@ -28,13 +30,11 @@ class Runtime:
         definitions: definitions by name, in an order in which they can be executed.
         imports: import statements of other packages.
         rows: names of the classes in rows.py, which must be defined before the tables of an arm.
-        public: names that a module can import from ``spelgen.runtime``.
     """
 
     definitions: dict[str, Definition]
     imports: tuple[ast.Import | ast.ImportFrom, ...]
     rows: frozenset[str]
-    public: frozenset[str]
 
 
 class Bundle(NamedTuple):
@@ -85,7 +85,7 @@ def load_runtime() -> Runtime:
     }
     # File systems list files in different orders; sorting makes the text of a module the same everywhere.
     trees = {name: ast.parse(texts[name]) for name in sorted(texts)}
-    public = [alias.name for node in _imported(trees.pop("__init__")) for alias in node.names]
+    del trees["__init__"]
     order: TopologicalSorter[str] = TopologicalSorter()
     imports = []
     for name, tree in trees.items():
@@ -103,12 +103,7 @@ def load_runtime() -> Runtime:
                 text, is_block = _text(statement, texts[name]), not isinstance(statement, ast.Assign)
                 definitions[defined] = Definition(text, frozenset(names_in(statement)), is_block)
     rows = frozenset(filter(None, map(_defined, trees["rows"].body)))
-    return Runtime(definitions, tuple(imports), rows, frozenset(public))
-
-
-def names_in(tree: ast.AST) -> set[str]:
-    """Return all names that occur in a syntax tree, including names in annotations."""
-    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    return Runtime(definitions, tuple(imports), rows)
 
 
 def _imported(tree: ast.Module) -> list[ast.Import | ast.ImportFrom]:

@@ -7,12 +7,13 @@ read is parsed, but not executed.
 import ast
 import json
 import re
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from textwrap import fill, wrap
 
 from spelgen.emission import parts
-from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call
-from spelgen.emission.standalone import bundle, load_runtime, names_in
+from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call, names_in
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
 from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
@@ -66,12 +67,23 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     title = f"Port-Hamiltonian model of an arm with {counted(len(spec.joints), 'joint')}, by `spelgen build`."
     context = {"title": title, "header": header(spec), "arm": arm, "model": model, "spec": spec.to_json()}
     if standalone:
+        from spelgen.emission.standalone import bundle
+
         return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
     # A module imports only the names that occur in its text.
-    used = names_in(ast.parse(f"{arm}\n{model}")) & load_runtime().public
+    used = names_in(ast.parse(f"{arm}\n{model}")) & _public_names()
     # ruff's order of imported names: classes first.
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
     return render("module.py.jinja", names=ordered, has_tensor=parts.MASS_ENTRIES.text in names, **context)
+
+
+@cache
+def _public_names() -> frozenset[str]:
+    """Return the names that a module can import from ``spelgen.runtime``."""
+    # The source is read, because the import of the package would import torch.
+    source = (files("spelgen") / "runtime" / "__init__.py").read_text(encoding="utf-8")
+    imports = [node for node in ast.parse(source).body if isinstance(node, ast.ImportFrom)]
+    return frozenset(alias.name for node in imports for alias in node.names)
 
 
 def class_summary(spec: ModelSpec) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
+from spelgen.baselines.predictor import Predictor, Solver, of_dynamics
 from spelgen.baselines.registry import EvaluatedArm, command_followers, torque_predictors
 from spelgen.dynamics.parameters import used_parameter_count, without_idle_residuals
 from spelgen.dynamics.protocol import RigidDynamics
@@ -155,11 +155,11 @@ def _evaluate_torques(
     model = without_idle_residuals(tested.model)
     # The number of integrator steps is chosen per predictor, because stiff friction needs more steps than smooth
     # dynamics. Integration errors are then negligible in the error of each predictor.
-    solver = accurate_solver(model, probe)
+    solver = Solver(model, probe)
     arm = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
     predictors = [Predictor(MODEL, solver, model), *torque_predictors(arm)]
     predictors += [of_dynamics(name, dynamics, probe) for name, dynamics in baselines.items()]
-    tip = _tip(tested, notes)
+    tip = _tip(tested, notes) if lengths else None
     horizons: list[Horizon] = []
     longest = None
     for name, k in lengths.items():

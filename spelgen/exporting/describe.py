@@ -13,7 +13,6 @@ from torch import Tensor
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.protocol import motors_of, residual_terms
-from spelgen.dynamics.tip import last_link
 from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
@@ -58,7 +57,7 @@ class Trained:
     @property
     def tip(self) -> str:
         """The name of the tip link."""
-        return self.arm.tip or last_link(self.arm.robot, self.arm.chain.joint_names)
+        return self.arm.tip or self.arm.robot.last_link(self.arm.chain.joint_names)
 
     @property
     def memory(self) -> int:

@@ -1,4 +1,4 @@
-"""Quantities of drives whose intervals a posterior states: constants of the drives, or ratios to kp of servos."""
+"""Constants of drives whose intervals a posterior states, and the straight line that approximates friction."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -30,55 +30,31 @@ TORQUE_UNITS = {
     "gain": "",
 }
 """Unit of each constant of drives that are given torques."""
-SERVO_UNITS = {
-    "kp": "{0.torque}/{0.position}",
-    "kd/kp": "s",
-    "lag": "s",
-    "armature/kp": "s²",
-    "coulomb/kp": "{0.position}",
-    "dead zone": "{0.position}",
-    "static error": "{0.position}",
-    "offset/kp": "{0.position}",
-}
-"""Unit of each quantity of position servos. lag: kd/kp plus the delay of the commands; static error: coulomb/kp plus
-half the dead zone, which is `dead zone`."""
-SUMS = {"lag": ("kd/kp", "delay"), "static error": ("coulomb/kp", "dead zone")}
-"""Sums of two quantities that logs of servos may determine better than either of the two."""
 
 
-def drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
-    """Return the quantities of a model's drives, and the function that returns their values (quantities, n).
+def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
+    """Return the constants of drives that are given torques, and the function that returns their values, (4 or 5, n).
 
     Viscous and Coulomb friction approximate the friction by least squares up to the typical speed.
     """
-    line, servos = friction_line(model), model.input_quantity == "position"
+    line = friction_line(model)
     gains = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
-    signed, all_joints = ("viscous", "offset", "offset/kp"), tuple(range(model.n))
-    units = (
-        SERVO_UNITS if servos else {name: x for name, x in TORQUE_UNITS.items() if gains or name != "gain"}
-    )
     quantities = [
-        DriveQuantity(name, unit, name not in signed, tuple(gains) if name == "gain" else all_joints)
-        for name, unit in units.items()
+        DriveQuantity(
+            name, unit, name not in ("viscous", "offset"), tuple(gains if name == "gain" else range(model.n))
+        )
+        for name, unit in TORQUE_UNITS.items()
+        if gains or name != "gain"
     ]
 
     def constants(model: ArmModel) -> Tensor:
-        """Return the constants of drives that are given torques, (4 or 5, n), in the order of `TORQUE_UNITS`."""
+        """Return the constants of the drives, (4 or 5, n), in the order of `TORQUE_UNITS`."""
         rows = [model.armature, *line(model), model.torque_offset]
         if gains and isinstance(model.inputs, MotorInputs):
             rows.append(model.inputs.gains().sum(dim=1))
         return torch.stack(rows)
 
-    def ratios(model: ArmModel) -> Tensor:
-        """Return the quantities of position servos, (8, n), in the order of `SERVO_UNITS`."""
-        servo, kp = model.servo, model.servo.kp()
-        damping, dry = servo.kd() / kp, line(model)[1] / kp
-        return torch.stack([
-            kp, damping, damping + servo.delay, model.armature / kp, dry, servo.dead_zone,
-            dry + servo.dead_zone, model.torque_offset / kp,
-        ])  # fmt: skip
-
-    return quantities, ratios if servos else constants
+    return quantities, constants
 
 
 def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:

@@ -5,12 +5,10 @@ to first order: the variance of a function f(x) is |J R|^2, with the Jacobian J 
 torque also includes the squared residual of held-out samples.
 """
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -22,15 +20,12 @@ from spelgen.dynamics.parameters import evaluate_with
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
-from spelgen.fitting.drive_quantities import SUMS, drive_quantities
+from spelgen.fitting.drive_quantities import DriveQuantity, torque_drive_quantities
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.identification.intervals import PRECISE, Interval, base_unit, interval_listing
 from spelgen.labels import UNITS, parameter_name
 from spelgen.listing import Listing
-
-PER_KP = "/kp"
-"""Ending of the names of base parameters that are ratios to kp of `Posterior.scale_joint`."""
 
 
 class Uncertain(NamedTuple):
@@ -54,7 +49,7 @@ class Propagated(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Posterior of a model that was fitted to torques, or to positions under position servos.
+    """Posterior of a model that was fitted to torques; for position servos see `ServoPosterior`.
 
     Attributes:
         covariance: (K, K), covariance of the K rigid-body, drive and friction parameters.
@@ -144,29 +139,15 @@ class Posterior:
 
     @cached_property
     def base_parameters(self) -> tuple[Interval, ...]:
-        """95 % intervals of the base parameters: identifiable combinations of inertial parameters and armatures.
-
-        Under position servos of unknown gains, they are ratios to kp of one joint, `scale_joint`.
-        """
-        names, combination = self._base
-        values, roots = (combination @ factor for factor in self._constants)
-        joint = self._scale_index
-        if joint is not None:
-            names = tuple(f"{name}{PER_KP}" for name in names)
-            values, roots = _ratios(Propagated(values, roots), self._stiffness, joint)
-        rows = zip(names, values.tolist(), roots.norm(dim=1).tolist(), strict=True)
-        return tuple(
-            Interval(name, value, std, base_unit(name) if joint is None else "") for name, value, std in rows
-        )
+        """95 % intervals of the base parameters: identifiable combinations of inertial parameters and armatures."""
+        names, values = self._base[0], self._base_values
+        rows = zip(names, values.value.tolist(), values.root.norm(dim=1).tolist(), strict=True)
+        return tuple(Interval(name, value, std, base_unit(name)) for name, value, std in rows)
 
     @property
-    def scale_joint(self) -> str | None:
-        """Name of the joint whose kp divides the base parameters; None if they are not divided.
-
-        Positions under servos determine masses and friction only relative to kp, unless a kp is known. The ratios to
-        kp of this joint have the smallest errors (median of the relative standard deviations).
-        """
-        return None if self._scale_index is None else self.model.joint_names[self._scale_index]
+    def base_units(self) -> str:
+        """Units of the base parameters, for the title of a table."""
+        return "kg, m"
 
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
@@ -177,36 +158,20 @@ class Posterior:
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
-        """Names of the masses and first moments that logs determine only in combinations, or not at all.
-
-        Under position servos, also pairs of quantities whose sum has a smaller error than either of them (`SUMS`), and
-        a common factor if no gain is known.
-        """
-        known = {x.name.removesuffix(PER_KP) for x in self.bodies}
-        names = map(parameter_name, range(10 * len(self.model.chain.parents)))
-        single = [name for name in names if name[0] in "mh" and name not in known]
-        drives, delay = self.drives, (self.delay,) * self.model.n
-        pairs = [
-            f"{first} and {second} of {total.name}"
-            for name, (first, second) in SUMS.items()
-            for total, *terms in zip(
-                drives.get(name, ()), drives.get(first, ()), drives.get(second, delay), strict=False
-            )
-            # The errors of the two terms are then correlated by less than -1/2.
-            if all(term is not None and total.std < term.std for term in terms)
-        ]
-        common = [] if self._scale_index is None else ["a common factor of kp and all masses"]
-        return tuple(single + pairs + common)
+        """Names of the masses and first moments that logs determine only in combinations, or not at all."""
+        names, combination = self._base
+        alone = set(compress(names, (combination.count_nonzero(dim=1) == 1).tolist()))
+        single = map(parameter_name, range(10 * len(self.model.chain.parents)))
+        return tuple(name for name in single if name[0] in "mh" and name not in alone)
 
     @cached_property
     def drives(self) -> dict[str, tuple[Interval, ...]]:
         """{quantity: 95 % intervals of the joints}.
 
-        The quantities are armature, viscous and Coulomb friction, torque offset, and trained motor gain; of position
-        servos they are kp and the ratios to kp (see `drive_quantities`).
+        The quantities are armature, viscous and Coulomb friction, torque offset, and trained motor gain.
         """
         model = self.model
-        quantities, function = drive_quantities(model)
+        quantities, function = self._drive_quantities()
         result = {}
         for quantity, value, std in zip(quantities, *self.uncertain(function), strict=True):
             labels = [quantity.unit.format(UNITS[joint_type]) for joint_type in model.joint_types]
@@ -236,8 +201,7 @@ class Posterior:
             f"{len(self.base_parameters) - len(determined)} more are not determined to 20 %. Unidentifiable on their "
             f"own: {', '.join(self.unidentifiable) or 'none'}."
         )
-        unit = "kg, m" if self.scale_joint is None else f"kg, m; ratios to kp of {self.scale_joint}"
-        title = f"Base parameters [{unit}], with half 95 % intervals; numbers after names: joint"
+        title = f"Base parameters [{self.base_units}], with half 95 % intervals; numbers after names: joint"
         columns = {"joint": list(self.model.joint_names), **self.drive_columns}
         drives = tuple(zip(*columns.values(), strict=True))
         note_delay = "" if self.delay is None else f"{self.delay.name.capitalize()}: {self.delay.text} s."
@@ -286,18 +250,13 @@ class Posterior:
         return self.propagate(_constants)
 
     @cached_property
-    def _stiffness(self) -> Propagated:
-        """kp of all servos, (n,) [Nm/rad, N/m]."""
-        return self.propagate(lambda model: model.servo.kp())
+    def _base_values(self) -> Propagated:
+        """Values of the base parameters, (r,), with a square root of their covariance."""
+        return Propagated(*(self._base[1] @ factor for factor in self._constants))
 
-    @cached_property
-    def _scale_index(self) -> int | None:
-        """Index of `scale_joint`."""
-        if self.model.input_quantity != "position" or not self.model.servo.trained.all():
-            return None
-        base = Propagated(*(self._base[1] @ factor for factor in self._constants))
-        ratios = [_ratios(base, self._stiffness, joint) for joint in range(self.model.n)]
-        return int(np.argmin([float((root.norm(dim=1) / value.abs()).median()) for value, root in ratios]))
+    def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
+        """Return the quantities of the drives, and the function that returns their values (quantities, n)."""
+        return torque_drive_quantities(self.model)
 
     def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         return constants_regressor(self.model.chain, motors_of(self.model), q, qd, qdd)
@@ -311,58 +270,6 @@ class Posterior:
         return Uncertain(value.numpy(), (rows @ self._constants.root).norm(dim=-1).numpy())
 
 
-def posterior_of(
-    model: ArmModel, content: Content | None, delay: float, file: Path | None = None
-) -> Posterior:
-    """Return the posterior of a fitted model.
-
-    Args:
-        model: model with the fitted parameters.
-        content: field ``posterior`` of a checkpoint: covariance of the K parameters, (K, K), delay_std [s], and, unless
-            the model has position servos, torque_std, (n,) [Nm, N].
-        delay: delay of the torques relative to the positions [s].
-        file: path of the checkpoint, for error messages.
-
-    Raises RunError if the content is None, or if it belongs to another model.
-    """
-    if content is None:
-        raise RunError(
-            "a fit without intervals", file=file,
-            expected="rigid bodies fitted to torques or by the objective servo, and not adapted",
-            do="fit the preset closed-form or hybrid by the objective torque or servo",
-        )  # fmt: skip
-    vector = ParameterVector(model)
-    count = len(vector.flatten(vector.initial))
-    covariance = _tensor(content, "covariance", (count, count))
-    torque_std, delay_std = _tensor(content, "torque_std", (model.n,)), content.get("delay_std")
-    servos = model.input_quantity == "position"
-    if covariance is None or (torque_std is None) != servos or not isinstance(delay_std, float):
-        do = "restore it from a copy, or fit again"
-        raise RunError("a posterior of another model", file=file, element="posterior", do=do)
-    if servos:
-        delay = float(model.servo.delay)
-    late = Interval("delay of the commands" if servos else "torque delay", delay, delay_std, "s", servos)
-    # The posterior keeps a copy of the model, because the caller may change the model.
-    model = copy.deepcopy(model).double().cpu().requires_grad_(False)
-    std = None if torque_std is None else torque_std.numpy()
-    return Posterior(model, covariance, std, late if delay else None)
-
-
-def _ratios(values: Propagated, divisors: Propagated, joint: int) -> Propagated:
-    """Return the ratios of values (r,) to one of the divisors (n,)."""
-    divisor, root = divisors.value[joint], divisors.root[joint]
-    ratio = values.value / divisor
-    return Propagated(ratio, (values.root - ratio.outer(root)) / divisor)
-
-
 def _constants(model: ArmModel) -> Tensor:
     """Return the inertial parameters of all B bodies, then the armatures, (10 B + n,)."""
     return torch.cat([model.inertial_parameters.flatten(), model.armature])
-
-
-def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
-    """Return the tensor ``name``; None unless it has this shape, is float64, finite and not zero."""
-    tensor = content.get(name)
-    if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
-        return tensor if tensor.any() and tensor.isfinite().all() else None
-    return None

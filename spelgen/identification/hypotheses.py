@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,15 +43,15 @@ class MotionSamples:
     @property
     def motion(self) -> np.ndarray:
         """Positions, velocities and accelerations, (3, S, n)."""
-        return np.moveaxis(self._central[..., :3], 2, 0)
+        return np.moveaxis(self.central[..., :3], 2, 0)
 
     @property
     def tau(self) -> np.ndarray:
         """Joint torques, (S, n)."""
-        return self._central[..., 3]
+        return self.central[..., 3]
 
     @property
-    def _central(self) -> np.ndarray:
+    def central(self) -> np.ndarray:
         """Signals (S, n, 4) at the times of the samples."""
         return self.values[..., self.values.shape[3] // 2]
 
@@ -60,8 +61,8 @@ class MotionSamples:
         Signals at a longer delay than `longest_delay` are those around the sample that is nearest in time.
         """
         if not delays.any():
-            return self._central
-        spline = CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
+            return self.central
+        spline = _interpolation()
         if delays.ndim == 2:
             return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
         # times of later recordings are larger, so that the nearest sample is of the same recording
@@ -137,11 +138,11 @@ class Hypothesis:
 
     def signals(self, samples: MotionSamples) -> MotionSamples:
         """Return the samples of the joints, in SI units, for logged samples under this hypothesis."""
-        of_joint = _permuted(samples.values, self.source)
         delays = _per_signal(self.delay)
         if self.drift.any():
             delays = delays + samples.times[:, None, None] * _per_signal(self.drift)
-        signals = replace(samples, values=of_joint).at(delays) * _per_signal(self.scale)
+        values = samples.values if delays.any() else samples.central[..., None]
+        signals = replace(samples, values=_permuted(values, self.source)).at(delays) * _per_signal(self.scale)
         signals[..., 0] += self.offset
         return replace(samples, values=signals[..., None])
 
@@ -150,6 +151,12 @@ class Hypothesis:
         signals = samples.values.copy()
         signals[:, :, 0] -= self.offset[:, None]
         return replace(samples, values=signals / _per_signal(self.scale)[..., None])
+
+
+@cache
+def _interpolation() -> CubicSpline:
+    """Return the weights (E,) of the signals around a sample for their values at a time [s] after the sample."""
+    return CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
 
 
 def _per_signal(values: np.ndarray) -> np.ndarray:

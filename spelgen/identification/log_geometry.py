@@ -150,7 +150,8 @@ class GeometryProblem:
         signals = hypothesis.signals(self.samples)
         tau = signals.tau
         tau = tau if self._counted is None else tau * self._counted[..., 0]
-        right, total = np.einsum("snk,sn->nk", rows, tau), np.square(tau).sum(axis=0)
+        right = (tau.T[:, None] @ rows.swapaxes(0, 1))[:, 0]
+        total = np.square(tau).sum(axis=0)
         variance = len(tau) * _variance(tau)
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         errors, scale = np.full(len(normal), 0.1), 0.1
@@ -160,12 +161,13 @@ class GeometryProblem:
             # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable
             ridge = 1e-9 * np.diag(matrix) + 1e-9
             ridge[: self._bodies] = 0.0
-            covariance = inverse(matrix + scale * precision + np.diag(ridge))
-            x = covariance @ (weights @ right + scale * precision @ mean)
-            squares = total - 2 * right @ x + np.einsum("k,jkl,l->j", x, normal, x)
+            matrix += scale * precision + np.diag(ridge)
+            x = solution(matrix, weights @ right + scale * precision @ mean)
+            squares = total - 2 * right @ x + (normal @ x) @ x
             errors = np.maximum(squares / variance, 0.0)
             distance = float((x - mean) @ precision @ (x - mean))
             scale = 2 * freedom / (freedom + distance)
+        covariance = inverse(matrix)
         misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
         cost = misfit + freedom * float(np.log1p(distance / freedom))
         cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
@@ -185,7 +187,7 @@ class GeometryProblem:
         matrix[:known, :known] += self._precision
         vector = flat.T @ ((tau - rows @ fit.parameters) * np.sqrt(weights)).ravel()
         vector[:known] += self._precision @ (self.prior_mean - fit.parameters)
-        return np.asarray((inverse(matrix) @ vector)[known:])
+        return solution(matrix, vector)[known:]
 
     def descend(
         self,
@@ -263,7 +265,7 @@ class GeometryProblem:
         functionals[n + drives, viscous] = normal[drives, viscous, viscous]
         functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
         negative = np.minimum(functionals @ x, 0.0)
-        variance = np.einsum("ik,kl,il->i", functionals, covariance, functionals)
+        variance = (functionals @ covariance * functionals).sum(axis=1)
         odds = 0.5 * np.square(negative) / np.maximum(variance, 1e-30)
         return float(np.minimum(odds, np.repeat([15.0, 10.0], n)).sum())
 
@@ -324,7 +326,18 @@ def _variance(tau: np.ndarray) -> np.ndarray:
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
     """Return the inverse of a symmetric positive definite matrix; it is scaled to a unit diagonal before inversion."""
-    length = np.sqrt(np.diag(matrix))
-    length = np.where(length > 0, length, 1.0)
-    scaled = matrix / np.outer(length, length) + 1e-12 * np.eye(len(matrix))
-    return np.asarray(np.linalg.inv(scaled) / np.outer(length, length))
+    scaled, scale = _with_unit_diagonal(matrix)
+    return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
+
+
+def solution(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Return `inverse(matrix) @ vector`, in a third of the time."""
+    scaled, scale = _with_unit_diagonal(matrix)
+    return np.asarray(np.linalg.solve(scaled, vector / scale) / scale)
+
+
+def _with_unit_diagonal(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a matrix (K, K) divided by the scale of its rows and columns, and the scale (K,)."""
+    scale = np.sqrt(np.diag(matrix))
+    scale = np.where(scale > 0, scale, 1.0)
+    return matrix / np.outer(scale, scale) + 1e-12 * np.eye(len(matrix)), scale

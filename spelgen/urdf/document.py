@@ -8,7 +8,6 @@ from lxml import etree
 
 from spelgen.errors import UrdfError, collect
 from spelgen.files import read_bytes
-from spelgen.urdf.xacro_input import XacroOutput, expand, is_xacro
 
 MAX_BYTES = 20_000_000
 _CONFLICT = re.compile(rb"^(?:<{7} |={7}\r?$|>{7} )", re.MULTILINE)
@@ -41,7 +40,7 @@ class UrdfDocument(NamedTuple):
 
 def urdf_bytes(path: Path) -> bytes:
     """Return the bytes of a URDF file, or of the URDF that a ``*.xacro`` file expands to. Raises UrdfError."""
-    return _expanded(path).data
+    return _expanded(path)[0]
 
 
 def read_document(path: Path) -> UrdfDocument:
@@ -52,8 +51,7 @@ def read_document(path: Path) -> UrdfDocument:
     Raises UrdfError for a missing or oversized file, a document type declaration, malformed XML, a root element other
     than ``<robot>``, and xacro that is not expanded.
     """
-    expansion = _expanded(path)
-    data = expansion.data
+    data, warnings = _expanded(path)
     if is_xacro(path):
         path = path.with_name(f"{path.name} (expanded)")
         _refuse_damage(path, data)
@@ -68,13 +66,23 @@ def read_document(path: Path) -> UrdfDocument:
     if root.getroottree().docinfo.internalDTD is not None:
         raise _doctype_error(path, None)
     _check_root(path, root)
-    return UrdfDocument(path, data, root, _check_xacro(path, root), expansion.warnings)
+    return UrdfDocument(path, data, root, _check_xacro(path, root), warnings)
 
 
-def _expanded(path: Path) -> XacroOutput:
+def is_xacro(path: Path) -> bool:
+    """Whether the name of a file marks it as a xacro file."""
+    return path.suffix.lower() == ".xacro"
+
+
+def _expanded(path: Path) -> tuple[bytes, tuple[str, ...]]:
+    """Return the bytes of a file or of its expansion, and the warnings of xacro."""
     data = read_bytes(path, UrdfError, "a URDF file", MAX_BYTES, "keep meshes in files of their own")
     _refuse_damage(path, data)
-    return expand(path, MAX_BYTES) if is_xacro(path) else XacroOutput(data, ())
+    if not is_xacro(path):
+        return data, ()
+    from spelgen.urdf.xacro_input import expand
+
+    return expand(path, MAX_BYTES)
 
 
 def _line_of(data: bytes, position: int) -> int:

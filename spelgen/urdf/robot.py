@@ -1,5 +1,6 @@
 """Data classes for the content of a URDF: robot, links, joints and transmissions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -161,3 +162,16 @@ class Robot:
             path.append(self.joint_above[link])
             link = path[-1].parent
         return tuple(reversed(path))
+
+    def last_link(self, joints: Sequence[str]) -> str:
+        """Return the last link behind the given joints, for example a flange.
+
+        The search starts at the child link of the last joint. It follows fixed joints from parent to child, and ends at
+        a link with no fixed joint, or with several.
+        """
+        link = self.joint[joints[-1]].child
+        while True:
+            fixed = [joint.child for joint in self.joints_below[link] if joint.type == "fixed"]
+            if len(fixed) != 1:
+                return link
+            link = fixed[0]

@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
 from spelgen.errors import UrdfError
 
@@ -23,20 +22,8 @@ MISSING = 3  # exit code of the process if the package xacro is not installed
 _BY_HAND = "expand it where that works: xacro FILE name:=value ... > ROBOT.urdf"
 
 
-class XacroOutput(NamedTuple):
-    """The expanded URDF, and the warnings of xacro."""
-
-    data: bytes
-    warnings: tuple[str, ...]
-
-
-def is_xacro(path: Path) -> bool:
-    """Whether the name of a file marks it as a xacro file."""
-    return path.suffix.lower() == ".xacro"
-
-
-def expand(path: Path, max_bytes: int) -> XacroOutput:
-    """Return the URDF to which a xacro file expands with the default values of its arguments.
+def expand(path: Path, max_bytes: int) -> tuple[bytes, tuple[str, ...]]:
+    """Return the URDF to which a xacro file expands with the default values of its arguments, and xacro's warnings.
 
     Raises UrdfError if the package xacro is not installed or fails, runs for more than 8 s, or writes more than
     ``max_bytes``.
@@ -61,7 +48,7 @@ def expand(path: Path, max_bytes: int) -> XacroOutput:
         if size > max_bytes:
             raise UrdfError(f"{size} bytes of URDF from xacro", file=path, expected=f"at most {max_bytes}")
         output.seek(0)
-        return XacroOutput(output.read(), warnings)
+        return output.read(), warnings
 
 
 def _failure(path: Path, code: int, lines: list[str]) -> UrdfError:

@@ -18,7 +18,13 @@ from spelgen.fitting.torque.problem import (
     refine,
 )
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.selection import SelectedTerm, can_split, select_functions
+from spelgen.fitting.torque.selection import (
+    SelectedTerm,
+    block_squares,
+    can_split,
+    select_functions,
+    significant_reduction,
+)
 from spelgen.fitting.torque.tuning import TUNING
 
 EFFECT_GROUPS = ("effects", "load_dependence")
@@ -120,15 +126,21 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
 
     ``estimate`` has rate-only friction. The force of bristles reverses over a displacement, later than the velocity. At
     joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The marginal
-    likelihoods of both fits decide (see `_rejected`).
+    likelihoods of both fits decide (see `_rejected`). If they favour bristles at most joints, but not at a single one,
+    its residual must also be smaller without bristles in most parts of the log: the likelihood ratio of a single joint
+    is unreliable, since the errors of a motion are correlated.
     """
     friction = estimate.problem.jacobian.model.friction
+    residual = estimate.problem.jacobian.residual_samples(estimate.state.x).torque_residual
     friction.memoryless.fill_(0.0)
     # The noise is estimated again, since bristles explain more of the torque than rate-only friction does.
     problem, state = _least_squares_noise_fit(estimate.problem, estimate.state)
     hysteretic = alternate(problem, state)
     evidence = log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic)
     rate_only = _rejected(evidence)
+    if evidence.sum() > 0:
+        other = hysteretic.problem.jacobian.residual_samples(hysteretic.state.x).torque_residual
+        rate_only &= _smaller_in_most_blocks(residual, other)
     friction.memoryless.copy_(rate_only)
     if rate_only.all():
         return estimate
@@ -137,6 +149,17 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
         mixed = hysteretic.with_jacobian(hysteretic.problem.jacobian)
         return alternate(mixed.problem, mixed.state)
     return hysteretic
+
+
+def _smaller_in_most_blocks(residual: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """Return a mask (n,), True for joints at which a torque residual is significantly smaller than another one.
+
+    The residuals are compared on ten blocks of samples (see `significant_reduction`). residual, other: (T, n) [Nm, N].
+    """
+    return torch.tensor([
+        significant_reduction(block_squares(before), block_squares(after)) is not None
+        for before, after in zip(other.mT, residual.mT, strict=True)
+    ])  # fmt: skip
 
 
 def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:

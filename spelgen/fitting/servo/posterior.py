@@ -1,0 +1,113 @@
+"""Posterior of a model that was fitted to positions under position servos: quantities relative to kp."""
+
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spelgen.emission.assemble import ArmModel
+from spelgen.fitting.drive_quantities import DriveQuantity, friction_line
+from spelgen.fitting.posterior import Posterior, Propagated
+from spelgen.identification.intervals import Interval
+
+SERVO_UNITS = {
+    "kp": "{0.torque}/{0.position}",
+    "kd/kp": "s",
+    "lag": "s",
+    "armature/kp": "s²",
+    "coulomb/kp": "{0.position}",
+    "dead zone": "{0.position}",
+    "static error": "{0.position}",
+    "offset/kp": "{0.position}",
+}
+"""Unit of each quantity of position servos. lag: kd/kp plus the delay of the commands; static error: coulomb/kp plus
+half the dead zone, which is `dead zone`."""
+SUMS = {"lag": ("kd/kp", "delay"), "static error": ("coulomb/kp", "dead zone")}
+"""Sums of two quantities that logs of servos may determine better than either of the two."""
+
+
+class ServoPosterior(Posterior):
+    """Posterior of a model with position servos.
+
+    Positions under servos determine masses and friction only relative to the gains kp. Unless a kp is known, base
+    parameters are therefore ratios to kp of one joint, `scale_joint`.
+    """
+
+    @property
+    def scale_joint(self) -> str | None:
+        """Name of the joint whose kp divides the base parameters; None if a kp is known.
+
+        The ratios to kp of this joint have the smallest errors (median of the relative standard deviations).
+        """
+        return None if self._scale_index is None else self.model.joint_names[self._scale_index]
+
+    @cached_property
+    def base_parameters(self) -> tuple[Interval, ...]:
+        """95 % intervals of the base parameters, or of their ratios to kp of `scale_joint`."""
+        if self._scale_index is None:
+            return super().base_parameters
+        values, roots = self._ratios(self._scale_index)
+        rows = zip(self._base[0], values.tolist(), roots.norm(dim=1).tolist(), strict=True)
+        return tuple(Interval(f"{name}/kp", value, std, "") for name, value, std in rows)
+
+    @property
+    def base_units(self) -> str:
+        """Units of the base parameters, for the title of a table."""
+        units = super().base_units
+        return units if self.scale_joint is None else f"{units}; ratios to kp of {self.scale_joint}"
+
+    @property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """Names of the quantities that logs determine only in combinations, or not at all.
+
+        The quantities are masses and first moments, pairs of quantities whose sum has a smaller error than either of
+        them (`SUMS`), and a common factor if no kp is known.
+        """
+        pairs, delays = [], (self.delay,) * self.model.n
+        for name, (first, second) in SUMS.items():
+            others = delays if second == "delay" else self.drives[second]
+            for total, one, other in zip(self.drives[name], self.drives[first], others, strict=True):
+                # If the sum has the smallest error, the errors of its terms are correlated by less than -1/2.
+                if other is not None and total.std < min(one.std, other.std):
+                    pairs.append(f"{first} and {second} of {total.name}")
+        common = [] if self._scale_index is None else ["a common factor of kp and all masses"]
+        return (*super().unidentifiable, *pairs, *common)
+
+    def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
+        """Return the quantities of the servos, and the function that returns their values, (8, n)."""
+        line, joints = friction_line(self.model), tuple(range(self.model.n))
+        quantities = [
+            DriveQuantity(name, unit, name != "offset/kp", joints) for name, unit in SERVO_UNITS.items()
+        ]
+
+        def ratios(model: ArmModel) -> Tensor:
+            """Return the quantities of the servos, (8, n), in the order of `SERVO_UNITS`."""
+            servo, kp = model.servo, model.servo.kp()
+            damping, dry = servo.kd() / kp, line(model)[1] / kp
+            return torch.stack([
+                kp, damping, damping + servo.delay, model.armature / kp, dry, servo.dead_zone,
+                dry + servo.dead_zone, model.torque_offset / kp,
+            ])  # fmt: skip
+
+        return quantities, ratios
+
+    @cached_property
+    def _scale_index(self) -> int | None:
+        """Index of `scale_joint`."""
+        if not self.model.servo.trained.all():
+            return None
+        ratios = map(self._ratios, range(self.model.n))
+        return int(np.argmin([float((root.norm(dim=1) / value.abs()).median()) for value, root in ratios]))
+
+    @cached_property
+    def _stiffness(self) -> Propagated:
+        """kp of all servos, (n,) [Nm/rad, N/m], with a square root of its covariance."""
+        return self.propagate(lambda model: model.servo.kp())
+
+    def _ratios(self, joint: int) -> Propagated:
+        """Return the ratios of the base parameters to kp of a joint, (r,), with a square root of their covariance."""
+        values, (kp, kp_root) = self._base_values, self._stiffness
+        ratio = values.value / kp[joint]
+        return Propagated(ratio, (values.root - ratio.outer(kp_root[joint])) / kp[joint])
