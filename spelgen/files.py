@@ -131,11 +131,11 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager that adds the file name `path` to an OSError without one, as raised for a full disk."""
+    """Context manager that adds the file name `path` to an OSError without one (a full disk), or of its hidden file."""
     try:
         yield
     except OSError as error:
-        if error.filename is not None:
+        if error.filename is not None and path.name not in str(error.filename):
             raise
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 

@@ -360,13 +360,27 @@ def test_closed_pipe_is_quiet(robots):
     assert done.returncode == 141
 
 
-def test_interrupt_exits_130(spelgen, robots, monkeypatch):
+@pytest.mark.parametrize("importing", [False, True])
+def test_interrupt_exits_130(spelgen, robots, monkeypatch, importing):
     def interrupted(*arguments, **options):
+        if importing:  # as compiled modules raise it
+            raise ImportError("initialization failed") from KeyboardInterrupt()
         raise KeyboardInterrupt
 
     monkeypatch.setattr("spelgen.arm.configured_arm.load_arm", interrupted)
     result = spelgen("inspect", robots / "rpr.urdf")
     assert (result.exit_code, result.stderr) == (130, "interrupted\n")
+
+
+def test_a_termination_ends_a_command_as_ctrl_c_does(robots, tmp_path):
+    (tmp_path / "live.urdf").symlink_to(robots / "rpr.urdf")
+    ends = (
+        "import os, signal; import spelgen.arm.configured_arm as arms; from spelgen.cli.main import main; "
+        "arms.load_arm = lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM); main()"
+    )
+    command = [sys.executable, "-c", ends, "inspect", "live.urdf"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
 
 
 # ---- the whole way, small

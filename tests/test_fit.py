@@ -122,7 +122,7 @@ def test_one_trajectory_is_enough():
 
 def test_logs_that_cannot_be_fitted_are_reported():
     model = Model()
-    with pytest.raises(LogError, match="got no logs, expected a trajectory or more"):
+    with pytest.raises(LogError, match="got no trajectory, expected at least one"):
         spelgen.fit(model, [])
     (log,) = motions(count=1)
     with pytest.raises(LogError, match="motion_0"):

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from planar_model import JOINTS, write_module
 from pydantic import ValidationError
@@ -14,6 +15,7 @@ from spelgen.errors import OptionError, SettingsError
 from spelgen.fitting.fit import FitOptions, choose_config, fit
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
+from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
@@ -185,7 +187,7 @@ def test_a_name_in_place_of_a_configuration_is_reported(robots):
     with pytest.raises(
         SettingsError, match=r"got 'torque' as the configuration of a fit, expected spelgen\.Torq"
     ):
-        fit(model, [], "torque")
+        fit(model, Trajectory(np.arange(3), *np.zeros((3, 3, 2))), "torque")
 
 
 def test_logs_are_read_for_the_choice_of_an_objective_only_if_it_depends_on_them(robots):

@@ -283,10 +283,13 @@ def test_samples_that_cannot_be_used_are_refused_and_counted(arm, levels, run):
     assert step(1, q=log.q[1] + 3.0) == "jump"
     assert step(1, tau=2 * EFFORT) == "saturated"
     assert step(2) == "used"
+    assert step(1, q=log.q[1].tolist()) == "reversed"
     assert step(100) == "gap"
     assert estimator.refused == {
-        "not finite": 2, "repeated": 1, "reversed": 1, "jump": 1, "saturated": 1, "gap": 1,
+        "not finite": 2, "repeated": 1, "reversed": 2, "jump": 1, "saturated": 1, "gap": 1,
     }  # fmt: skip
+    with pytest.raises(ValueError, match=r"got q, qd and tau \(1, 5\), .*, expected \(1, 6\): 6 joints"):
+        step(101, q=log.q[101, :5])
     # a clock that was set back for good
     for k in range(TUNING.restart - 1):
         assert step(101 + k, t=0.001 * k) == "reversed"
@@ -419,6 +422,8 @@ def test_thresholds_hold_in_a_log_that_differs(levels):
 
 
 def test_models_that_it_cannot_use_are_refused(arm, levels, tmp_path):
+    with pytest.raises(RunError, match=r"got <Model of .*, expected a fit: spelgen.fit"):
+        Estimator(arm[0])
     networks = saved_run(build(ROBOTS / "two_link.urdf", "spel").double(), ROBOTS / "two_link.urdf", tmp_path)
     with pytest.raises(RunError, match=r"without rigid bodies.*closed-form or hybrid"):
         Estimator(load_run(networks.path))

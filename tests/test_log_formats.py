@@ -2,8 +2,10 @@
 
 import csv
 import datetime as dt
+import json
 import os
 import re
+import subprocess
 import sys
 import textwrap
 import tracemalloc
@@ -304,7 +306,7 @@ def test_bad_npz_is_refused_in_one_sentence(tmp_path, case):
 
 def test_npz_never_unpickles(tmp_path):
     np.savez(tmp_path / "x.npz", **columns(q_elbow=np.array([print] * 4, dtype=object)))
-    with pytest.raises(LogError, match=r"x\.npz: an unreadable npz file \(.*pickle"):
+    with pytest.raises(LogError, match=r"x\.npz: array .*: got Python objects, expected numbers; store"):
         read_logs([tmp_path], JOINTS)
     (tmp_path / "x.npz").write_bytes(b"not an archive")
     with pytest.raises(LogError, match=r"x\.npz: an unreadable npz file"):
@@ -394,7 +396,8 @@ def test_pipes_among_logs_are_not_waited_for(tmp_path, suffix):
     os.mkfifo(tmp_path / f"live{suffix}")
     with pytest.raises(LogError) as caught:
         read_logs(tmp_path / f"live{suffix}", JOINTS)
-    kinds = ".parquet, .csv, .npz, .mcap, .db3, .bag, the folder of a ROS 2 bag or of a LeRobot data set"
+    kinds = ".parquet, .csv, .tsv, .npz, .jsonl, .ndjson, .mcap, .db3, .bag"
+    kinds += ", the folder of a ROS 2 bag or of a LeRobot data set"
     assert str(caught.value) == f"{tmp_path}/live{suffix}: got no regular file, expected a file: {kinds}"
     parquet(tmp_path / "x.parquet", columns())
     check(read_logs(tmp_path, JOINTS)[0], "x")
@@ -585,7 +588,35 @@ def test_csv_as_spreadsheets_write_it(tmp_path, separator, decimal, encoding):
 
 
 UNIT_LINE = "s,rad,rad,rad/s,rad/s,Nm,Nm"
+
+
+def delimited(lines: list[str], delimiter: str) -> list[str]:
+    return [line.replace(",", delimiter) for line in lines]
+
+
 FORMS = {
+    "Excel's delimiter": lambda lines: ["sep=;", *delimited(lines, ";")],
+    "quoted decimal commas and semicolons": lambda lines: [
+        ";".join(f'"{x}"'.replace(".", ",") for x in line.split(",")) for line in lines
+    ],
+    "lines of a recorder": lambda lines: ["Recorder 3.2", "robot: arm, 6 axes", "", *lines],
+    "MATLAB's comments": lambda lines: ["% arm 3", *lines],
+    "a header in a comment": lambda lines: ["# arm, 3", f"# {lines[0]}", *lines[1:]],
+    "a header in a comment, spaces": lambda lines: [
+        f"# {lines[0].replace(',', ' ')}",
+        *delimited(lines[1:], " "),
+    ],
+    "aligned by spaces": lambda lines: [
+        " " + "  ".join(x.rjust(12) for x in line.split(",")) for line in lines
+    ],
+    "rows that end with a comma": lambda lines: [lines[0], *(f"{line}," for line in lines[1:])],
+    "quantities above joints": lambda lines: [",q,q,qd,qd,tau,tau", f"t{',shoulder,elbow' * 3}", *lines[1:]],
+    "merged quantities above joints": lambda lines: [
+        ",q,,qd,,tau,",
+        f"{',shoulder,elbow' * 3}",
+        "t,,,,,,",
+        *lines[1:],
+    ],
     "comments": lambda lines: ["# arm 3", "# 26 November", *lines],
     "a line of units": lambda lines: [lines[0], UNIT_LINE, *lines[1:]],
     "the header twice": lambda lines: [lines[0], *lines],
@@ -875,6 +906,65 @@ def test_the_encoding_of_a_long_file_is_found_in_its_head(tmp_path):
     (tmp_path / "log.csv").write_bytes("\n".join(["t,q °,qd,tau", *rows, ""]).encode("latin-1"))
     mapping = LogMapping.model_validate({"columns": {"q": "q °", "qd": "qd", "tau": "tau"}})
     assert len(read_logs(tmp_path / "log.csv", ["a"], mapping)[0]) == 8000
+
+
+def test_separators_of_thousands_are_an_error_with_what_to_do(tmp_path):
+    (tmp_path / "log.csv").write_text('t,q_a,qd_a,tau_a\n1,0.1,0,1\n2,0.2,0,"1,002.5"\n')
+    with pytest.raises(
+        LogError, match=r"got '1,002.5', expected a number; write numbers without separators of thou"
+    ):
+        read_logs(tmp_path / "log.csv", ["a"])
+
+
+def test_vectors_of_matlab_and_conversions_of_other_files(tmp_path, monkeypatch):
+    """The command of each message makes a log of the file."""
+    import scipy.io
+
+    monkeypatch.chdir(tmp_path)
+    scipy.io.savemat("m.mat", columns(t=T[:, None]))
+    np.save("n.npy", np.column_stack([T, Q, QD, TAU]))
+    Path("t.txt").write_text(text_log())
+    for name, log in (("m.mat", "m.npz"), ("n.npy", "n.csv"), ("t.txt", "t.csv")):
+        with pytest.raises(LogError, match="; convert it: ") as caught:
+            read_logs(name, JOINTS)
+        command = str(caught.value).split("convert it: ")[1].replace("python", sys.executable)
+        subprocess.run(command.replace("NAMES", ",".join(columns())), shell=True, check=True)
+        check(read_logs(log, JOINTS)[0], log[0])
+    np.savez("x.npz", data=np.column_stack([T, Q, QD, TAU]))
+    joints = {
+        joint: {"columns": {x: f"data[{1 + 2 * k + row}]" for k, x in enumerate(("q", "qd", "tau"))}}
+        for row, joint in enumerate(JOINTS)
+    }
+    check(read_logs("x.npz", JOINTS, {"columns": {"t": "data[0]"}, "joints": joints})[0], "x")
+    np.savez("x.npz", t=T, q=np.stack([Q, Q]), qd=QD, tau=TAU)
+    with pytest.raises(
+        LogError, match=r"array q: got an array of shape \(2, 4, 2\), .*; store an array per recording"
+    ):
+        read_logs("x.npz", JOINTS)
+
+
+def test_json_lines_structs_stamps_in_two_columns_and_logs_without_times(tmp_path):
+    lines = [
+        {
+            "sec": 17,
+            "nsec": round(t * 1e9),
+            **{x: dict(zip(JOINTS, values, strict=True)) for x, values in row.items()},
+        }
+        for t, *row in zip(T.tolist(), Q.tolist(), QD.tolist(), TAU.tolist(), strict=True)
+        for row in [dict(zip(("q", "qd", "tau"), row, strict=True))]
+    ]
+    (tmp_path / "x.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    parquet(tmp_path / "y.parquet", pa.Table.from_pylist(lines))
+    names = {x: f"{x}.{{joint}}" for x in ("q", "qd", "tau")}
+    for file in ("x.jsonl", "y.parquet"):
+        (found,) = read_logs(tmp_path / file, JOINTS, {"columns": {"t": "sec + nsec", **names}})
+        check(found, file[0], rtol=1e-12)
+        (found,) = read_logs(tmp_path / file, JOINTS, {"columns": names, "sample_rate": 100})
+        check(found, file[0], rtol=1e-12)
+        with pytest.raises(
+            LogError, match=r"missing column t: .*; write its name as .*, or 'sample_rate: HZ'"
+        ):
+            read_logs(tmp_path / file, JOINTS, {"columns": names})
 
 
 def test_columns_separated_by_spaces_are_read(tmp_path):

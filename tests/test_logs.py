@@ -22,6 +22,7 @@ from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.tuning import shows_accelerations
 from spelgen.logs.windows import cut_windows, split_validation
+from spelgen.settings.log_mapping import LogMapping
 
 JOINTS = ("a", "b")
 
@@ -158,7 +159,7 @@ def test_names_are_unique_across_files(tmp_path):
 def test_what_cannot_be_written_is_told(tmp_path):
     for path, logs, message in (
         ("x.txt", [swing()], "got a log named 'x.txt', expected .parquet or .csv"),
-        ("x.csv", [], f"{tmp_path}/x.csv: got no trajectory, expected at least one"),
+        ("x.csv", [], "got no trajectory, expected at least one"),
         ("x.csv", [swing()], "trajectory swing: got 2 joints, expected 3: a, b, c"),
     ):
         with pytest.raises(LogError) as caught:
@@ -211,11 +212,13 @@ def test_missing_files_and_folders_are_told_at_once(tmp_path):
     csv(tmp_path / "log.txt", "")
     with pytest.raises(SpelgenErrors) as caught:
         read_logs([tmp_path / "none.csv", tmp_path / "empty", tmp_path / "log.txt"], JOINTS)
-    kinds = ".parquet, .csv, .npz, .mcap, .db3, .bag, the folder of a ROS 2 bag or of a LeRobot data set"
+    kinds = ".parquet, .csv, .tsv, .npz, .jsonl, .ndjson, .mcap, .db3, .bag"
+    kinds += ", the folder of a ROS 2 bag or of a LeRobot data set"
+    renamed = f"mv {tmp_path}/log.txt {tmp_path}/log.csv"
     assert str(caught.value).splitlines() == [
         f"{tmp_path}/none.csv: got no such file or folder, expected a log; check the path",
         f"{tmp_path}/empty: got a folder without logs, expected {kinds}",
-        f"{tmp_path}/log.txt: got a file of kind '.txt', expected {kinds}",
+        f"{tmp_path}/log.txt: got a file of kind '.txt', expected {kinds}; convert it: {renamed}",
     ]
 
 
@@ -273,6 +276,40 @@ def test_degrees_are_refused(case):
         f"trajectory x, joint 'a', 'b': got {message}, expected rad and rad/s, m and m/s; "
         f"write 'units: {units}' under 'logs' in the robot's YAML; --accept degrees if it is right"
     )
+
+
+def test_registers_get_no_unit_by_chance_but_the_lines_that_read_them(tmp_path):
+    """Counts of encoders and speeds in units of 0.229 rpm are in no unit of a table, and not late by a slow clock."""
+    log = swing()
+    registers = replace(
+        log, q=np.round(2048 + log.q * 4096 / 2 / np.pi), qd=np.round(log.qd * 60 / 2 / np.pi / 0.229)
+    )
+    write_logs(tmp_path / "x.parquet", [registers], JOINTS)
+    table = pa.parquet.read_table(tmp_path / "x.parquet").replace_schema_metadata(None)
+    pa.parquet.write_table(table, tmp_path / "x.parquet")
+    counts = {
+        "units": {"q": "counts"},
+        "joints": {joint: {"counts_per_turn": 4096, "offset": -np.pi} for joint in JOINTS},
+    }
+    for mapping, expected in (
+        ({}, r"counts of an encoder need 'counts_per_turn'\), expected .*; write 'units' under"),
+        (
+            counts,
+            "0.024 times as fast as qd, whole numbers of an unknown unit, .*; write 'velocity: differentiated' un",
+        ),
+    ):
+        with pytest.raises(LogError, match=expected):
+            check(read_logs(tmp_path / "x.parquet", JOINTS, mapping), JOINTS, ("revolute", "revolute"))
+    found = read_logs(tmp_path / "x.parquet", JOINTS, counts | {"velocity": "differentiated"})
+    few = replace(
+        log, q=np.round(2048 + 0.05 * log.q * 4096 / 2 / np.pi), mapping=LogMapping(velocity="differentiated")
+    )
+    with pytest.raises(
+        LogError, match=r"counts of an encoder need 'counts_per_turn'\), expected .*; write 'units' under"
+    ):
+        check([few], JOINTS, ("revolute", "revolute"))
+    assert check(found, JOINTS, ("revolute", "revolute")) == []
+    np.testing.assert_allclose(found[0].q, log.q, atol=1e-3)
 
 
 def test_many_turns_are_believed_where_the_units_are_declared(tmp_path):

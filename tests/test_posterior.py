@@ -1,6 +1,7 @@
 """Posterior of torque fits: intervals against known arms, sampled parameters and exact combinations."""
 
 import json
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -20,7 +21,8 @@ from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.emission.build import build
-from spelgen.errors import RunError
+from spelgen.errors import LogError, RunError
+from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
 from spelgen.fitting.fit import fit, load_run
 from spelgen.fitting.posterior import Posterior
@@ -176,6 +178,31 @@ def test_standard_deviations_agree_with_sampled_parameters(fitted):
     np.testing.assert_allclose(
         np.std(draws, axis=0), np.concatenate([y.ravel() for y in stated]), rtol=0.2, atol=1e-9
     )
+
+
+def test_wrong_arguments_are_named_and_a_fit_can_be_pickled(fitted):
+    result, logs = fitted
+    wide = Trajectory(*(np.zeros((9, 4)) if x else np.arange(9) for x in range(4)), name="wide")
+    for call in (result.predict, result.score, lambda x: fit(result.model, x), lambda x: evaluate(result, x)):
+        with pytest.raises(LogError, match="trajectory wide: got 4 joints, expected 3: joint1"):
+            call(wide)
+        with pytest.raises(LogError, match=r"got str 'run/logs', expected trajectories: spelgen.read_logs\("):
+            call("run/logs")
+    with pytest.raises(LogError, match="got no trajectory"):
+        evaluate(result, [])
+    with pytest.raises(LogError, match=r"q: got \[.*nan.*\] at sample 2, expected finite"):
+        Trajectory(
+            np.arange(9), np.ma.masked_array(wide.q, np.arange(36).reshape(9, 4) == 9), wide.qd, wide.tau
+        )
+    again = pickle.loads(pickle.dumps(result))
+    assert isinstance(again.model, type(result.model))
+    np.testing.assert_array_equal(again.predict(logs[2]), result.predict(logs[2]))
+    q = logs[2].q[:5]
+    expected = result.posterior.mass_matrix(q).std
+    for form in (q.tolist(), torch.from_numpy(q).requires_grad_(), np.asfortranarray(q)):
+        np.testing.assert_array_equal(again.posterior.mass_matrix(form).std, expected)
+    with pytest.raises(ValueError, match=r"got q of shape \(3,\), expected \(T, 3\)"):
+        result.posterior.gravity(q[0])
 
 
 def test_torque_intervals_hold_the_torques_of_another_motion(fitted):

@@ -65,6 +65,53 @@ def test_numbered_columns_with_set_points_and_without_velocities(scara, tmp_path
     assert text.count("gain: 1.0 # Nm per A at the joint, the gear included: write its value") == 4
 
 
+PUBLIC = {
+    "libfranka": ("time", "q[{}]", "dq[{}]", "tau_J[{}]", "O_T_EE[{}] q_d[{}] dq_d[{}] tau_J_d[{}] dtau_J[{}] "
+                  "tau_ext_hat_filtered[{}]"),
+    "RTDE": ("timestamp", "actual_q_{}", "actual_qd_{}", "actual_moment_{}", "target_q_{} target_moment_{} "
+             "actual_current_{} actual_TCP_speed_{} actual_TCP_force_{}"),
+    "set and actual": ("t", "q_act_{}", "dq_act_{}", "trq_{}", "q_set_{} I_act_{} friction_trq_{} gravity_trq_{}"),
+    "FRI": ("sec nsec", "measured_position_{}", "measured_speed_{}", "measured_torque_{}", "ipo_position_{} "
+            "commanded_position_{} commanded_torque_{} external_torque_{}"),
+    "Kortex": ("ts", "actuators[{}].position", "actuators[{}].velocity", "actuators[{}].torque", ""
+               "actuators[{}].current actuators[{}].temperature_motor"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("source", PUBLIC)
+def test_of_several_signals_of_a_quantity_the_measured_one_of_the_joints_is_taken(scara, tmp_path, source):
+    """Names of public recordings, whose set points, tool forces and estimates have similar names."""
+    clock, *measured, others = PUBLIC[source]
+    names = [*measured, *others.split()]
+    head = [*clock.split(), *(name.format(k) for name in names for k in range(4))]
+    times = np.stack([np.floor(T + 99), np.round(T % 1 * 1e9)] if " " in clock else [T], axis=1)
+    rest = np.random.default_rng(1).normal(size=(len(T), 4 * (len(names) - 3)))
+    rows = np.column_stack([times, Q, QD, TAU, rest])
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+def test_joints_named_by_words_of_other_signals(scara, tmp_path):
+    text = (scara.robot.path).read_text()
+    for k, name in enumerate(("tool_joint", "set_joint", "target_slide", "ee")):
+        text = text.replace(f'"joint{k + 1}"', f'"{name}"')
+    (tmp_path / "arm.urdf").write_text(text)
+    arm = load_arm(tmp_path / "arm.urdf")
+    head = ["t", *(f"{x}_{name}" for x in ("q", "qd", "tau") for name in arm.chain.joint_names)]
+    require_same(suggested(written(tmp_path / "log.csv", head, np.column_stack([T, Q, QD, TAU])), arm)[0])
+
+
+def test_columns_of_pandas_with_a_date_as_index(scara, tmp_path):
+    names = [x.name for x in scara.chain.coordinates]
+    log = {
+        f"('{x}', '{name}')": values[:, k]
+        for x, values in (("position", Q), ("velocity", QD), ("effort", TAU))
+        for k, name in enumerate(names)
+    }
+    dates = pa.array((1.7e18 + np.round(T * 1e9)).astype(np.int64)).cast(pa.timestamp("ns"))
+    pa.parquet.write_table(pa.table(log | {"__index_level_0__": dates}), tmp_path / "log.parquet")
+    require_same(suggested(tmp_path / "log.parquet", scara)[0])
+
+
 def test_names_of_joints_count_before_numbers(scara, tmp_path):
     names = [x.name for x in scara.chain.coordinates]
     order = [3, 1, 0, 2]

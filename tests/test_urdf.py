@@ -381,6 +381,8 @@ class TestLint:
             ("inertial-without-inertia", '<inertial><mass value="1"/></inertial>'),
             ("inertial-without-mass", '<inertial><inertia ixx="1" iyy="1" izz="1"/></inertial>'),
             ("several-inertials", INERTIAL + INERTIAL),
+            ("millimetres", INERTIAL.replace('"1"', '"0.001"', 1)),
+            ("millimetres", INERTIAL.replace("<mass", '<origin xyz="0 -150 0"/><mass')),
         ],
     )
     def test_inertials(self, write, code, inertial):

@@ -98,8 +98,8 @@ def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
         raise typer.Exit(BROKEN_PIPE)
     if debug:
         traceback.print_exception(error)
-    # An interrupt by the user needs no traceback.
-    if isinstance(error, KeyboardInterrupt):
+    # An interrupt needs no traceback. Compiled modules convert it to an ImportError while they are imported.
+    if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         note("interrupted")
         raise typer.Exit(INTERRUPTED)
     note(_message(error, debug))

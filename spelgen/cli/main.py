@@ -6,6 +6,7 @@ A command imports its modules when it runs, so that `spelgen --help` is fast and
 import gc
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -124,6 +125,8 @@ def main() -> None:
     # OMP_NUM_THREADS is set before BLAS and torch are imported, because both read the variable only once. One thread
     # makes runs deterministic, and is fastest for small matrices.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # A termination ends a command as Ctrl-C does: unfinished files are removed.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     # Imports create many objects that live as long as the process: collections during imports take 6 % of the time of a
     # short command.
     gc.set_threshold(100_000)

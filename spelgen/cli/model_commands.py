@@ -76,6 +76,10 @@ def build(
     if is_new:
         options.require_free(path, force=force)
         line = f"wrote {write_text(path, source)}"
+    if not spec.started_from_urdf:
+        note(
+            "the URDF has no physically consistent inertials of all moving bodies: each body starts with 1 kg"
+        )
     record: dict[str, object] = {"module": str(path), "new": is_new, "robot": spec.robot, "urdf": spec.urdf}
     record |= {"urdf_sha256": spec.urdf_sha256, "spec_sha256": spec.sha256, "options": asdict(spec.options)}
     record |= {"joints": spec.joint_names, "joint_types": spec.joint_types}

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import cache, partial
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, SupportsIndex, cast
 
 import torch
 from torch import Tensor
@@ -41,6 +41,10 @@ class ArmModel(PortHamiltonian):
         from spelgen.dynamics.prepared import PreparedModel
 
         return PreparedModel(self, tip, dtype=dtype)
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
+        # The class is made by a function, so that pickle does not find it by its name.
+        return (_without_state, (base_class(self.spec),), *super().__reduce_ex__(protocol)[2:])
 
     def __repr__(self) -> str:
         sizes = f"{self.n} joints, {parameter_count(self)} parameters"
@@ -126,6 +130,12 @@ def _model_class(base: str) -> Callable[..., ArmModel]:
     """Return a class ``Model`` that derives from ``ArmModel`` and from ``base``, a class of ``spelgen.runtime``."""
     # The function is cached, so that all models with the same base class have the same type.
     return cast("Callable[..., ArmModel]", type("Model", (ArmModel, vars(runtime)[base]), {}))
+
+
+def _without_state(base: str) -> ArmModel:
+    """Return a model without attributes, which unpickling adds. base: name of the base class."""
+    made = cast("type[ArmModel]", _model_class(base))
+    return made.__new__(made)
 
 
 def _value(item: object, names: dict[str, object]) -> object:

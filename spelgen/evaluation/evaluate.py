@@ -37,8 +37,8 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import (
     Trajectory,
     joined_column,
+    recordings,
     require_commands,
-    require_joints,
     require_torques,
 )
 from spelgen.logs.tuning import SLOWEST
@@ -87,10 +87,7 @@ def evaluate(
     """
     # Model and logs are checked before the rollouts, because rollouts take minutes.
     tested = Subject(model, arm)
-    logs = [logs] if isinstance(logs, Trajectory) else list(logs)
-    # Joints are matched by name: the order of the joints in a log may differ, but a missing joint is an error.
-    for trajectory in logs:
-        require_joints(trajectory, tested.joints)
+    logs = recordings(logs, tested.joints)
     notes = check(logs, tested.joints, tested.model.joint_types)
     seen = [trajectory.name for trajectory in logs if trajectory.name in tested.trained_on]
     # Test logs that were also training logs are detected by their names, because a run does not store the logs.

@@ -44,6 +44,7 @@ def rollout(
     Returns:
         Positions [rad, m] and velocities [rad/s, m/s], each (..., T + 1, n), the initial state included.
     """
+    q, qd, tau = map(torch.as_tensor, (q, qd, tau))
     batch = np.broadcast_shapes(q.shape[:-1], tau.shape[:-2])
     samples, n = tau.shape[-2:]
     steps = torch.as_tensor(dt, dtype=q.dtype, device=q.device).expand(*batch, samples)

@@ -7,6 +7,7 @@ from lxml import etree
 
 from spelgen.arm.arm import lump_links
 from spelgen.arm.chain import choose_chain
+from spelgen.arm.rational import rotation_from_rpy
 from spelgen.dynamics.body_regressor import about_center
 from spelgen.dynamics.parameters import friction_factor
 from spelgen.exporting.describe import Trained, array
@@ -59,13 +60,20 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     joints = {element.get("name"): element for element in root.findall("joint")}
     chain = choose_chain(robot, arm.joint_names, None)
     lumped = lump_links(robot, chain, projection.arm.angle_tolerance)
+    # Some tools do not read the orientation of an <inertial>: fixed links get an <inertial> without one, too.
+    for link in robot.links:
+        if link.inertial and any(link.inertial.rpy):
+            mass, center, rpy, (xx, xy, xz, yy, yz, zz), _ = link.inertial
+            rotation = rotation_from_rpy(rpy)
+            tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            _set_inertial(links[link.name], mass, rotation.T @ center, tensor, rotation)
     for body, inertia in zip(lumped.moved, projection.inertias, strict=True):
         for link in body.links:
             _remove(links[link.name], "inertial")
         name = body.joint.child
         # This rotation maps from the body frame, whose z axis is the joint axis, to the link frame.
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
-        _set_inertial(links[name], inertia, rotation)
+        _set_inertial(links[name], *about_center(inertia), rotation)
     friction = projection.friction
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
@@ -140,16 +148,19 @@ def _plain(value: npt.ArrayLike) -> object:
     return rounded(value).tolist()
 
 
-def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarray) -> None:
+def _set_inertial(
+    link: etree._Element, mass: float, center: np.ndarray, tensor: np.ndarray, rotation: np.ndarray
+) -> None:
     """Replace the <inertial> of a link.
 
     Args:
         link: <link> element of the URDF.
-        inertia: inertial parameters in the body frame, (10,).
+        mass: mass [kg].
+        center: centre of mass in the body frame, (3,) [m].
+        tensor: inertia about the centre of mass in the body frame, (3, 3) [kg m^2].
         rotation: rotation from the body frame to the link frame, (3, 3).
     """
     _remove(link, "inertial")
-    mass, center, tensor = about_center(inertia)
     center = rotation @ center
     tensor = rotation @ tensor @ rotation.T
     inertial = etree.Element("inertial")

@@ -11,7 +11,7 @@ import torch
 
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.emission.assemble import ArmModel
-from spelgen.errors import Diagnostic, LogError
+from spelgen.errors import Diagnostic
 from spelgen.fitting.rollout import LossScales, choose_substeps, loss_scales, rollout_loss
 from spelgen.fitting.tuning import TUNING
 from spelgen.logs.checks import check
@@ -121,8 +121,6 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
         window: number of samples per window.
         stride: number of samples between the starts of successive windows.
     """
-    if not request.logs:
-        raise LogError("no logs", expected="a trajectory or more")
     # Whole trajectories are set aside: neighbouring windows of one motion are not independent.
     if isinstance(request.validation, float):
         split = split_validation(request.logs, request.validation, request.seed)

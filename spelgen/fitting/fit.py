@@ -26,7 +26,7 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import Checkpoint
 from spelgen.logs.dynamics_samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, recordings
 from spelgen.logs.tuning import shows_accelerations
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig, fit_config
@@ -104,7 +104,7 @@ def fit(
     """
     began = options.began or time.monotonic()
     run = None if folder is None else RunFolder(folder)
-    logs = [logs] if isinstance(logs, Trajectory) else logs
+    logs = recordings(logs, model.joint_names)
     config = choose_config(model, config, lambda: sample_rates(logs))
     # A resumed run uses its own copy of the URDF: the user's file may have changed.
     urdf = run.urdf if run is not None and options.resume else urdf_path(arm)

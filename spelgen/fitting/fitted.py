@@ -24,7 +24,7 @@ from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.filtering import low_pass
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, gap_ends
+from spelgen.logs.trajectory import Trajectory, gap_ends, recordings
 from spelgen.logs.tuning import SLOWEST
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import FitConfig
@@ -158,6 +158,7 @@ class Fit:
         """
         from spelgen.fitting.posterior import Uncertain
 
+        (trajectory,) = recordings(trajectory, self.model.joint_names)
         reach = bristle_reach(self.model)
         tau, deviation = np.full_like(trajectory.q, np.nan), np.full_like(trajectory.q, np.nan)
         for start, stop in pairwise(gap_ends(trajectory.t, self.preprocessing.gap)):
@@ -183,7 +184,7 @@ class Fit:
         The score is the mean over trajectories of the mean over joints. Samples are selected and filtered by
         `dynamics_samples`. Raises LogError if no log is sampled densely enough for accelerations.
         """
-        logs = [logs] if isinstance(logs, Trajectory) else logs
+        logs = recordings(logs, self.model.joint_names)
         reach = bristle_reach(self.model)
         samples = dynamics_samples(logs, preprocessing=self.preprocessing, reach=reach)
         samples = [x for x in samples if len(x.q)]

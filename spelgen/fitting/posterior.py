@@ -92,7 +92,8 @@ class Posterior:
 
     def mass_matrix(self, q: np.ndarray) -> Uncertain:
         """Return M (T, n, n) [kg m^2, kg m, kg] at q (T, n) [rad, m], with standard deviations."""
-        position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
+        position = self._positions(q)
+        zero = torch.zeros_like(position)
         at_rest, units = self._regressor(position, zero, zero), torch.eye(self.model.n).double()
         columns = [self._regressor(position, zero, unit.expand_as(zero)) - at_rest for unit in units]
         with torch.no_grad():
@@ -100,9 +101,17 @@ class Posterior:
 
     def gravity(self, q: np.ndarray) -> Uncertain:
         """Return gravity torques (T, n) [Nm, N] at q (T, n) [rad, m], with standard deviations."""
-        position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
+        position = self._positions(q)
+        zero = torch.zeros_like(position)
         with torch.no_grad():
             return self._linear(self.model.gravity(position), self._regressor(position, zero, zero))
+
+    def _positions(self, q: np.ndarray) -> Tensor:
+        """Return positions (T, n) as a tensor. Raises ValueError for another shape."""
+        position = torch.as_tensor(q, dtype=torch.float64)
+        if position.ndim != 2 or position.shape[1] != self.model.n:
+            raise ValueError(f"got q of shape {tuple(position.shape)}, expected (T, {self.model.n})")
+        return position
 
     def torque(self, *motion: np.ndarray) -> Uncertain:
         """Return the torques (T, n) [Nm, N] that would be logged, with standard deviations.

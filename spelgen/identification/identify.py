@@ -23,7 +23,7 @@ from spelgen.identification.tuning import TUNING
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
+from spelgen.logs.trajectory import Trajectory, recordings, require_torques
 from spelgen.logs.tuning import SLOWEST
 
 
@@ -47,7 +47,7 @@ def identify(
     """
     if not isinstance(arm, Arm):
         arm = load_arm(arm)
-    logs = [logs] if isinstance(logs, Trajectory) else logs
+    logs = recordings(logs, arm.chain.joint_names)
     return identify_by(arm, logs, [method or LeastSquares()], preprocessing or Preprocessing())[0]
 
 
@@ -59,8 +59,6 @@ def identify_by(
 ) -> list[Identification]:
     """Return one result per method for the same logs, which are filtered only once; see `identify`."""
     joints, joint_types = arm.chain.joint_names, arm.chain.joint_types
-    for trajectory in logs:
-        require_joints(trajectory, joints)
     require_torques(logs)
     notes = check(logs, joints, joint_types)
     drives = arm.actuation.drives()

@@ -95,7 +95,7 @@ class Estimator:
 
     def step(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> EstimatorState:
         """Process a sample: time [s], positions, velocities and measured torques, (n,); return the estimates."""
-        (state,) = self.steps(np.array([t]), *(np.array([x], dtype=float) for x in (q, qd, tau)))
+        (state,) = self.steps(np.array([t], dtype=float), *(np.array([x], dtype=float) for x in (q, qd, tau)))
         return state
 
     def replay(self, log: Trajectory) -> list[EstimatorState]:
@@ -106,6 +106,11 @@ class Estimator:
         self, t: np.ndarray, q: np.ndarray, qd: np.ndarray, tau: np.ndarray
     ) -> Iterator[EstimatorState]:
         """Process samples at times t (T,), with q, qd and tau (T, n); yield the estimates after each sample."""
+        shape = (len(t), self.model.n)
+        if not q.shape == qd.shape == tau.shape == shape:
+            raise ValueError(
+                f"got q, qd and tau {q.shape}, {qd.shape}, {tau.shape}, expected {shape}: {shape[1]} joints"
+            )
         refusals, terms = balance_along(self.model, self.levels, self.intake, t, (q, qd, tau), self.prepared)
         for now, refusal, at in zip(t.tolist(), refusals, terms, strict=True):
             changed = at is not None and self._advance(now, at, refusal)
@@ -186,6 +191,10 @@ def torque_model(fit: Fit) -> RigidBodyDynamics:
 
     Raises RunError for a model that the estimator does not support.
     """
+    if not isinstance(fit, Fit):
+        raise RunError(
+            repr(fit), element="estimator", expected="a fit: spelgen.fit(...) or spelgen.load_run(FOLDER)"
+        )
     model = fit.model
     if not isinstance(model, RigidBodyDynamics):
         raise RunError(

@@ -1,42 +1,45 @@
 """Reader of CSV logs in the dialects of spreadsheets and loggers."""
 
 import codecs
+import csv
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import takewhile
+from itertools import accumulate, takewhile, zip_longest
 from pathlib import Path
+from statistics import mode
 from typing import NamedTuple
 
 import pyarrow as pa
-import pyarrow.compute
 import pyarrow.csv
 
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import LogTable, table_layout
-from spelgen.logs.values import is_number
+from spelgen.logs.values import is_number, stamps
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
 # first columns that `ros2 topic echo --csv` writes: the header of the message
 STAMP = ("sec", "nanosec", "frame_id")
+# Beginning of a comment; "%time" is a name that `rostopic echo -p` writes.
+COMMENT = re.compile(r"^(#|% )\s*")
 
 
 class Beginning(NamedTuple):
-    """Beginning of a CSV file, divided into comments, header, other lines and rows of values.
+    """Beginning of a CSV file, up to the first row of values.
 
     Attributes:
         encoding: text encoding of the file.
-        comments: number of comment lines before the header.
-        header: the header line.
-        others: number of lines between the header and the first row of values, such as a line of units.
+        delimiter: character between columns.
+        names: names of the columns; for a file without a header, the values of its first row.
+        lines: number of lines before the first row of values: comments, the header, and lines such as units.
         rows: the first rows of values.
     """
 
     encoding: str
-    comments: int
-    header: str
-    others: int
+    delimiter: str
+    names: list[str]
+    lines: int
     rows: str
 
 
@@ -57,17 +60,12 @@ def csv_columns(file: Path) -> pa.Table:
 def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
     """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
 
-    Columns may be separated by commas, semicolons, tabs, bars or single spaces; numbers may have decimal commas; the
-    encoding may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
+    Columns may be separated by commas, semicolons, tabs, bars or spaces; numbers may have decimal commas; the encoding
+    may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
     """
     text = _beginning(file)
-    # Names of columns may contain spaces, so spaces are the delimiter only if the header contains no other delimiter.
-    delimiter = max(",;\t|", key=text.header.count)
-    if delimiter not in text.header:
-        delimiter = " "
-    cells = text.header.split(delimiter)
-    names = _joint_state_columns(cells, file) if is_number(cells[0]) else None
-    start = '"' if delimiter == "," else f"(^|{re.escape(delimiter)}) *"
+    names = _joint_state_columns(text.names, file) if is_number(text.names[0]) else None
+    start = '"' if text.delimiter == "," else f'(^|{re.escape(text.delimiter)}) *"?'
     decimal_point = "," if re.search(rf"{start}-?\d+,\d", text.rows, re.MULTILINE) else "."
     wrong: list[pa.csv.InvalidRow] = []
 
@@ -75,43 +73,83 @@ def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
         wrong.append(row)
         return "skip" if len(wrong) == 1 else "error"
 
+    source, encoding = file, text.encoding
+    # Arrow does not join several spaces, which align columns, to one delimiter.
+    if text.delimiter == " " and re.search("^ |  ", text.rows, re.MULTILINE):
+        aligned = re.sub("^ +| +$| +(?= )", "", file.read_text(encoding), flags=re.MULTILINE)
+        source, encoding = pa.BufferReader(aligned.encode()), "utf-8"
     # Arrow reads with one thread and with the system's allocator, which limits the memory and frees it after use. This
     # costs 0.02 s for 17 MB.
-    rows = {"skip_rows": text.comments, "skip_rows_after_names": text.others, "column_names": names}
+    rows = {"skip_rows": text.lines, "column_names": names or text.names}
     table = pa.csv.read_csv(
-        file,
-        pa.csv.ReadOptions(use_threads=False, encoding=text.encoding, **rows),
-        pa.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=skipped),
+        source,
+        pa.csv.ReadOptions(use_threads=False, encoding=encoding, **rows),
+        pa.csv.ParseOptions(delimiter=text.delimiter, invalid_row_handler=skipped),
         pa.csv.ConvertOptions(decimal_point=decimal_point),
         memory_pool=pa.system_memory_pool(),
     )
-    header = text.comments + 1 + text.others
     # Only the last line may be incomplete, as after a power failure of the recorder. Any other incomplete line is an
     # error.
     for row in wrong:
-        if not len(table) or row.number <= header + len(table):
+        if not len(table) or row.number <= text.lines + len(table):
             got = f"{row.actual_columns} values ({row.text:.40})"
             raise LogError(
                 got, file=file, line=row.number, expected=f"{row.expected_columns}, as in the header"
             )
-    if names is None:
-        table = table.rename_columns([name.strip() for name in table.column_names])
-    else:
-        seconds, nanoseconds = table[STAMP[0]].cast(pa.int64()), table[STAMP[1]].cast(pa.int64())
-        times = pa.compute.add(pa.compute.multiply(seconds, 1_000_000_000), nanoseconds)
-        table = table.append_column(PLAIN["t"], times.cast(pa.duration("ns")))
-    return table, header, wrong[0].text if wrong else ""
+    if names is not None:
+        table = table.append_column(PLAIN["t"], stamps(table[STAMP[0]], table[STAMP[1]]))
+    return table, text.lines, wrong[0].text if wrong else ""
 
 
 def _beginning(file: Path) -> Beginning:
-    """Return the beginning of a CSV file, in which comments start with # and a line of units contains no digits."""
+    """Return the beginning of a CSV file.
+
+    The header is the first line with as many cells as most lines have, which is a comment only if values follow it
+    directly. Between header and values there may be lines without digits, such as units, and repeats of the header.
+    """
     encoding, head = _decoded_head(file)
-    lines = head.splitlines() or [""]
-    # The last line of the head never counts as a comment, so that there is always a header.
-    comments = len(list(takewhile(lambda line: line.startswith("#"), lines[:-1])))
-    header, rows = lines[comments], lines[comments + 1 :]
-    skipped = list(takewhile(lambda x: x and (x == header or not re.search(r"\d", x)), rows[:-1]))
-    return Beginning(encoding, comments, header, len(skipped), "\n".join(rows[len(skipped) :]))
+    lines = head.lstrip("\ufeff").splitlines() or [""]
+    # Names of columns may contain spaces, and numbers decimal commas, so spaces and commas are tried last.
+    for delimiter in "\t;|, ":
+        cells = [_cells(COMMENT.sub("", line), delimiter) for line in lines]
+        width = mode(map(len, cells[:-1] or cells))
+        if width > 2:
+            break
+    # In rows that end with a delimiter, the last cell has no name.
+    ends = width - all(row[-1] == "" for row in cells[1:-1] if len(row) == width)
+    full = [k for k, row in enumerate(cells) if len(row) in (ends, width)] or [0]
+    first = next((k for k in full if not COMMENT.match(lines[k])), full[0])
+    if is_number(cells[first][0]):
+        first = max((k for k in full if k < first), default=first)
+    names, rows = cells[first], range(first + 1, len(lines) - 1)
+    if is_number(names[0]):
+        return Beginning(encoding, delimiter, names, first, "\n".join(lines[first:]))
+    # Names may be in two lines: the quantities, repeated or once for several joints, and below them the joints.
+    is_repeated = len(set(names)) < len(names) - 1
+    named = cells if is_repeated else [None] * len(cells)
+    between = [*takewhile(lambda k: _is_text(lines[k], lines[first], named[k]), rows)]
+    if is_repeated and between:
+        filled = accumulate(names, lambda before, name: name or before, initial="")
+        parts = zip_longest([*filled][1:], *(cells[k] for k in between), fillvalue="")
+        names = ["_".join(filter(None, dict.fromkeys(column))) for column in parts]
+    start = first + 1 + len(between)
+    names = names + [""] * (width - len(names))
+    return Beginning(encoding, delimiter, names, start, "\n".join(lines[start:]))
+
+
+def _is_text(line: str, header: str, cells: Sequence[str] | None) -> bool:
+    """Return True for a line below the header without values: without digits, the header again, or without numbers.
+
+    cells: the cells of the line if they may be names, which may contain digits; else None.
+    """
+    is_name = cells is not None and not any(map(is_number, cells))
+    return bool(line) and (line == header or is_name or not re.search(r"\d", line))
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line, which may be in quotation marks; several spaces are one delimiter."""
+    cells = line.split() if delimiter == " " else next(csv.reader([line], delimiter=delimiter), [])
+    return [cell.strip() for cell in cells] or [""]
 
 
 def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
@@ -138,8 +176,9 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
 def _decoded_head(file: Path) -> tuple[str, str]:
     """Return the encoding and the first characters of a file."""
-    # [B] size of the head of the file, from which encoding, delimiter and decimal point are detected
-    size = 2**16
+    # [B] size of the head of the file, from which names, encoding, delimiter and decimal point are detected. The module
+    # csv reads no larger cells.
+    size = 2**17
     with file.open("rb") as source:
         head = source.read(size)
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):

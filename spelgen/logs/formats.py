@@ -16,7 +16,21 @@ from spelgen.settings.log_mapping import LogMapping
 LogPaths = Path | str | Iterable[Path | str]
 """Paths of log files and of folders with logs, or their addresses (see `local`)."""
 
-UNPACK = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".xz": "unxz", ".bz2": "bunzip2"}
+_PYTHON = 'python -c "import {}"'
+# {suffix: command that makes a log of a file of this kind}; {0} is its path, {1} the path without the suffix.
+CONVERT = {
+    ".zstd": "zstd -d {0}", ".zst": "zstd -d {0}", ".gz": "gunzip {0}", ".xz": "unxz {0}", ".bz2": "bunzip2 {0}",
+    **dict.fromkeys((".txt", ".dat", ".asc"), "mv {0} {1}.csv"),
+    ".xlsx": _PYTHON.format("pandas; pandas.read_excel('{0}').to_csv('{1}.csv', index=False)"),
+    ".pkl": _PYTHON.format("pandas; pandas.read_pickle('{0}').reset_index().to_parquet('{1}.parquet')"),
+    ".json": _PYTHON.format("pandas; pandas.read_json('{0}').to_parquet('{1}.parquet')"),
+    ".npy": _PYTHON.format("numpy; numpy.savetxt('{1}.csv', numpy.load('{0}'), delimiter=',', header='NAMES')"),
+    ".mat": _PYTHON.format("numpy, scipy.io; numpy.savez('{1}.npz', **scipy.io.loadmat('{0}'))"),
+    **dict.fromkeys((".h5", ".hdf5"), _PYTHON.format(
+        "h5py, numpy; d = {{}}; h5py.File('{0}').visititems(lambda k, x: d.update({{k: x[()]}}) "
+        "if isinstance(x, h5py.Dataset) else None); numpy.savez('{1}.npz', **d)"
+    )),
+}  # fmt: skip
 
 
 def _lazy(name: str) -> Callable[..., list[LogTable]]:
@@ -25,22 +39,25 @@ def _lazy(name: str) -> Callable[..., list[LogTable]]:
 
 
 PARQUET = LogFormat(
-    _lazy("parquet_files:read_parquet"), (".parquet",), _lazy("parquet_files:pa.parquet.read_table")
+    _lazy("parquet_files:read_parquet"), (".parquet",), _lazy("parquet_files:parquet_columns")
 )
-CSV = LogFormat(_lazy("csv_files:read_csv"), (".csv",), _lazy("csv_files:csv_columns"))
+CSV = LogFormat(_lazy("csv_files:read_csv"), (".csv", ".tsv"), _lazy("csv_files:csv_columns"))
 NPZ = LogFormat(_lazy("npz:read_npz"), (".npz",), _lazy("npz:npz_columns"))
+JSON_LINES = LogFormat(
+    _lazy("parquet_files:read_json_lines"), (".jsonl", ".ndjson"), _lazy("parquet_files:json_columns")
+)
 BAG = LogFormat(
     _lazy("bags:read_bag"), (".mcap", ".db3", ".bag"), marker="metadata.yaml", folder="a ROS 2 bag"
 )
 LEROBOT = LogFormat(_lazy("parquet_files:read_dataset"), marker="meta/info.json", folder="a LeRobot data set")
-FORMATS = [PARQUET, CSV, NPZ, BAG, LEROBOT]
+FORMATS = [PARQUET, CSV, NPZ, JSON_LINES, BAG, LEROBOT]
 
 
 def format_of(path: Path) -> LogFormat | None:
     """Return the log format of a file or folder; None if it is not a log. A pipe is no log: reading might not end."""
     for log_format in FORMATS:
         is_folder = log_format.marker and (path / log_format.marker).is_file()
-        if is_folder or (path.suffix in log_format.suffixes and path.is_file()):
+        if is_folder or (path.suffix.lower() in log_format.suffixes and path.is_file()):
             return log_format
     return None
 
@@ -75,9 +92,10 @@ def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], lis
     return list(files), errors
 
 
-def _unpacking(path: Path) -> str | None:
-    """Return the advice to unpack a compressed file; None for other files."""
-    return f"unpack it: {UNPACK[path.suffix]} {path.name}" if path.suffix in UNPACK else None
+def _conversion(path: Path) -> str | None:
+    """Return the advice to convert a file of a kind in CONVERT; None for other files."""
+    command = CONVERT.get(path.suffix.lower())
+    return command and f"convert it: {command.format(path, path.with_suffix(''))}"
 
 
 def _logs_at(path: Path, role: str | None) -> list[Path]:
@@ -88,11 +106,11 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
     formats = f"{suffixes}, the folder of {folders}"
     if not path.is_dir():
         require_regular_file(path, LogError, f"a file: {formats}")
-        raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=formats, do=_unpacking(path))
+        raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=formats, do=_conversion(path))
     # hidden files are no logs: macOS writes "._log.csv" in addition to log.csv on foreign file systems
     logs = sorted(x for x in path.iterdir() if format_of(x) is not None and not x.name.startswith("."))
     if not logs:
-        packed = next(filter(None, map(_unpacking, sorted(path.iterdir()))), None)
+        packed = next(filter(None, map(_conversion, sorted(path.iterdir()))), None)
         raise LogError("a folder without logs", file=path, expected=formats, do=packed)
     # all logs are used if no file of the folder is named train.* or test.*
     selected = [log for log in logs if log.stem == role]

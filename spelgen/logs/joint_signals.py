@@ -97,6 +97,11 @@ class JointSignals(NamedTuple):
         return self.kind == "continuous" or bool(self.trajectory.mapping.word("period", "q", self.joint))
 
     @property
+    def is_whole(self) -> bool:
+        """True if all positions are whole numbers."""
+        return bool((self.q == self.q.round()).all())
+
+    @property
     def measured(self) -> tuple[str, ...]:
         """Names of the measured signals, of "q", "qd" and "tau", without commands and differentiated velocities."""
         if self.trajectory.u is None and self.trajectory.tau.size:
@@ -153,7 +158,9 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
     drift = np.abs(cumulative_trapezoid(qd, t)).max(initial=0.0)
     if np.ptp(q) == 0 and drift > motion:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
-    for name in signals.measured if "qd" in signals.measured else ():
+    # If another unit explains the difference of qd and dq/dt, the drift does not show that values are stale.
+    is_other_unit = signals.correlation > SIGNALS.agreement and not 0.25 < signals.factor < 4
+    for name in signals.measured if "qd" in signals.measured and not is_other_unit else ():
         rows = np.flatnonzero(stale_rows(name, signals.signal(name), t, q, qd))
         if rows.size:
             value, count = signals.signal(name)[rows[0]], counted(len(rows), "sample")
@@ -227,7 +234,11 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
         words = {x: plain_number(y, 9) for x, y in stated.items() if y and word.key == "sign_bit"}
         keys: dict[str, object] = {word.key: words | {name: plain_number(word.value, 9)}}
         if turn == 360.0 and unit is None:
-            unit, keys = "deg", {"units": {name: "deg"}} | keys
+            unit, units = "deg", {name: "deg"}
+            speed = float(np.std(np.diff(word.values))) / signals.step
+            if name == "q" and is_factor(speed, float(np.std(signals.qd)) or np.inf):
+                units["qd"] = "deg/s"
+            keys = {"units": units} | keys
         unit = unit or ("as logged" if turn is None else "rad")
         what = (
             "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"

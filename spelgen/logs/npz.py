@@ -42,6 +42,11 @@ class NpzArrays:
             with self._archive.open(member) as data:
                 try:
                     self._arrays[name] = np.lib.format.read_array(data, allow_pickle=False)
+                except ValueError as error:
+                    if "allow_pickle" not in str(error):
+                        raise
+                    do = f"store numbers, for example by numpy.savez(FILE, {name}=numpy.stack(LIST))"
+                    raise self.error(name, "Python objects", "numbers", do) from error
                 except MemoryError:
                     raise ValueError(f"array {member.filename} is larger than the file says") from None
         return self._arrays[name]
@@ -50,14 +55,18 @@ class NpzArrays:
         """Return an error about the array of this name."""
         return LogError(got, file=self.file, element=f"array {name}", expected=expected, do=do)
 
-    def column(self, name: str) -> pa.Array:
-        """Return the array of this name as a column of a table; the rows of a matrix become lists."""
+    def is_vector(self, name: str) -> bool:
+        """Return True for an array (T,), (T, 1) or (1, T): MATLAB stores vectors as matrices."""
+        return max(self[name].shape, default=0) == self[name].size
+
+    def column(self, name: str, *, is_list: bool) -> pa.Array:
+        """Return the array of this name as a column of a table. is_list: the rows of a matrix become lists."""
         array = self[name]
         # The array is converted to double precision and native byte order, since Arrow rejects other types and byte
         # orders.
         wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
         values = pa.array(array.astype(wide).ravel())
-        return pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if array.ndim == 2 else values
+        return pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if is_list else values
 
 
 def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -78,9 +87,11 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 def npz_columns(file: Path) -> pa.Table:
     """Return a table of all arrays with as many rows as the longest one; matrices become columns of lists."""
     arrays = NpzArrays(file)
-    lengths = {name: len(arrays[name]) for name in arrays.names if arrays[name].ndim in (1, 2)}
+    names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
+    lengths = {name: arrays[name].size if arrays.is_vector(name) else len(arrays[name]) for name in names}
     samples = max(lengths.values(), default=0)
-    return pa.table({name: arrays.column(name) for name, length in lengths.items() if length == samples})
+    columns = [name for name, length in lengths.items() if length == samples]
+    return pa.table({name: arrays.column(name, is_list=not arrays.is_vector(name)) for name in columns})
 
 
 def _trajectory_text(pattern: str, name: str) -> str | None:
@@ -105,16 +116,19 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
     layout = table_layout(schema, joints, mapping, arrays.file)
     if recording is not None:
         layout = replace(layout, labels=None, recording=recording)
-    samples = arrays[layout.columns[0]].shape
-    columns = stored_columns(layout, arrays.names)
+    columns, matrices, samples = stored_columns(layout, arrays.names), set(), None
     for name in columns:
         shape = arrays[name].shape
-        # An array may have two dimensions only if the layout names its columns, such as q[0], and not the whole array.
-        if shape[:1] != samples or len(shape) > 1 + (name not in layout.columns):
-            expected = f"a value for each of the {samples[0] if samples else 0} times"
+        # The layout names an array as a whole, or the columns of a matrix, such as q[0].
+        if name not in layout.columns and len(shape) == 2:
+            matrices.add(name)
+        length = shape[0] if name in matrices else arrays[name].size
+        samples = length if samples is None else samples
+        if length != samples or not (arrays.is_vector(name) or name in matrices):
+            expected = f"a value for each of the {samples} times"
             do = "resample it to these times"
             raise arrays.error(name, f"an array of shape {shape}", expected, do)
-    return layout, pa.table({name: arrays.column(name) for name in columns})
+    return layout, pa.table({name: arrays.column(name, is_list=name in matrices) for name in columns})
 
 
 def _with_matrix_columns(
@@ -126,8 +140,11 @@ def _with_matrix_columns(
     """
     pattern = mapping.pattern(quantity)
     matrix = pattern.replace("{joint}", "").rstrip("_")
-    if matrix not in arrays.names or arrays[matrix].ndim != 2:
+    if matrix not in arrays.names or arrays[matrix].ndim < 2:
         return mapping
+    if arrays[matrix].ndim > 2:
+        got, expected = f"an array of shape {arrays[matrix].shape}", "a row per time and a column per joint"
+        raise arrays.error(matrix, got, expected, "store an array per recording, such as q_1, q_2")
     names = [mapping.log_name(joint) for joint in joints]
     column_of = dict(zip(names, _matrix_columns(arrays, matrix, names), strict=True))
     columns: dict[str, dict[str, str | None]] = {}

@@ -1,4 +1,4 @@
-"""Reader of Parquet logs, and of LeRobot 3 data sets, which consist of Parquet files."""
+"""Reader of Parquet logs, of JSON lines, and of LeRobot 3 data sets, which consist of Parquet files."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.json
 import pyarrow.parquet
 
 from spelgen.errors import LogError, collect
@@ -29,10 +30,35 @@ UNLESS_NORMALISED = "unless they are LeRobot's normalised values"
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return a list with one table, the content of a file. The mapping is ignored for files that spelgen wrote."""
     schema = pa.parquet.read_schema(file)
-    layout = table_layout(schema, joints, mapping, file)
-    columns = stored_columns(layout, schema.names)
+    flat = _flat(schema.empty_table()).schema
+    layout = table_layout(flat, joints, mapping, file)
+    read = stored_columns(layout, flat.names)
+    columns = [x for x in schema.names if any(name == x or name.startswith(f"{x}.") for name in read)]
     # Pre-buffering is disabled, because it would keep the compressed file in memory in addition to the table.
-    return [(layout, pa.parquet.read_table(file, columns=columns, pre_buffer=False))]
+    return [(layout, _flat(pa.parquet.read_table(file, columns=columns, pre_buffer=False)))]
+
+
+def parquet_columns(file: Path) -> pa.Table:
+    """Return all columns of a Parquet file."""
+    return _flat(pa.parquet.read_table(file))
+
+
+def read_json_lines(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
+    """Return a list with one table, the content of a file with a JSON object per line and row."""
+    table = json_columns(file)
+    return [(replace(table_layout(table.schema, joints, mapping, file), header=0), table)]
+
+
+def json_columns(file: Path) -> pa.Table:
+    """Return all columns of a file of JSON lines."""
+    return _flat(pa.json.read_json(file))
+
+
+def _flat(table: pa.Table) -> pa.Table:
+    """Return a table in which columns of structs are replaced by a column per field, such as `position.elbow`."""
+    while any(map(pa.types.is_struct, table.schema.types)):
+        table = table.flatten()
+    return table
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:

@@ -15,7 +15,7 @@ from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, LogSource, log_sou
 from spelgen.logs.formats import LogPaths, log_files, read_tables
 from spelgen.logs.segments import LogSegments
 from spelgen.logs.tables import UNITS, UNITS_KEY
-from spelgen.logs.trajectory import Trajectory, joined_column, require_joints
+from spelgen.logs.trajectory import Trajectory, joined_column, recordings
 from spelgen.logs.tuning import TUNING
 
 
@@ -121,12 +121,8 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     path, joints = Path(path), log_source(arm).joints
     if path.suffix not in (".parquet", ".csv"):
         raise LogError(f"a log named {path.name!r}", expected=".parquet or .csv")
-    if not trajectories:
-        raise LogError("no trajectory", file=path, expected="at least one")
-    names: list[str] = []
-    for trajectory in trajectories:
-        require_joints(trajectory, joints)
-        names += [trajectory.name] * len(trajectory)
+    trajectories = recordings(trajectories, joints)
+    names = [x.name for x in trajectories for _ in range(len(x))]
     columns = {"trajectory": pa.array(names), "t": joined_column(trajectories, "t")}
     for quantity in trajectories[0].quantities:
         values = joined_column(trajectories, quantity)

@@ -8,6 +8,7 @@ import difflib
 import json
 import re
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +24,7 @@ from spelgen.logs.unit_checks import time_unit
 from spelgen.settings.log_mapping import CURRENTS
 
 WORDS = {
-    "t": {"t", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis", "zeit"},
+    "t": {"t", "ts", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis", "zeit"},
     "q": {"q", "pos", "position", "positions", "angle", "angles", "theta", "θ", "winkel"},
     "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega", "ω", "geschwindigkeit"},
     "tau": {"tau", "τ", "torque", "torques", "trq", "tq", "effort", "efforts", "force", "forces", "current", "currents",
@@ -32,9 +33,13 @@ WORDS = {
 # Words that distinguish the names of commanded values from the names of measured values.
 COMMANDED = {
     "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
-    "demand",
+    "demand", "planned", "ipo", "set", "soll",
 }  # fmt: skip
-NOT_MEASURED = COMMANDED | {"error", "std"}
+# Words in names of signals other than measured joint signals.
+NOT_MEASURED = COMMANDED | {
+    "error", "std", "external", "ext", "tcp", "ee", "eef", "cartesian", "tool", "contact", "gravity", "friction",
+}  # fmt: skip
+MEASURED = {"actual", "act", "measured", "meas", "present", "feedback", "fb", "ist"}
 # For each quantity: units as written in column names, in lower case, and the corresponding units of a mapping.
 UNITS = {
     "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "ns": "ns"},
@@ -86,18 +91,27 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         raise LogError(got, file=file, expected=" or ".join(suffixes), do=do)
     with reading(file):
         table = log_format.columns(file)
-    columns = [_column_name(name) for name in _names(table)]
+    dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
+    columns = [_column_name(name, {"time"} if name in dates else set()) for name in _names(table)]
     columns_of = _by_quantity(columns, commands, joints)
     if not columns_of["t"]:
         got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
-        raise LogError(got, file=file, expected="one of times, called t or time")
+        do = "name it so, or write 'columns' and 'sample_rate' under 'logs' if there is none and rows are evenly spaced"
+        raise LogError(got, file=file, expected="one of times, called t or time", do=do)
     # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
     # measurement. Without a stamp, the name with the fewest words is used.
     clock = min(columns_of.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
+    stamp = re.sub(r"secs?$", "", clock.name)
+    parts = [x.name for x in columns if re.fullmatch(rf"{re.escape(stamp)}n(ano)?secs?", x.name)]
+    if stamp != clock.name and parts:
+        clock = ColumnName(f"{clock.name} + {parts[0]}", clock.words, "s")
     # Numbered columns are assigned by cells that contain joint names, since the order in a log may differ from the
     # arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)
-    by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in columns_of.items()}
+    by_joint = {
+        quantity: _by_joint(_of_one_signal(named, joints), joints, order)
+        for quantity, named in columns_of.items()
+    }
     # A mapping has columns of velocities for all joints or for none. If one is absent, all velocities are computed from
     # positions.
     if not commands and len(by_joint["qd"]) < len(joints):
@@ -151,16 +165,16 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
     return _suggestion(lines, [f"q of {joint}" for joint, names in close.items() if not names], "motor")
 
 
-def _column_name(name: str) -> ColumnName:
-    """Return the parts of a column's name; its unit is in brackets, or its last word."""
-    bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d]+)[\])]", name)
+def _column_name(name: str, words: set[str]) -> ColumnName:
+    """Return the parts of a column's name; its unit is in brackets, or its last word. words: additional words."""
+    bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d',]+)[\])]", name)
     base, unit = bracketed.groups() if bracketed else (name, "")
     unit_names = set().union(*UNITS.values())
     last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s)?)", name)
     if not unit and last and last[2].lower() in unit_names - BARE and last[2] != name[:1]:
         base, unit = last.groups()
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", base)
-    return ColumnName(name, set(re.findall(r"[^\W\d_]+", separated.lower())), unit.strip().lower())
+    return ColumnName(name, words | set(re.findall(r"[^\W\d_]+", separated.lower())), unit.strip().lower())
 
 
 def _by_quantity(
@@ -174,7 +188,7 @@ def _by_quantity(
     The name of a joint in a column's name does not mark commands, even if it is a word such as "d" or "target".
     """
     by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
-    names = {joint.lower() for joint in joints}
+    names = set().union(*(_column_name(joint, set()).words for joint in joints))
     for column in columns:
         quantity = next((x for x, words in WORDS.items() if column.words & words), None)
         if quantity is None:
@@ -252,6 +266,25 @@ def _first_list(column: pa.ChunkedArray) -> list[object]:
     if isinstance(first, str) and (match := re.fullmatch(r"[\w.]*[\[(]+(.*?)[\])]+", first.strip())):
         first = [text.strip("'\"") for text in re.split(r"[,;\s]+", match[1].strip())]
     return first if isinstance(first, list) else []
+
+
+def _of_one_signal(columns: Sequence[ColumnName], joints: Sequence[str]) -> Sequence[ColumnName]:
+    """Return the columns of one of the signals of a quantity that a log contains for all joints.
+
+    Names of a signal's columns differ only in the words of the joint. Torques are preferred to currents, names with a
+    word such as "actual" to others, and names with few words to longer ones: `tau_J` to `tau_hat_filtered`. All columns
+    are returned if no signal has a column for each joint.
+    """
+    signals: dict[frozenset[str], list[ColumnName]] = {}
+    for column in columns:
+        joint = max((x for x in joints if names_joint(column.name, x)), key=len, default="")
+        signals.setdefault(frozenset(column.words - _column_name(joint, set()).words), []).append(column)
+    complete = [
+        ((bool(words & CURRENT), not words & MEASURED, len(words)), named)
+        for words, named in signals.items()
+        if len(named) >= len(joints)
+    ]
+    return min(reversed(complete), key=itemgetter(0), default=((), columns))[1]
 
 
 def _by_joint(

@@ -42,7 +42,7 @@ class Layout:
         accepted: codes of checks that are omitted.
         recording: name of the recording, if the table contains a single one of several in the file.
         remarks: messages about properties of the file.
-        header: number of lines in a CSV file before the values.
+        header: number of lines before the values; None if the file does not consist of lines.
     """
 
     file: Path
@@ -53,11 +53,11 @@ class Layout:
     accepted: tuple[str, ...]
     recording: str | None = None
     remarks: tuple[str, ...] = ()
-    header: int = 1
+    header: int | None = None
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about the value in a row (counted from 0) and column; for a CSV file also with the line."""
-        line = int(row) + 1 + self.header if self.file.suffix == ".csv" else None
+        """Return an error about the value in a row (counted from 0) and column; for text files also with the line."""
+        line = int(row) + 1 + self.header if self.header is not None else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
 
@@ -104,7 +104,10 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
         if len(numbers) > 1:
             got = f"the same name for the columns {', '.join(numbers)}"
             raise LogError(got, file=file, element=element, expected="it once", do="rename one of them")
-    missing = [x for x in columns if x not in schema.names and not list_element(x, schema.names)]
+    missing = [x for x in columns if not stored_names(x, schema.names)]
+    # Times of evenly spaced rows need no column.
+    if mapping.sample_rate and missing[:1] == columns[:1]:
+        del missing[0]
     if missing:
         raise missing_columns(missing, schema.names, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
@@ -131,14 +134,24 @@ def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
     return match[1], int(match[2])
 
 
+def stored_names(name: str, columns: Collection[str]) -> list[str]:
+    """Return the file's columns from which a column of a mapping is computed; [] if one of them is absent.
+
+    The result is the column itself, a column of lists (see `list_element`), or for a name "sec + nsec" both columns.
+    columns: names of the table's columns.
+    """
+    element = list_element(name, columns)
+    names = [name] if name in columns else [element[0]] if element else name.split(" + ")
+    return names if set(names) <= set(columns) else []
+
+
 def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
     """Return the file's columns that must be read for a layout, each once.
 
     For columns of the layout such as `position[0]` and `position[1]` this is the file's column `position`.
     """
-    elements = [list_element(name, columns) or (name, 0) for name in layout.columns]
     labels = [layout.labels] if layout.labels else []
-    return list(dict.fromkeys([name for name, _ in elements] + labels))
+    return list(dict.fromkeys(chain(*(stored_names(x, columns) for x in layout.columns), labels)))
 
 
 def missing_columns(
@@ -162,6 +175,11 @@ def missing_columns(
         )
     elif mapping.input == "torque" and _are_commands(columns, mapping, joints):
         do = "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
+    elif list(missing) == [mapping.columns.t]:
+        do = (
+            "write its name as 'columns: {t: NAME}' under 'logs' in the robot's YAML, or 'sample_rate: HZ' if there is "
+            "none and the rows are evenly spaced"
+        )
     # Many loggers do not log velocities, which can be computed from the positions.
     elif set(missing) <= set(of_quantity.get("qd", ())):
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -139,6 +139,8 @@ class Trajectory:
         try:
             if hasattr(values, "detach"):  # a tensor may be on another device, or require gradients
                 values = values.detach().cpu()
+            if isinstance(values, np.ma.MaskedArray):  # NumPy would return the values under the mask
+                return np.asarray(np.ma.filled(values.astype(float), np.nan))
             return np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:
             got = f"{type(values).__name__} ({error})"
@@ -181,6 +183,24 @@ def require_joints(trajectory: Trajectory, joints: Sequence[str]) -> None:
     count = trajectory.q.shape[1]
     if count != len(joints):
         raise trajectory.error(f"{count} joints", f"{len(joints)}: {', '.join(joints)}")
+
+
+def recordings(logs: Trajectory | Iterable[Trajectory], joints: Sequence[str]) -> list[Trajectory]:
+    """Return one or several trajectories as a list.
+
+    Raises LogError for other objects, such as paths, for no trajectories, and for a wrong number of joints.
+    """
+    found = [logs] if isinstance(logs, Trajectory) else list(logs)
+    if not found:
+        raise LogError("no trajectory", expected="at least one")
+    for trajectory in found:
+        if not isinstance(trajectory, Trajectory):
+            got = f"{type(logs).__name__} {logs!r:.60}"
+            raise LogError(
+                got, element="logs", expected="trajectories: spelgen.read_logs(PATHS, arm) or Trajectory(...)"
+            )
+        require_joints(trajectory, joints)
+    return found
 
 
 def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 from math import log
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -71,11 +70,17 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     message = f"q that changes {signals.factor:.3g} times as fast as qd"
     if is_far:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
-        if (signals.q == signals.q.round()).all():
+        if signals.is_whole:
             message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
-    distance, keys = min(_unit_readings(signals, is_far), key=itemgetter(0), default=(np.inf, {}))
+    # of readings that differ by rounding only, the unit that loggers use most is the first
+    readings = _unit_readings(signals, is_far)
+    distance, keys = min(readings, key=lambda reading: round(reading[0], 3), default=(np.inf, {}))
     if distance > log(1.25):
-        return message if is_far else None
+        registers = signals.qd / mapping.scale("qd", joint)
+        if is_far or not (registers == registers.round()).all():
+            return message if is_far else None
+        message += ", whole numbers of an unknown unit, such as register values"
+        return Advice(message, keys={"velocity": "differentiated"})
     units = " and ".join(f"{name} in {unit}" for name, unit in keys.get("units", {}).items())
     return Advice(f"{message}: {units}", keys) if keys else None
 
@@ -84,7 +89,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     """Yield (distance, settings of the joint) for all combinations of units of q and qd that the mapping permits.
 
     The distance is |log r|, with r the ratio of dq/dt to qd in these units, plus a penalty for units other than SI.
-    is_far: True if the range of q is more than two turns; combinations with such a range are then omitted.
+    is_far: True if the range of q is more than two turns; combinations in which q exceeds two turns are then omitted.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
     # The ratio r is known only if velocities were logged and are proportional to dq/dt. If it is unknown, only the
@@ -102,7 +107,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
             yield abs(log(signals.factor * ratio)) + 0.01, {"units": {"q": unit}}
     if stated:
         positions = positions[:1]
-    elif is_far and not is_known:
+    elif is_far and (signals.is_whole or not is_known):
         positions = positions[:3]  # milliradians and counts of an encoder have similar ranges
     if not is_known or mapping.unit("qd", joint):
         speeds = speeds[:1]
@@ -110,7 +115,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
         scale = SCALES.get(q, 1.0)
         units = {name: x for name, x in (("q", q), ("qd", qd)) if x in SCALES}
         distance = abs(log(signals.factor * scale / SCALES.get(qd, 1.0))) if is_known else 0.0
-        if not is_far or np.ptp(signals.q) * scale <= TURNS:
+        if not is_far or np.abs(signals.q).max() * scale <= TURNS:
             yield distance + 0.02 * len(units), {"units": units} if units else {}
     for counts in (2 ** np.arange(10, 21)).tolist() if is_known and "turns" in positions else ():
         distance = abs(log(signals.factor * 2 * np.pi / counts)) + 0.02

@@ -11,7 +11,7 @@ import pyarrow.compute
 
 from spelgen.errors import LogError
 from spelgen.logs.jumps import signed
-from spelgen.logs.tables import Layout, list_element
+from spelgen.logs.tables import Layout, list_element, stored_names
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import TIMES
 
@@ -167,8 +167,12 @@ def _numbers(texts: Column) -> np.ndarray:
 def _column(table: pa.Table, name: str) -> Column:
     """Return a column, or for a name like `position[2]` the element 2 of each list in the column `position`.
 
-    A list may also be written as text, such as "[0.1, 0.2]".
+    A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is the sum of these two columns. Row
+    numbers replace absent times, which the mapping's `sample_rate` makes superfluous.
     """
+    stored = stored_names(name, table.schema.names)
+    if len(stored) != 1:
+        return stamps(*map(table.column, stored)) if stored else pa.array(np.arange(len(table), dtype=float))
     element = list_element(name, table.schema.names)
     if element is None:
         return table.column(name)
@@ -182,6 +186,12 @@ def _column(table: pa.Table, name: str) -> Column:
     lists = pa.compute.if_else(long_enough, lists, pa.scalar(None, lists.type))
     elements = pa.compute.list_element(lists, index)
     return pa.compute.replace_substring_regex(elements, "^$", "nan") if is_text else elements
+
+
+def stamps(seconds: Column, nanoseconds: Column) -> Column:
+    """Return times from columns of whole seconds and of the nanoseconds within the second, as ROS stores stamps."""
+    whole = pa.compute.multiply(seconds.cast(pa.int64()), 1_000_000_000)
+    return pa.compute.add(whole, nanoseconds.cast(pa.int64())).cast(pa.duration("ns"))
 
 
 def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray:
@@ -202,6 +212,8 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
                 do = "remove that row"
                 if text.strip() == name:
                     do += ", the header of a second file; joined recordings need a column 'trajectory'"
+                elif re.fullmatch(r"-?\d{1,3}([,.' ]\d{3})+([,.]\d*)?", text):
+                    do = "write numbers without separators of thousands"
                 elif re.match(NUMBER, text):
                     do = "write numbers only, and the unit as 'units' under 'logs' in the robot's YAML"
                 raise layout.row_error(repr(text[:60]), rows[index], name, "a number", do) from error
