@@ -5,6 +5,7 @@ it is then the log without the fault. Inertials of the URDF are 30 % wrong, torq
 """
 
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -245,3 +246,104 @@ def test_a_slow_arm_with_right_torques_is_not_refused(arm):
     tau = rigid + 0.1 * rigid.std(axis=0) * np.sign(qd) + 0.05 * rng.standard_normal(q.shape)
     slow = Trajectory(t, q, np.gradient(q, t, axis=0), tau, "motion")
     assert check_logs([slow], arm).errors == ()
+
+
+def test_gravity_along_all_axes_is_called_compensated(tmp_path):
+    """With both axes horizontal, gravity along the axes gives the same torques as none."""
+    rows = (
+        ("shoulder", "revolute", "base", "0 0 0", "0 1 0", -3, 3, 2),
+        ("elbow", "revolute", "shoulder_link", "0.3 0 0", "0 1 0", -3, 3, 1),
+    )
+    arm = made_arm(tmp_path, rows)
+    error = told(arm, recorded(arm, 5, gravity=0.0))
+    assert "--accept gravity-compensated" in error and "'gravity: [0, 0, 0]' in the robot's YAML" in error
+    assert "or 'gravity" not in error
+
+
+def test_factors_of_torques_that_differ_are_stated_per_joint(robots, tmp_path):
+    arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
+    upright = replace(arm, chain=replace(arm.chain, gravity=(0.0, -9.81, 0.0)))
+    log = recorded(upright, 6)
+    error = told(upright, replace(log, tau=log.tau * [37.0, 11.0]))
+    gains = np.array(list(map(float, re.findall(r"gain: ([\d.e-]+)", error))))
+    assert "--accept torque-unit" in error
+    assert gains[1] / gains[0] == pytest.approx(37 / 11, rel=0.05)  # by the coupling of the joints
+    np.testing.assert_allclose(np.log(gains * [37.0, 11.0]), 0.0, atol=np.log(2))  # by the masses of the URDF
+
+
+ROBOT = """<robot name="made">
+  <link name="base"/>
+  {joints}
+</robot>"""
+JOINT = """<joint name="{name}" type="{kind}">
+    <parent link="{parent}"/><child link="{name}_link"/><origin xyz="{xyz}"/><axis xyz="{axis}"/>
+    <limit lower="{lower}" upper="{upper}" effort="0" velocity="0"/>
+  </joint>
+  <link name="{name}_link"><inertial><mass value="{mass}"/><origin xyz="0.15 0.01 -0.02"/>
+    <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
+def made_arm(folder, rows):
+    fields = ("name", "kind", "parent", "xyz", "axis", "lower", "upper", "mass")
+    joints = "\n  ".join(JOINT.format(**dict(zip(fields, row, strict=True))) for row in rows)
+    (folder / "made.urdf").write_text(ROBOT.format(joints=joints))
+    return load_arm(folder / "made.urdf")
+
+
+@pytest.fixture(scope="module")
+def lift(tmp_path_factory):
+    """Return an arm whose first joint moves along gravity."""
+    rows = (
+        ("slide", "prismatic", "base", "0 0 0", "0 0 1", 0, 0.4, 3),
+        ("shoulder", "revolute", "slide_link", "0.1 0 0", "0 0 1", -3, 3, 2),
+        ("elbow", "revolute", "shoulder_link", "0.3 0 0", "0 0 1", -3, 3, 1),
+    )
+    return made_arm(tmp_path_factory.mktemp("lift"), rows)
+
+
+def lifting(arm, rng):
+    t, q = excitation(arm, rng)
+    low, high = q[:, 0].min(), q[:, 0].max()
+    q[:, 0] = 0.02 + 0.36 * (q[:, 0] - low) / (high - low)
+    return t, q
+
+
+def hysteresis(q, breakaway):
+    """Return the normalised friction torque (T, n) of one bristle per joint that slips at this deflection [rad, m]."""
+    z = np.zeros_like(q)
+    for k in range(1, len(q)):
+        z[k] = np.clip(z[k - 1] + (q[k] - q[k - 1]) / breakaway, -1, 1)
+    return z
+
+
+@pytest.mark.parametrize("seed", [0, 1, 5])
+def test_presliding_hysteresis_does_not_hide_exchanged_joints(seed, robots, tmp_path):
+    """The friction of each joint has a hysteresis of 0.05 rad, which is 1.5 % of the torque under both orders."""
+    arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
+    log = recorded(arm, seed, noise=0.005)
+    log = replace(log, tau=log.tau + 0.3 * log.tau.std(axis=0) * hysteresis(log.q, 0.05))
+    assert check_logs([log], arm).errors == ()
+    error = told(arm, replace(log, q=log.q[:, ::-1], qd=log.qd[:, ::-1], tau=log.tau[:, ::-1]))
+    assert "{columns: {q: q_joint2, qd: qd_joint2, tau: tau_joint2}}" in error
+    assert "delay" not in error
+
+
+def lifted(arm):
+    """Return a log with friction that has a hysteresis of 0.05 m and 0.05 rad."""
+    log = recorded(arm, 0, lifting)
+    return replace(log, tau=log.tau + 0.7 * log.tau.std(axis=0) * hysteresis(log.q, 0.05))
+
+
+def test_a_lift_whose_position_runs_the_other_way_is_named(lift):
+    """The load by gravity is the same in both senses: limits and friction are the evidence."""
+    log = lifted(lift)
+    assert check_logs([log], lift).errors == ()
+    assert "'joints: {slide: {sign: -1, gain: -1}}'" in told(lift, flipped(log, 0, True, False))
+
+
+def test_an_order_with_a_prismatic_joint_is_named(lift):
+    log, order = lifted(lift), [1, 2, 0]
+    error = told(lift, replace(log, q=log.q[:, order], qd=log.qd[:, order], tau=log.tau[:, order]))
+    for joint, source in (("slide", "elbow"), ("shoulder", "slide"), ("elbow", "shoulder")):
+        assert f"{joint}: {{columns: {{q: q_{source}, qd: qd_{source}, tau: tau_{source}}}}}" in error
+    assert "delay" not in error

@@ -332,6 +332,22 @@ def test_a_velocity_that_is_no_derivative_is_a_warning():
     assert note.message == "qd is not dq/dt: the best factor is 0.769, the correlation 1"
 
 
+@pytest.mark.parametrize(
+    ("matrix", "formula"),
+    [
+        ([[1, 1], [0, 1]], "dq/dt of joint 'a' + dq/dt of joint 'b'"),
+        ([[1, 0.3], [0, 1]], None),
+        ([[1, 0], [0.5, -0.5]], "0.5 dq/dt of joint 'a' -0.5 dq/dt of joint 'b'"),
+    ],
+)
+def test_a_velocity_of_the_motors_of_a_coupled_wrist_is_named(matrix, formula):
+    log = swing()
+    notes = check([replace(log, qd=log.qd @ np.transpose(matrix))], JOINTS, ("revolute", "revolute"))
+    assert [x.code for x in notes if formula] == ["velocity-is-no-derivative"] * bool(formula)
+    assert all(("of a coupled wrist" in x.message) == bool(formula) for x in notes)
+    assert formula is None or f"it is {formula}: " in notes[0].message
+
+
 def test_times_that_contradict_all_velocities_get_the_rate_of_the_velocities(tmp_path):
     """Frames recorded at 100 Hz and stamped with another rate: the line in the error gives the velocities back."""
     sound = swing()

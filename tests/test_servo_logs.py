@@ -69,12 +69,20 @@ def test_the_command_prints_the_report(arm, logs, tmp_path):
     [
         ({"u": lambda x: np.degrees(x.u)}, r"joint 'shoulder': got positions that move 0\.016\d* times as far as"),
         ({"u": lambda x: -x.u}, r"joint 'elbow': got positions that move against commands \(correlation -1"),
-        ({"u": lambda x: x.u[:, ::-1]}, "joint 'shoulder': got a command that joint 'elbow' follows, and this one"),
+        ({"u": lambda x: np.diff(x.u, axis=0, prepend=x.u[:1])}, r"'elbow': got increments: the position follows"),
     ],
 )  # fmt: skip
 def test_commands_that_cannot_be_these_are_errors(arm, logs, columns, text):
     found = spelgen.check_logs(changed(logs, **columns), arm)
     assert any(re.search(text, str(each)) for each in found.errors)
+
+
+def test_exchanged_commands_are_one_error_with_one_line(arm, logs):
+    exchanged = changed(logs, u=lambda x: x.u[:, ::-1])
+    (error,) = map(str, spelgen.check_logs(exchanged, arm).errors)
+    assert error.startswith("joint 'shoulder', 'elbow': got commands that other joints follow")
+    line = "joints: {shoulder: {columns: {u: u_elbow}}, elbow: {columns: {u: u_shoulder}}}"
+    assert f"write '{line}' under 'logs'" in error
 
 
 def only(column, values):
@@ -96,6 +104,7 @@ def only(column, values):
         ({"u": only(1, lambda x: np.roll(x.u, 500, axis=0))}, "not-following"),
         ({"u": lambda x: np.concatenate([x.u[:1].repeat(10, axis=0), x.u[:-10]])}, "ahead-of-command"),
         ({"u": lambda x: x.u + 3.0}, "beyond-position-limit"),
+        ({"u": lambda x: x.u + np.radians([0, 20])}, "command-offset"),
     ],
 )
 def test_anomalous_commands_are_reported(arm, logs, columns, code):

@@ -7,11 +7,13 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from spelgen.arm.arm import Chain
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
 from spelgen.identification.log_faults import Correction, Fault
 from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.joint_signals import plain_number
 from spelgen.settings.log_mapping import SCALES
 
@@ -188,6 +190,33 @@ class TorqueUnit(WrongScale):
     needed = 0.0
     evidence = "by the URDF's gravity"
 
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the fits with each candidate, and with a factor of its own for each joint if the factors differ."""
+        if self in base.hypothesis.faults or not self.factors:
+            return
+        fits = list(super().fits(problem, base))
+        yield from fits
+        best = lowest = min(fits, key=lambda fit: fit.cost)
+        is_open = np.any(
+            [factor[1] != 1 for factor in self.factors], axis=0
+        )  # not of a unit that is declared
+        # the couplings of the joints show the ratios of the factors, and the URDF's masses a common factor
+        for joints in (*np.eye(len(is_open))[is_open], 1.0 * is_open):
+            exponent = minimize_scalar(
+                lambda x, fit=best, joints=joints: self._scaled(problem, fit, np.exp(x * joints)).cost,
+                bounds=(-np.log(10), np.log(10)), method="bounded", options={"xatol": 0.05},
+            ).x  # fmt: skip
+            best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
+        # such factors also correct errors of the URDF's masses, and so lower the cost a little
+        if best.cost < lowest.cost - GEOMETRY.needed:
+            yield best
+
+    def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
+        """Return the fit with torques that are multiplied by further factors (n,), rounded to two digits in all."""
+        (motion, torque), present = fit.hypothesis.scale, problem.unchanged.scale[1]
+        rounded = np.array([float(f"{x:.2g}") for x in torque * factors / present])
+        return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * present])))
+
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints whose torque has another unit."""
         return np.asarray(np.abs(torque) != 1)
@@ -199,7 +228,10 @@ class TorqueUnit(WrongScale):
         senses = (JointSense, TorqueSense)
         is_reversed = largest < 0 and not any(isinstance(x, senses) for x in correction.hypothesis.faults)
         sense = " and of the opposite sense" if is_reversed else ""
-        return f"torques of another unit{sense}, {abs(1 / largest):.3g} times as large"
+        times = f"{abs(1 / largest):.3g} times as large"
+        if np.ptp(np.abs(torque[torque != 1])):
+            times = f"by another factor at each joint, up to {times}"
+        return f"torques of another unit{sense}, {times}"
 
     def minor_code(self, correction: Correction) -> str:
         """Return a code for factors between 0.1 and 10; inertials of a URDF are never wrong by a factor of ten."""

@@ -273,7 +273,8 @@ class Gravity(Compensation):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield the fit with the best direction of gravity; directions along the axes of the root link are preferred.
 
-        A direction is omitted if it differs from the present one by less than calibration errors.
+        A direction is omitted if it differs from the present one by less than calibration errors, or if the torques may
+        contain no gravity.
         """
         present = np.array(base.hypothesis.gravity)
         size = float(np.linalg.norm(present))
@@ -301,7 +302,10 @@ class Gravity(Compensation):
                 )
             )
         new, best = min(descents, key=lambda x: x[1].cost)
-        if np.linalg.norm(new - present) > GEOMETRY.min_angle * size:
+        # Without gravity the torques are the same as with gravity along the axes of all joints. Gravity along -z is the
+        # nearest explanation of this, other directions are less likely than a compensation.
+        is_likely = start is starts[0] or best.cost < problem.fit(turned(np.zeros(3))).cost - 1.0
+        if is_likely and np.linalg.norm(new - present) > GEOMETRY.min_angle * size:
             nearest = np.linalg.norm(new) * np.sign(new) * (np.abs(new) == np.abs(new).max())
             axis = problem.fit(turned(nearest))
             is_axis = axis.cost < best.cost + GEOMETRY.right_angle

@@ -3,7 +3,8 @@
 A hypothesis is a change of the log's signals or of the arm's gravity that settings can express. The cost of a
 hypothesis is the negative log posterior of the torques, minimised over inertial parameters, friction and the noise of
 each joint. Between hypotheses that explain the torques equally well, the following terms decide: the prior of the
-inertial parameters at the URDF, and penalties for negative rotor inertia and for friction that drives the motion.
+inertial parameters at the URDF, and penalties for negative rotor inertia, for friction that drives the motion, and for
+positions beyond the limits of the joints.
 """
 
 from __future__ import annotations
@@ -146,7 +147,8 @@ class GeometryProblem:
         is reweighted in each iteration.
         """
         rows, normal = self.equations(hypothesis)
-        tau = hypothesis.signals(self.samples).tau
+        signals = hypothesis.signals(self.samples)
+        tau = signals.tau
         tau = tau if self._counted is None else tau * self._counted[..., 0]
         right = (tau.T[:, None] @ rows.swapaxes(0, 1))[:, 0]
         total = np.square(tau).sum(axis=0)
@@ -167,9 +169,8 @@ class GeometryProblem:
             scale = 2 * freedom / (freedom + distance)
         covariance = inverse(matrix)
         misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
-        cost = (
-            misfit + freedom * float(np.log1p(distance / freedom)) + self._implausible(x, covariance, normal)
-        )
+        cost = misfit + freedom * float(np.log1p(distance / freedom))
+        cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
@@ -226,6 +227,22 @@ class GeometryProblem:
                 break
             values, fit = new, best
         return values, fit
+
+    def _beyond_limits(self, q: np.ndarray) -> float:
+        """Return the penalty for positions q (S, n) beyond the position limits: at most 15 for each joint.
+
+        Limits of a URDF may be wrong, and zeros may be calibrated badly: the penalty is proportional to the distance
+        beyond the limits up to half of the range between them. Whole turns of revolute joints are no matter.
+        """
+        penalty = 0.0
+        for coordinate, low, high in zip(self.arm.coordinates, q.min(axis=0), q.max(axis=0), strict=True):
+            lower, upper = coordinate.limits or (0.0, 0.0)
+            if not 0 < upper - lower < 1e3:  # equal or huge limits are no limits
+                continue
+            turns = 2 * np.pi * np.arange(-1, 2) * (coordinate.joint_type == "revolute")
+            distance = np.maximum(high + turns - upper, lower - low - turns).min()
+            penalty += 15.0 * float(np.clip(2 * distance / (upper - lower), 0.0, 1.0))
+        return penalty
 
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the penalty for negative rotor inertias, and for friction that drives the motion on average.

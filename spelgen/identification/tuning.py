@@ -57,12 +57,16 @@ class LogGeometryTuning:
     # Smallest cost decrease of an accepted hypothesis. On recorded arms the largest decrease of a wrong hypothesis
     # is 16.
     needed: float = 20.0
+    # Smallest cost decrease without hysteresis of a hypothesis that is accepted for its decrease with hysteresis.
+    slight: float = 3.0
+    # [1] Number of the best hypotheses that are also compared with hysteresis.
+    weighed: int = 10
     # Cost difference up to which two hypotheses count as equally good, and are both reported.
     ambiguous: float = 8.0
     # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which a log is probably in another order.
-    unexplained: float = 0.3
+    unexplained: float = 0.15
     # [1] Largest number of samples for the comparison of all hypotheses.
     coarse_samples: int = 200
     # [1] Largest number of samples for the final comparison of the best hypotheses.

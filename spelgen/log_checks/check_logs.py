@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.log_checks.check_torque_logs import COUPLED, CURRENT, WRONG_LINK, TorqueLogs
+from spelgen.log_checks.check_torque_logs import COUPLED, CURRENT, WITHOUT_GRAVITY, WRONG_LINK, TorqueLogs
 from spelgen.log_checks.geometry_finding import WARNINGS
 from spelgen.log_checks.limits_in_logs import AT_A_STOP
 from spelgen.log_checks.report import LogReport, joint_report
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from spelgen.log_checks.check_servo_logs import ServoLogs
     from spelgen.settings.log_mapping import LogMapping
 
-ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, CURRENT, WRONG_LINK, AT_A_STOP, *WARNINGS}
+ABOUT_ARM = {COUPLED, CURRENT, WITHOUT_GRAVITY, WRONG_LINK, AT_A_STOP, *WARNINGS} | {x.code for x in CHECKS}
 
 
 def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None = None) -> LogReport:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError
+from spelgen.labels import UNITS
 from spelgen.listing import Listing, number
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
@@ -30,6 +31,9 @@ DELAYS = np.linspace(-0.1, 0.4, 51).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # [1] fewest samples of a gap-free piece, which the smoothing polynomial needs
 FOLLOWS = SIGNALS.agreement
+OTHER_ZERO = (
+    0.17  # [rad, m] constant distance of commands from positions; servos deviate less under their load
+)
 # Encoders of bus servos have 2**k counts per turn, with k from 10 to 14. Positions therefore have the same quantisation
 # step at all joints: 360/2**k degrees, or 360/(2**k - 1) with LeRobot. LeRobot's normalised positions have another step
 # at each joint: 200 divided by the counts of the joint's calibrated range.
@@ -100,6 +104,7 @@ class Following(NamedTuple):
         correlation: (n, n) correlation of the command of joint i (row) with the position of joint j (column), at this
             delay.
         gain: (n,) amplitude of a joint's motion divided by the amplitude of the joint's command.
+        offset: (n,) [rad, m] mean of u - q; 0 if u - q varies more than that, as for joints that carry a load.
         joints: tracking errors and lag of each joint.
     """
 
@@ -107,6 +112,7 @@ class Following(NamedTuple):
     delay: np.ndarray
     correlation: np.ndarray
     gain: np.ndarray
+    offset: np.ndarray
     joints: list[JointFollowing]
 
 
@@ -142,7 +148,11 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
         fraction = float(saturated[k]) if np.isfinite(saturation[k]) else None
         joints.append(JointFollowing(lag, float(tracking_rms[delay_index][k]), error, fraction))
     gain = correlation.diagonal() * q_std / np.maximum(u_std, 1e-6)
-    return Following(moves, DELAYS[best], correlation, gain, joints)
+    difference = commands - q
+    offset = np.where(
+        2 * difference.std(axis=0) < np.abs(difference.mean(axis=0)), difference.mean(axis=0), 0.0
+    )
+    return Following(moves, DELAYS[best], correlation, gain, offset, joints)
 
 
 def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
@@ -203,20 +213,27 @@ class ServoLogs:
         if following is None:
             message = f"no {FILTER_SAMPLES} samples without a gap: no servo is determined"
             summary.notes.append(Diagnostic("warning", "idle-command", "logs", None, message))
+        exchanged, summed = list[int](), following
+        if following is not None and (following.correlation.diagonal() < FOLLOWS).any():
+            exchanged = _exchanged_commands(following)
+            if exchanged:
+                summary.errors.append(_exchange_error(exchanged, names, following, mapping))
+            sums = [x.q[0] + np.cumsum(require_commands(x), axis=0).clip(-1e6, 1e6) for x in self._logs]
+            logs = [replace(log, u=u) for log, u in zip(self._logs, sums, strict=True)]
+            summed = measure_following(logs, saturation)
         completed = []
         for k, (coordinate, report) in enumerate(zip(self._arm.chain.coordinates, reports, strict=True)):
-            odd = None
             if following is not None:
                 report = replace(report, following=following.joints[k])
-                # True if the logger wrote measured positions in place of commands
-                is_copy = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in self._logs)
-                odd = _odd_command(k, names, report, following, is_copy, mapping)
             completed.append(report)
-            if isinstance(odd, LogError):
-                summary.errors.append(odd)
+            if k in exchanged:
                 continue
-            if odd is not None:
-                summary.notes.append(odd)
+            if following is not None and summed is not None:
+                wrong = _command_error(k, report, following, summed.correlation[k, k])
+                if wrong is not None:
+                    summary.errors.append(wrong)
+                    continue
+                summary.notes.extend(_command_warning(k, report, following, self._logs))
             for check, found in run_checks(POSITION_CHECKS, JointEvidence(coordinate, report)):
                 summary.add(check, found.message, f"joint {coordinate.name!r}")
         for log in self._logs:
@@ -243,58 +260,75 @@ class ServoLogs:
             summary.add(check, finding.message, "all joints", keys=finding.keys)
 
 
-def _odd_command(
-    k: int,
-    joints: Sequence[str],
-    report: JointReport,
-    following: Following,
-    is_copy: bool,
-    mapping: LogMapping,
-) -> LogError | Diagnostic | None:
-    """Return the finding about the logged command of joint k, or None.
+def _exchanged_commands(following: Following) -> list[int]:
+    """Return the joints whose commands other joints track."""
+    is_tracked = following.moves & (following.correlation > FOLLOWS).any(axis=1)
+    return np.flatnonzero(is_tracked & (following.correlation.diagonal() < 0.5)).tolist()
 
-    The finding is an error if the column cannot contain the commands of this joint, otherwise a warning. is_copy: True
-    if the logged command equals the logged position in all samples.
+
+def _exchange_error(
+    exchanged: Sequence[int], joints: Sequence[str], following: Following, mapping: LogMapping
+) -> LogError:
+    """Return the error about joints whose commands other joints track, with the columns that these joints track."""
+    entries = {}
+    for k in exchanged:
+        for source in np.flatnonzero(following.correlation[:, k] > FOLLOWS)[:1].tolist():
+            entries[joints[k]] = {"columns": {"u": mapping.column("u", joints[source])}}
+    do = mapping_line({"joints": entries}) if entries else "check the names of the columns"
+    where = f"joint {', '.join(repr(joints[k]) for k in exchanged)}"
+    got = "commands that other joints follow, and these do not"
+    return LogError(got, element=where, expected="their own commands", do=do)
+
+
+def _command_error(k: int, report: JointReport, following: Following, of_sum: float) -> LogError | None:
+    """Return the error that the column cannot contain the commands of joint k; None if it can.
+
+    of_sum: correlation of the sum of the commands with the position.
     """
-    where = f"joint {joints[k]!r}"
     # correlation and gain at the delay with the largest correlation, so that a slow servo is not reported as a fault
     correlation, gain = following.correlation[k, k], following.gain[k]
-    if is_copy:
-        code, message = (
-            "commands-are-positions",
-            "u is q, to the last bit: are the commands those that were sent?",
-        )
     # a ratio of amplitudes of about 57.3 or 1/57.3 shows that the command or the position is in degrees
-    elif correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
+    if correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         units = {"q": "deg", "u": "rad"} if gain > 1 else {"q": "rad", "u": "deg"}
-        do = mapping_line({"joints": {joints[k]: {"units": units}}})
-        return LogError(got, element=where, expected="both in radians", do=do)
-    # a constant command contains no information on the servo
+        expected, do = "both in radians", mapping_line({"joints": {report.name: {"units": units}}})
+    elif of_sum > FOLLOWS > correlation:
+        got = f"increments: the position follows the sum of the commands (correlation {of_sum:.2g})"
+        expected, do = "commanded positions", "log the commanded positions, or add the increments up"
+    elif following.moves[k] and correlation < -FOLLOWS:
+        got = f"positions that move against commands (correlation {correlation:.2g})"
+        expected = "one sense"
+        do = "multiply the column of u or that of q by -1: the setting 'sign' applies to both"
+    else:
+        return None
+    return LogError(got, element=f"joint {report.name!r}", expected=expected, do=do)
+
+
+def _command_warning(
+    k: int, report: JointReport, following: Following, logs: Sequence[Trajectory]
+) -> Iterator[Diagnostic]:
+    """Yield the warning that the logged command of joint k may not be the command that its servo tracks."""
+    correlation, offset, delay = following.correlation[k, k], following.offset[k], following.delay[k, k]
+    if all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs):
+        # the logger wrote measured positions in place of commands
+        code = "commands-are-positions"
+        message = "u is q, to the last bit: are the commands those that were sent?"
     elif not following.moves[k]:
+        # a constant command contains no information on the servo
         width = report.high["u"] - report.low["u"]
         code, message = "idle-command", f"its command moves by only {width:.3g}: its servo is not determined"
-    elif correlation < -FOLLOWS:
-        got = f"positions that move against commands (correlation {correlation:.2g})"
-        return LogError(got, element=where, expected="one sense", do="check the signs of q and u")
     elif correlation < 0.5:
-        # if another joint follows this command, the columns of the log are swapped
-        for other, name in enumerate(joints):
-            if following.correlation[k, other] > FOLLOWS:
-                got = f"a command that joint {name!r} follows, and this one does not"
-                do = "check the names of the columns"
-                for source in np.flatnonzero(following.correlation[:, k] > FOLLOWS)[:1].tolist():
-                    do = mapping_line(
-                        {"joints": {joints[k]: {"columns": {"u": mapping.column("u", joints[source])}}}}
-                    )
-                return LogError(got, element=where, expected="its own command", do=do)
         code, message = "not-following", f"it does not follow its command (correlation {correlation:.2g})"
-    elif following.delay[k, k] >= 0:
-        return None
+    elif abs(offset) > OTHER_ZERO:
+        side = f"{UNITS[report.kind].position} {'above' if offset > 0 else 'below'} its position throughout"
+        code = "command-offset"
+        message = f"its command is {abs(offset):.3g} {side}: other zeros of q and u, or a servo too soft for its load"
+    elif delay < 0:
+        code = "ahead-of-command"
+        message = f"positions come {-1000 * delay:.0f} ms before commands: are rows shifted?"
     else:
-        early = f"{-1000 * following.delay[k, k]:.0f} ms"
-        code, message = "ahead-of-command", f"positions come {early} before commands: are rows shifted?"
-    return Diagnostic("warning", code, where, None, message)
+        return
+    yield Diagnostic("warning", code, f"joint {report.name!r}", None, message)
 
 
 def _following_table(joints: Sequence[JointReport]) -> Listing:

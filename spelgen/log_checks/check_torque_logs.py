@@ -27,9 +27,7 @@ from spelgen.log_checks.report import JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import (
     CHECKS,
     TUNING,
-    WITHOUT_GRAVITY,
     JointEvidence,
-    find_no_gravity,
     fit_gravity,
     rounded_factor,
     torque_factors,
@@ -46,7 +44,7 @@ if TYPE_CHECKING:
     from spelgen.settings.log_mapping import LogMapping
 
 COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
-CURRENT = "current-without-gain"
+CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
 
 
 class TorqueLogs:
@@ -98,13 +96,12 @@ class TorqueLogs:
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         moving = self._moving.samples()
-        weightless: list[JointEvidence] = []
         if is_sound:
             # with unknown motor gains a wrong hypothesis about the log may have the lowest cost
             problem = None if unscaled else self._problem(moving, motion)
             is_right = problem is None or self._check_geometry(problem, evidence, accepted, summary)
-            if problem is not None and is_right:
-                weightless = _without_gravity(problem, evidence)
+            if problem is not None and is_right and WITHOUT_GRAVITY not in accepted:
+                summary.notes.extend(_without_gravity(problem, completed))
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
         has_errors, faults = bool(summary.errors), dict[Check[JointEvidence], dict[str, str]]()
@@ -113,10 +110,6 @@ class TorqueLogs:
             # if the log has an error, torques beyond the limits of the drive are a consequence of the same fault
             if has_errors:
                 passed.add("torque-beyond-drive")
-            # If the masses of a joint are wrong in the URDF, its torque may also be uncorrelated with the URDF's
-            # gravity: only joints whose torques fit better without gravity are reported.
-            if joint not in weightless:
-                passed.add(WITHOUT_GRAVITY)
             for check, found in run_checks(CHECKS, joint, passed):
                 if check.severity == "error":
                     faults.setdefault(check, {})[joint.coordinate.name] = found.message
@@ -245,21 +238,25 @@ class TorqueLogs:
             summary.notes.extend(late.notes)
 
 
-def _without_gravity(problem: GeometryProblem, joints: Sequence[JointEvidence]) -> list[JointEvidence]:
-    """Return the joints whose torques fit better without gravity than with gravity and masses near the URDF's."""
-    suspicious = [k for k, joint in enumerate(joints) if find_no_gravity(joint)]
-    if not suspicious:
-        return []
+def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) -> Iterator[Diagnostic]:
+    """Yield a warning for each joint whose torque contains no gravity.
+
+    Its torque is uncorrelated with the gravity torque of the URDF and, since wrong masses also lower this correlation,
+    fits better without gravity than with gravity and masses near the URDF's.
+    """
     problem = problem.thinned(GEOMETRY.confirming_samples)
-    fit = problem.fit(problem.unchanged)
-    confirmed = []
-    for k in suspicious:
-        cost = problem.without_gravity(k).fit(problem.unchanged).cost
-        # A torque without gravity is reported if the model without gravity has the lower cost, or if the residual of
-        # the model with gravity has more than 10 % of the torque's variance.
-        if fit.errors[k] > 0.1 or cost < fit.cost:
-            confirmed.append(joints[k])
-    return confirmed
+    for k, joint in enumerate(joints):
+        deviation, correlation = joint.gravity.relative_deviation or 0.0, joint.gravity.correlation
+        if correlation is None or deviation < TUNING.visible or abs(correlation) > 1 - TUNING.seen:
+            continue
+        fit = problem.fit(problem.unchanged)
+        # without any suitable model, a residual of more than 10 % of the torque's variance is enough
+        if fit.errors[k] > 0.1 or problem.without_gravity(k).fit(problem.unchanged).cost < fit.cost:
+            message = (
+                f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity "
+                f"torque varies {deviation:.2g} times as much as tau"
+            )
+            yield Diagnostic("warning", WITHOUT_GRAVITY, f"joint {joint.name!r}", None, message)
 
 
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:

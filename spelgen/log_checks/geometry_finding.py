@@ -54,4 +54,4 @@ def _evidence(before: float, after: float) -> str:
     """Return a sentence that compares squared torque residuals, relative to the variance of the torques."""
     if after < 0.9 * before:
         return f"the squared torque error of least squares falls from {before:.2%} to {after:.2%} of the variance"
-    return "the torque error of least squares remains the same, with plausible masses, rotor inertias and friction"
+    return "the torque error of least squares remains the same, with plausible positions, masses, inertias and friction"

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from math import inf, nan
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +19,6 @@ from spelgen.logs.checks import Check
 from spelgen.logs.trajectory import QUANTITIES
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
-WITHOUT_GRAVITY = "torque-without-gravity"
 SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' confirms the unit"
 
 
@@ -110,16 +109,6 @@ class JointEvidence(NamedTuple):
         if self.coordinate.continuous:
             lower = upper = None
         return -inf if lower is None else lower, inf if upper is None else upper
-
-    def gravity_in_torque(self) -> tuple[float, float]:
-        """Return the ratio of the torque to the URDF's gravity torque, and their correlation.
-
-        Both are NaN for a joint whose gravity torque is too small.
-        """
-        fit = self.report.gravity
-        if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < TUNING.visible:
-            return nan, nan  # every comparison with NaN is false
-        return fit.factor, fit.correlation
 
 
 def find_beyond_limits(joint: JointEvidence) -> str | None:
@@ -225,17 +214,6 @@ def find_one_way(joint: JointEvidence) -> str | None:
     )
 
 
-def find_no_gravity(joint: JointEvidence) -> str | None:
-    """Find torques that are not correlated with the gravity torque of the URDF."""
-    correlation = joint.gravity_in_torque()[1]
-    if not abs(correlation) < 1 - TUNING.seen:  # NaN included
-        return None
-    return (
-        f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity torque "
-        f"varies {joint.report.gravity.relative_deviation:.2g} times as much as tau"
-    )
-
-
 # checks that need no torques, and therefore also apply to arms under position servos
 POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
 CHECKS: list[Check[JointEvidence]] = [
@@ -245,5 +223,4 @@ CHECKS: list[Check[JointEvidence]] = [
     Check("beyond-effort-limit", "warning", partial(find_above, "effort", "tau")),
     Check("coarse", "warning", find_coarse),
     Check("one-way", "warning", find_one_way),
-    Check(WITHOUT_GRAVITY, "warning", find_no_gravity),
 ]

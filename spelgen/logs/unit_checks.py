@@ -187,7 +187,8 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     if correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance:
         lag = _velocity_lag(signals)
         if abs(lag) < SIGNALS.longest_lag:
-            return None
+            text = _velocity_sum(signals) if correlation < 0.99 else ""
+            return f"qd is not dq/dt{text}" if text else None
         order = "later" if lag > 0 else "earlier"
         return Advice(
             f"qd that is {1e3 * abs(lag):.3g} ms {order} than dq/dt", keys={"velocity": "differentiated"}
@@ -209,7 +210,23 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     if correlations[k, k] > SIGNALS.agreement and abs(factors[k] - 1) < 0.5:
         columns = {"q": mapping.column("qd", signals.joint), "qd": mapping.column("q", signals.joint)}
         return Advice(f"{message}; q is the derivative of qd", {"columns": columns})
-    return message
+    return message + _velocity_sum(signals)
+
+
+def _velocity_sum(signals: JointSignals) -> str:
+    """Return a text if the joint's qd is a sum or difference of dq/dt of several joints, as at a coupled wrist."""
+    products = velocity_products(signals.trajectory)
+    n, power = len(signals.joints), products[signals.number, signals.number]
+    gram, target = products[n:, n:], products[n:, signals.number]
+    # coefficients of a differential are -1, -1/2, 0, 1/2 and 1
+    factors = np.round(2 * np.linalg.lstsq(gram, target, rcond=1e-9)[0]) / 2
+    terms = np.flatnonzero(factors).tolist()
+    residual = power - 2 * factors @ target + factors @ gram @ factors
+    if len(terms) < 2 or np.abs(factors).max() > 1 or residual > (1 - SIGNALS.agreement) ** 2 * power:
+        return ""
+    texts = [f"{factors[k]:+g} dq/dt of joint {signals.joints[k]!r}".replace("1 dq", " dq") for k in terms]
+    formula = " ".join(texts).removeprefix("+").strip()
+    return f"; it is {formula}: one of both is that of the motors of a coupled wrist; log both at the joints"
 
 
 def _velocity_lag(signals: JointSignals) -> float:
