@@ -21,6 +21,7 @@ from spelgen.emission.specify import generate
 from spelgen.fitting.fit import fit, load_run
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TorqueJacobian
+from spelgen.fitting.torque.parameters import set_initial_gains
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.identification import torque_delay
 from spelgen.identification.drive_hints import Coupling
@@ -309,20 +310,41 @@ def test_logs_of_plain_drives_suggest_nothing(uncoupled):
     assert not codes & {"coupled-motors", "torque-delay"}
 
 
+def trained_gains(tmp_path, names):
+    """A closed-form model of six_dof.urdf whose settings state no gears; all gains are trained."""
+    shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
+    joints = ", ".join(f"{x}: {{gear: 1, gain: trained}}" for x in names)
+    (tmp_path / "arm.yaml").write_text(f"torque: motor\njoints: {{{joints}}}\n", encoding="utf-8")
+    return build(tmp_path / "arm.urdf", "closed-form")
+
+
 def test_gains_of_currents_are_found(uncoupled, tmp_path):
     """Torques logged in one unit per joint: the gains are estimated together with bodies, friction and rotors."""
     gains = np.array([1.5, 0.7, 1.3, 0.8, 1.2, 0.9])
     logs = [recorded(uncoupled, "joints", 0.0)]
-    shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
-    names = [x.name for x in uncoupled.chain.coordinates]
-    sidecar = (
-        "torque: motor\njoints: {" + ", ".join(f"{x}: {{gear: 1, gain: trained}}" for x in names) + "}\n"
-    )
-    (tmp_path / "arm.yaml").write_text(sidecar, encoding="utf-8")
-    model = build(tmp_path / "arm.urdf", "closed-form")
+    model = trained_gains(tmp_path, uncoupled.chain.joint_names)
     samples = dynamics_samples([replace(x, tau=x.tau / gains) for x in logs])
     fit_torque(model, samples)
     with torch.no_grad():
         found = model.input_matrix(torch.zeros(6).double()).diagonal().numpy()
     np.testing.assert_allclose(found / gains, 1.0, atol=0.15)
     assert np.abs(np.log(found)).max() > 0.2  # they did not stay where they started
+
+
+def test_initial_gains_that_are_far_off_are_replaced(uncoupled, tmp_path):
+    """Gains of 40 Nm/A in place of 1; joint 1 is at rest and has the median of the others, joint 6 has 1.2."""
+    gains = np.array([40.0, 42.0, 36.0, 44.0, 40.0, 1.2])
+    log = recorded(uncoupled, "joints", 0.0)
+    model = trained_gains(tmp_path, uncoupled.chain.joint_names)
+    (whole,) = dynamics_samples([replace(log, tau=log.tau / gains)])
+    still = whole.q * [0, 1, 1, 1, 1, 1], whole.qd * [0, 1, 1, 1, 1, 1], whole.qdd * [0, 1, 1, 1, 1, 1]
+    tau = whole.tau.copy()
+    tau[:, 0] = 0.0
+    samples = TorqueSamples.of([DynamicsSamples("still", *still, tau)], 2)
+    set_initial_gains(model, samples, 0.3)
+    with torch.no_grad():
+        found = model.input_matrix(torch.zeros(6).double()).diagonal().numpy()
+    # the masses of the URDF are not the robot's
+    np.testing.assert_allclose(found[1:5] / gains[1:5], 1.0, atol=0.35)
+    assert found[0] == pytest.approx(np.median(found[1:5]), rel=0.3)
+    assert found[5] == 1.0

@@ -134,8 +134,8 @@ def _model_class(base: str) -> Callable[..., ArmModel]:
 
 def _without_state(base: str) -> ArmModel:
     """Return a model without attributes, which unpickling adds. base: name of the base class."""
-    made = cast("type[ArmModel]", _model_class(base))
-    return made.__new__(made)
+    model_class = cast("type[ArmModel]", _model_class(base))
+    return model_class.__new__(model_class)
 
 
 def _value(item: object, names: dict[str, object]) -> object:

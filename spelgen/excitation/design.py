@@ -69,12 +69,7 @@ def excite(
     ranges = arm.robot.joint, arm.settings.simulation.positions
     limits = motion_bounds(arm.chain, 1.0, 1.0, *ranges)
     bounds = motion_bounds(arm.chain, reach, speed, *ranges)
-    # `strongest` is the acceleration limit of the approach. If it is not given, the approach reaches its largest speed
-    # in one second.
-    strongest = bounds.speed
-    if acceleration is not None:
-        strongest = _joint_values("acceleration", acceleration, arm.chain, positive=True)
-        bounds = replace(bounds, acceleration=strongest)
+    bounds, strongest = _accelerated(bounds, acceleration, arm.chain)
     collisions, statement = _collisions(arm, surroundings, limits)
     beginning = _start(start, arm.chain, limits, collisions)
     contacts = []
@@ -129,6 +124,19 @@ def _checked_harmonics(
     if harmonics < 2:
         raise SettingsError(repr(harmonics), element="excite: harmonics", expected="2 or more")
     return harmonics
+
+
+def _accelerated(
+    bounds: MotionBounds, acceleration: float | Sequence[float] | None, arm: Chain
+) -> tuple[MotionBounds, np.ndarray]:
+    """Return the bounds with a limit of acceleration, and the limit of the approach, (n,).
+
+    Without a limit, the approach reaches its largest speed in one second.
+    """
+    if acceleration is None:
+        return bounds, bounds.speed
+    strongest = _joint_values("acceleration", acceleration, arm, positive=True)
+    return replace(bounds, acceleration=strongest), strongest
 
 
 def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, positive: bool) -> np.ndarray:

@@ -129,9 +129,9 @@ def _beginning(file: Path) -> Beginning:
     named = cells if is_repeated else [None] * len(cells)
     between = [*takewhile(lambda k: _is_text(lines[k], lines[first], named[k]), rows)]
     if is_repeated and between:
-        filled = accumulate(names, lambda before, name: name or before, initial="")
-        parts = zip_longest([*filled][1:], *(cells[k] for k in between), fillvalue="")
-        names = ["_".join(filter(None, dict.fromkeys(column))) for column in parts]
+        filled = accumulate(names, lambda left, name: name or left, initial="")
+        columns = zip_longest([*filled][1:], *(cells[k] for k in between), fillvalue="")
+        names = ["_".join(filter(None, dict.fromkeys(column))) for column in columns]
     start = first + 1 + len(between)
     names = names + [""] * (width - len(names))
     return Beginning(encoding, delimiter, names, start, "\n".join(lines[start:]))

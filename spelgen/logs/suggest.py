@@ -102,9 +102,9 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     # measurement. Without a stamp, the name with the fewest words is used.
     clock = min(columns_of.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
     stamp = re.sub(r"secs?$", "", clock.name)
-    parts = [x.name for x in columns if re.fullmatch(rf"{re.escape(stamp)}n(ano)?secs?", x.name)]
-    if stamp != clock.name and parts:
-        clock = ColumnName(f"{clock.name} + {parts[0]}", clock.words, "s")
+    nanoseconds = [x.name for x in columns if re.fullmatch(rf"{re.escape(stamp)}n(ano)?secs?", x.name)]
+    if stamp != clock.name and nanoseconds:
+        clock = ColumnName(f"{clock.name} + {nanoseconds[0]}", clock.words, "s")
     # Numbered columns are assigned by cells that contain joint names, since the order in a log may differ from the
     # arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)

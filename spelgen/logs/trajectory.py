@@ -190,17 +190,17 @@ def recordings(logs: Trajectory | Iterable[Trajectory], joints: Sequence[str]) -
 
     Raises LogError for other objects, such as paths, for no trajectories, and for a wrong number of joints.
     """
-    found = [logs] if isinstance(logs, Trajectory) else list(logs)
-    if not found:
+    trajectories = [logs] if isinstance(logs, Trajectory) else list(logs)
+    if not trajectories:
         raise LogError("no trajectory", expected="at least one")
-    for trajectory in found:
+    for trajectory in trajectories:
         if not isinstance(trajectory, Trajectory):
             got = f"{type(logs).__name__} {logs!r:.60}"
             raise LogError(
                 got, element="logs", expected="trajectories: spelgen.read_logs(PATHS, arm) or Trajectory(...)"
             )
         require_joints(trajectory, joints)
-    return found
+    return trajectories
 
 
 def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:

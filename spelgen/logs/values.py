@@ -190,8 +190,8 @@ def _column(table: pa.Table, name: str) -> Column:
 
 def stamps(seconds: Column, nanoseconds: Column) -> Column:
     """Return times from columns of whole seconds and of the nanoseconds within the second, as ROS stores stamps."""
-    whole = pa.compute.multiply(seconds.cast(pa.int64()), 1_000_000_000)
-    return pa.compute.add(whole, nanoseconds.cast(pa.int64())).cast(pa.duration("ns"))
+    rounded = pa.compute.multiply(seconds.cast(pa.int64()), 1_000_000_000)
+    return pa.compute.add(rounded, nanoseconds.cast(pa.int64())).cast(pa.duration("ns"))
 
 
 def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray:

@@ -67,10 +67,12 @@ class ServoPosterior(Posterior):
         """
         pairs, delays = [], (self.delay,) * self.model.n
         for name, (first, second) in SUMS.items():
-            others = delays if second == "delay" else self.drives[second]
-            for total, one, other in zip(self.drives[name], self.drives[first], others, strict=True):
+            second_terms = delays if second == "delay" else self.drives[second]
+            for total, term, second_term in zip(
+                self.drives[name], self.drives[first], second_terms, strict=True
+            ):
                 # If the sum has the smallest error, the errors of its terms are correlated by less than -1/2.
-                if other is not None and total.std < min(one.std, other.std):
+                if second_term is not None and total.std < min(term.std, second_term.std):
                     pairs.append(f"{first} and {second} of {total.name}")
         common = [] if self._scale_index is None else ["a common factor of kp and all masses"]
         return (*super().unidentifiable, *pairs, *common)

@@ -20,7 +20,7 @@ from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.torque.covariance import Jackknife, contiguous_blocks, jackknife
 from spelgen.fitting.torque.jacobian import TorqueJacobian
-from spelgen.fitting.torque.parameters import joint_torque, limit_friction
+from spelgen.fitting.torque.parameters import joint_torque, limit_friction, set_initial_gains
 from spelgen.fitting.torque.problem import (
     TorqueEstimate,
     TorqueProblem,
@@ -122,11 +122,13 @@ def fit_torque(
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.of(samples, TUNING.decimation)
     samples = samples.subsampled(_max_samples(model))
-    if adapt is None:
-        # The friction of an adapted model is not nominal but fitted, so it is not limited.
-        limit_friction(model, samples.subsampled(TUNING.initial_samples).columns)
     if prior is None:
         prior = TUNING.priors[adapt] if adapt else GaussianPrior()
+    if adapt is None:
+        # Gains and friction of an adapted model are not nominal but fitted, so they are not changed.
+        subset = samples.subsampled(TUNING.initial_samples)
+        set_initial_gains(model, subset, prior.gains)
+        limit_friction(model, subset.columns)
     initial = copy.deepcopy(model.state_dict())
     fitted, comparison = _staged_fit(model, samples, prior, adapt), None
     if adapt is None:

@@ -22,10 +22,11 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.logs.tuning import SAMPLES
 from spelgen.runtime.body_chain import body_factor
+from spelgen.runtime.motors import MotorInputs
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 if TYPE_CHECKING:
-    from spelgen.fitting.torque.samples import SampleBlock
+    from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
 
 MIN_SPEED = SAMPLES.moving
 RIGID_GROUPS = (
@@ -108,6 +109,37 @@ def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
     with torch.no_grad():
         torque: torch.Tensor = samples.tau @ model.input_matrix(samples.q[:1])[0].mT
     return torque
+
+
+def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float) -> None:
+    """Multiply trained motor gains by factors from the samples, where their initial values are far off.
+
+    Settings without `gear` have the initial gain 1, but a current in A may have a gain of 100 Nm/A. The rigid-body
+    torque of the initial parameters is regressed on the torque of the initial gain, per joint, together with friction
+    and an offset. Joints without a significant slope have the median slope of the others.
+
+    deviation: prior standard deviation of the logarithm of a gain. Slopes within three deviations change nothing.
+    """
+    inputs, (q, qd, qdd, *_) = model.inputs, samples.columns
+    if not isinstance(inputs, MotorInputs) or inputs.raw_gains is None:
+        return
+    with torch.no_grad():
+        rigid = model.inverse_dynamics(q, qd, qdd) - model.friction_torque(q, qd)
+        # The columns of each trained joint, (joints, T, 4), of which the first is the rigid-body torque.
+        columns = torch.stack([rigid, qd, qd.sign(), torch.ones_like(qd)], dim=-1).transpose(0, 1)[
+            inputs.gain_rows
+        ]
+        torque = joint_torque(model, samples.columns).mT[inputs.gain_rows].unsqueeze(-1)
+        inverse = torch.linalg.pinv(columns, rcond=1e-9)
+        weights = inverse @ torque
+        correlated = max(1.0, TUNING.correlation_time / samples.interval)
+        variance = (torque - columns @ weights).square().mean(dim=(1, 2)) * inverse[:, 0].square().sum(dim=1)
+        slope = weights[:, 0, 0]
+        known = slope > TUNING.min_significance * (correlated * variance).sqrt()
+        if not known.any():
+            return
+        factors = -torch.where(known, slope, slope[known].median()).log()
+        inputs.raw_gains.add_(torch.where(factors.abs() > 3 * deviation, factors, 0.0))
 
 
 def limit_friction(model: ArmModel, samples: SampleBlock) -> None:

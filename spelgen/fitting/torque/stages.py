@@ -139,8 +139,8 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     evidence = log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic)
     rate_only = _rejected(evidence)
     if evidence.sum() > 0:
-        other = hysteretic.problem.jacobian.residual_samples(hysteretic.state.x).torque_residual
-        rate_only &= _smaller_in_most_blocks(residual, other)
+        bristle_residual = hysteretic.problem.jacobian.residual_samples(hysteretic.state.x).torque_residual
+        rate_only &= _smaller_in_most_blocks(residual, bristle_residual)
     friction.memoryless.copy_(rate_only)
     if rate_only.all():
         return estimate
@@ -151,14 +151,15 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     return hysteretic
 
 
-def _smaller_in_most_blocks(residual: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Return a mask (n,), True for joints at which a torque residual is significantly smaller than another one.
+def _smaller_in_most_blocks(residual: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
+    """Return a mask (n,), True for joints at which a torque residual is significantly smaller than a reference.
 
-    The residuals are compared on ten blocks of samples (see `significant_reduction`). residual, other: (T, n) [Nm, N].
+    The residuals are compared on ten blocks of samples (see `significant_reduction`). residual, reference: (T, n)
+    [Nm, N].
     """
     return torch.tensor([
-        significant_reduction(block_squares(before), block_squares(after)) is not None
-        for before, after in zip(other.mT, residual.mT, strict=True)
+        significant_reduction(block_squares(larger), block_squares(smaller)) is not None
+        for larger, smaller in zip(reference.mT, residual.mT, strict=True)
     ])  # fmt: skip
 
 
