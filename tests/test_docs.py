@@ -40,8 +40,8 @@ SLOW = {"tutorial_servo.md"}  # a fit of half a minute: only `pytest --update` r
 SHORTER = {
     "control.md": {
         '("estimator", "learned", "URDF"):': '("estimator", "learned"):',
-        "PICKED, END = 3.0, 11.0": "PICKED, END = 3.0, 7.5",
-        "END, dynamics=with_load": "END if estimator else 5.6, dynamics=with_load",
+        "PICKED, END = 3.0, 11.0": "PICKED, END = 3.0, 9.0",
+        "END, dynamics=with_load": "END if estimator else 6.0, dynamics=with_load",
     }
 }
 RUN = [page for page in PAGES if page.name not in SLOW or "--update" in sys.argv]

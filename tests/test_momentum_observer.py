@@ -106,7 +106,7 @@ def test_rollouts_with_the_estimate_are_compared_with_open_loop():
 def test_a_diverged_window_affects_no_other():
     model = Model()
     windows = cut_windows(motions(), 11, 60, measured=False)
-    solver = Solver(model, 1)
+    solver = Solver(model, windows)
     sound = solver(windows)
     disturbance = torch.zeros_like(windows.q[:, 0])
     disturbance[3] = 1e12  # a force that no arm withstands

@@ -10,6 +10,7 @@ import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -24,7 +25,7 @@ from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
 from spelgen.emission.specify import generate
 from spelgen.errors import LogError, RunError, SettingsError, SpelgenError
-from spelgen.exporting.exported import readme
+from spelgen.exporting.exported import with_readme
 from spelgen.fitting.fit import fit
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs import bags
@@ -172,8 +173,13 @@ def test_a_name_of_a_megabyte_on_every_row_is_kept_once(tmp_path, arm):
 
 
 def test_a_line_break_in_a_name_is_shown_as_one():
-    lines = readme("a\nb", "use\nit", ["j\r1", "j\u20282"], "as it is", "checked").decode().splitlines()
-    assert lines[:3] == [r"# a\nb", r"use\nit", r"Joints, in this order: j\r1, j\u20282."]
+    arm = SimpleNamespace(chain=SimpleNamespace(name="a\nb", joint_names=["j\r1", "j\u20282"]))
+    trained = SimpleNamespace(arm=arm, tip="t\n3", intervals=())
+    exported = with_readme(trained, "casadi", {}, use="use\nit", about="as it is", summary=["checked"])
+    ((_, content),) = exported.files.items()
+    title, use, joints, units, _ = content.decode().splitlines()
+    assert title.startswith(r"# Dynamics of a\nb") and use == r"use\nit"
+    assert joints == r"Joints, in this order: j\r1, j\u20282." and r"link t\n3" in units
 
 
 def test_an_invalid_learning_rate_is_reported_in_plain_words():
