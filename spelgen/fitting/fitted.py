@@ -136,7 +136,7 @@ class Fit:
         Raises RunError unless rigid bodies were fitted to torques, or to positions under position servos.
         """
         # Imported here, because evaluation needs no posterior.
-        from spelgen.fitting.stored_posterior import posterior_of
+        from spelgen.fitting.posterior import posterior_of
 
         delay = self.record.preprocessing.torque_delay or 0.0
         file = None if self.folder is None else RunFolder(self.folder).checkpoint

@@ -15,11 +15,10 @@ from spelgen.errors import SpelgenError, shortened
 from spelgen.evaluation.results import Results, Verdict
 from spelgen.evaluation.tables import figures
 from spelgen.evaluation.verdict import Limits
-from spelgen.fitting.posterior import Posterior
+from spelgen.fitting.posterior import Posterior, posterior_of
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
-from spelgen.fitting.stored_posterior import posterior_of
 from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import MODEL, counted, share
 from spelgen.listing import duration, number
