@@ -12,11 +12,12 @@ from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
-from spelgen.errors import LogError
+from spelgen.errors import LogError, SettingsError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import LeastSquares
 from spelgen.identification.identify import least_squares
 from spelgen.identification.least_squares import correlation_time
+from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
@@ -296,3 +297,20 @@ def test_panda_gives_the_published_figure(shared):
         arm, training, LeastSquares("range", friction=FrictionModel(coulomb_smoothing_velocity=0.02))
     )
     assert nmse(found, test[0]) == pytest.approx(0.0056, rel=0.05)
+
+
+@pytest.mark.parametrize(("option", "value"), [("friction", "memory"), ("weights", "rms")])
+def test_a_wrong_option_is_an_error_where_it_is_given(option, value):
+    with pytest.raises(SettingsError, match=f"^{option}: got '{value}'"):
+        LeastSquares(**{option: value})
+
+
+def test_python_accepts_lists_and_a_single_trajectory(robots):
+    arm = load_arm(robots / "two_link.urdf")
+    samples, _ = excited(arm.chain, seconds=4.0)
+    found = least_squares(arm.chain, [samples], LeastSquares("range"))
+    motion = [x[:3] for x in (samples.q, samples.qd, samples.qdd)]
+    expected = found.torque(*motion)
+    np.testing.assert_array_equal(found.torque(*(x.tolist() for x in motion)), expected)
+    single = trajectory(arm.chain, seconds=4.0)
+    assert check_logs(single, arm).to_dict() == check_logs([single], arm).to_dict()

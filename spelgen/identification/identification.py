@@ -13,7 +13,7 @@ from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics, identified_dynamics
-from spelgen.errors import Diagnostic
+from spelgen.errors import Diagnostic, SettingsError
 from spelgen.identification.base_parameters import BaseParameters
 from spelgen.identification.intervals import DETERMINED, Interval, base_unit, interval_listing
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay
@@ -34,11 +34,21 @@ class LeastSquares:
 
     weights: weights of the joints' squared torque residuals: ``equal``, ``range`` (inverse variance of a joint's
     torque) or ``noise`` (inverse variance of a joint's residual, in a few iterations). friction: friction model;
-    ``FrictionModel(memory=True)`` has dry friction with hysteresis.
+    ``FrictionModel(memory=True)`` has dry friction with hysteresis. Raises SettingsError for other values.
     """
 
     weights: Literal["equal", "range", "noise"] = "noise"
     friction: FrictionModel = field(default_factory=FrictionModel)
+
+    def __post_init__(self) -> None:
+        if self.weights not in ("equal", "range", "noise"):
+            raise SettingsError(repr(self.weights), element="weights", expected="equal, range or noise")
+        if not isinstance(self.friction, FrictionModel):
+            raise SettingsError(
+                repr(self.friction),
+                element="friction",
+                expected="FrictionModel(memory=True), or without memory",
+            )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,8 +105,8 @@ class Identification:
             qdd: (T, n) accelerations [rad/s^2, m/s^2].
             z: (T, n, K) [rad, m] bristle states of a friction model with hysteresis; None for other friction models.
         """
-        past = None if z is None else torch.from_numpy(z)
-        position, velocity, acceleration = map(torch.from_numpy, (q, qd, qdd))
+        past = None if z is None else torch.as_tensor(z)
+        position, velocity, acceleration = (torch.as_tensor(np.asarray(x, float)) for x in (q, qd, qdd))
         return self.dynamics.joint_torque(position, velocity, acceleration, past).numpy()
 
     @cached_property

@@ -23,11 +23,13 @@ if TYPE_CHECKING:
 ABOUT_ARM = {COUPLED, CURRENT, WITHOUT_GRAVITY, WRONG_LINK, AT_A_STOP, *WARNINGS} | {x.code for x in CHECKS}
 
 
-def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None = None) -> LogReport:
+def check_logs(
+    logs: Trajectory | Iterable[Trajectory], arm: Arm, mapping: LogMapping | None = None
+) -> LogReport:
     """Return the report on the logs of an arm. Faults of the logs are not raised, but are `errors` of the report.
 
     Args:
-        logs: trajectories; an iterator is consumed once, one trajectory at a time.
+        logs: one or several trajectories; an iterator is consumed once, one trajectory at a time.
         arm: the arm. Its input matrix converts logged torques to joint torques.
         mapping: mapping of the logs; None: the mapping in the arm's settings. Units that it declares are not checked,
             and checks that it accepts are omitted.
@@ -37,6 +39,7 @@ def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None 
             without commands if the arm's settings contain 'input: position'.
     """
     joints = arm.chain.joint_names
+    logs = [logs] if isinstance(logs, Trajectory) else logs
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
         from spelgen.log_checks.check_servo_logs import ServoLogs
