@@ -156,18 +156,6 @@ def test_no_spring_from_one_recording_at_a_joint_without_load(robots):
     assert (limits["raw_torque_splines"][gravity > 0.5 * gravity.max()] > 0).all()
 
 
-def test_ripple_has_frequencies_of_which_the_samples_contain_two_periods(hybrid):
-    """A range of 2 rad contains two periods of 7 per revolution (1.8 rad), but not of 6 (2.1 rad)."""
-    from spelgen.fitting.torque.joint_functions import RIPPLE, joint_functions
-
-    q = torch.stack([torch.linspace(-1, 1, 500).double(), torch.zeros(500).double()], dim=1)
-    candidates = joint_functions(hybrid, residual_of(q.sin(), q), Unabsorbed(), {(RIPPLE, 0)})
-    (candidate,) = candidates
-    cosines, sines = candidate.columns.chunk(2, dim=1)
-    for waves in (cosines, sines):
-        assert not waves[:, :6].any() and (waves[:, 6:].abs().amax(dim=0) > 0.1).all()
-
-
 def test_slow_passes_are_few_errors(hybrid):
     """A joint that passes its range once has as many independent errors as the range has splines."""
     from spelgen.fitting.torque.joint_functions import joint_functions

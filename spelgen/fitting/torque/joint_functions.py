@@ -202,10 +202,6 @@ def joint_functions(
     terms, motors = model.residuals, motors_of(model)
     with torch.no_grad():
         splines, ripple = terms.splines(samples.q), terms.revolute * terms.waves(samples.q)
-    # Frequencies are omitted if the samples contain less than two of their periods: they would fit a trend in the
-    # position, and would be wrong at other positions.
-    width = (samples.q.amax(dim=0) - samples.q.amin(dim=0)).unsqueeze(-1)
-    ripple = ripple * (terms.frequencies * width >= 4 * torch.pi).repeat(1, 2)
     joints, unit = torch.eye(len(motors)).to(motors), terms.unit.flatten()
     # The number of visits of a joint is 1 + path length / knot spacing of the splines.
     visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
