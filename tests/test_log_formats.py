@@ -970,3 +970,13 @@ def test_json_lines_structs_stamps_in_two_columns_and_logs_without_times(tmp_pat
 def test_columns_separated_by_spaces_are_read(tmp_path):
     (tmp_path / "log.csv").write_text("t q_a qd_a tau_a\n0 0.1 0 1\n0.1 0.2 0 1\n")
     np.testing.assert_array_equal(read_logs(tmp_path / "log.csv", ["a"])[0].q[:, 0], [0.1, 0.2])
+
+
+@pytest.mark.parametrize("name", ["my log.txt", "a'); import os; (b.npy", 'a"; ls; ".mat', "$(ls).xlsx"])
+def test_a_path_is_no_code_in_an_advised_command(tmp_path, name):
+    path = tmp_path / name
+    path.touch()
+    with pytest.raises(LogError) as caught:
+        read_logs(path, JOINTS)
+    command = str(caught.value).split("convert it: ")[1]
+    assert "FILE" in command and path.stem not in command

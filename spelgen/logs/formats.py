@@ -4,6 +4,7 @@ To add a format, write a module like `csv_files.py` and add a `LogFormat` to FOR
 """
 
 import pkgutil
+import re
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
 from pathlib import Path
@@ -95,7 +96,9 @@ def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], lis
 def _conversion(path: Path) -> str | None:
     """Return the advice to convert a file of a kind in CONVERT; None for other files."""
     command = CONVERT.get(path.suffix.lower())
-    return command and f"convert it: {command.format(path, path.with_suffix(''))}"
+    # A path with spaces or quotation marks would be other arguments, or code, in a command that is copied to a shell.
+    plain = path if re.fullmatch(r"[\w./@+-]+", str(path)) else Path("FILE").with_suffix(path.suffix)
+    return command and f"convert it: {command.format(plain, plain.with_suffix(''))}"
 
 
 def _logs_at(path: Path, role: str | None) -> list[Path]:
