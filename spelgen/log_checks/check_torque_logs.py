@@ -244,19 +244,23 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
     Its torque is uncorrelated with the gravity torque of the URDF and, since wrong masses also lower this correlation,
     fits better without gravity than with gravity and masses near the URDF's.
     """
-    problem = problem.thinned(GEOMETRY.confirming_samples)
+    suspicious = []
     for k, joint in enumerate(joints):
         deviation, correlation = joint.gravity.relative_deviation or 0.0, joint.gravity.correlation
-        if correlation is None or deviation < TUNING.visible or abs(correlation) > 1 - TUNING.seen:
-            continue
-        fit = problem.fit(problem.unchanged)
+        if correlation is not None and deviation >= TUNING.visible and abs(correlation) <= 1 - TUNING.seen:
+            suspicious.append((k, joint.name, deviation, correlation))
+    if not suspicious:
+        return
+    problem = problem.thinned(GEOMETRY.confirming_samples)
+    fit = problem.fit(problem.unchanged)
+    for k, name, deviation, correlation in suspicious:
         # without any suitable model, a residual of more than 10 % of the torque's variance is enough
         if fit.errors[k] > 0.1 or problem.without_gravity(k).fit(problem.unchanged).cost < fit.cost:
             message = (
                 f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity "
                 f"torque varies {deviation:.2g} times as much as tau"
             )
-            yield Diagnostic("warning", WITHOUT_GRAVITY, f"joint {joint.name!r}", None, message)
+            yield Diagnostic("warning", WITHOUT_GRAVITY, f"joint {name!r}", None, message)
 
 
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
