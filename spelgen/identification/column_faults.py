@@ -207,8 +207,9 @@ class TorqueUnit(WrongScale):
                 bounds=(-np.log(10), np.log(10)), method="bounded", options={"xatol": 0.05},
             ).x  # fmt: skip
             best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
-        # such factors also correct errors of the URDF's masses, and so lower the cost a little
-        if best.cost < lowest.cost - GEOMETRY.needed:
+        # such factors also correct errors of the URDF's masses, and so lower the cost a little; no factor explains a
+        # torque that does not resemble the URDF's, such as its magnitude
+        if best.cost < lowest.cost - GEOMETRY.needed and best.errors.max() <= GEOMETRY.unexplained:
             yield best
 
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
