@@ -303,11 +303,8 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     n, mean = len(scale), scale.mean()
     variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)
     weight = min(mean**2 / count / variance, 1 - 1 / n)
-    return {
-        "peak_start": start,
-        "peak_scale": scale + weight * (mean - scale),
-        "peak_count": count / (1 - weight),
-    }
+    scale += weight * (mean - scale)
+    return {"peak_start": start, "peak_scale": scale, "peak_count": count / (1 - weight)}
 
 
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:

@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from spelgen.errors import LogError
 from spelgen.fitting.fitted import Fit
 from spelgen.listing import WIDTH
 from spelgen.live.estimator import Estimator, EstimatorState
@@ -133,10 +132,6 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
     estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
     joints, results = fit.model.joint_names, []
     for log in logs:
-        if log.q.shape[1] != fit.model.n:
-            raise LogError(
-                f"{log.q.shape[1]} joints", file=log.file, expected=f"{fit.model.n}, as the model has"
-            )
         estimator.reset()
         states = estimator.replay(log)
         times = log.t - log.t[0]
