@@ -71,6 +71,11 @@ def on_motors(q, qd, qdd, arm, strength, armature):
     return joint, np.linalg.solve(arm.actuation.matrix(), joint.T).T
 
 
+def noisy(tau):
+    """Torques (T, 6) with 1 % of noise, with which a fit takes a seventh of the time that it takes without noise."""
+    return tau + 0.01 * tau.std(axis=0) * np.random.default_rng(2).standard_normal(tau.shape)
+
+
 def test_motor_speeds_are_of_the_joint_that_each_moves_most(wrist):
     _, arm = wrist
     found = motor_speeds(arm.actuation.matrix())
@@ -108,7 +113,7 @@ def test_a_closed_form_model_is_fitted_to_a_coupled_wrist(wrist):
     motion = moved(module, 6.0)
     _, tau = on_motors(*motion, arm, strength, armature)
     model = module.Model()
-    fit_torque(model, [DynamicsSamples("x", *motion, tau)])
+    fit_torque(model, [DynamicsSamples("x", *motion, noisy(tau))])
     fresh = moved(module, 10.0, seed=1)
     _, tau = on_motors(*fresh, arm, strength, armature)
     with torch.no_grad():
@@ -176,7 +181,7 @@ def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
     found = least_squares(arm.chain, samples, LeastSquares("range"), arm.actuation.drives())
     assert (np.square(found.torque(*fresh) - expected).mean(axis=0) / expected.var(axis=0)).max() < 1e-10
     model = module.Model()
-    fit_torque(model, samples)
+    fit_torque(model, [DynamicsSamples("x", *motion, noisy(tau))])
     with torch.no_grad():
         learned = model.inverse_dynamics(*(torch.from_numpy(x) for x in fresh)).numpy()
     assert (np.square(learned - expected).mean(axis=0) / expected.var(axis=0)).max() < 2e-3
