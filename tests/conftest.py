@@ -89,7 +89,18 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+def coarse_validation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rollouts of the validation have at most two steps per sample, for tests that do not look at its loss.
+
+    Steep friction would otherwise be integrated with 1, 2, 4, ... 32 steps, which takes longer than a torque fit.
+    """
+    from spelgen.fitting.tuning import FittingTuning
+
+    monkeypatch.setattr("spelgen.fitting.rollout.TUNING", FittingTuning(max_substeps=2))
+
+
+@pytest.fixture
+def short_torque_fits(monkeypatch: pytest.MonkeyPatch, coarse_validation: None) -> None:
     """Torque fits take two steps in few outer iterations, for tests of files, commands and messages."""
     from spelgen.fitting.torque.tuning import TorqueTuning
 

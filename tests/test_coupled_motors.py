@@ -253,6 +253,7 @@ def test_logs_show_torques_that_are_late_or_early(uncoupled, tmp_path, late):
         assert aligned.nmse.mean() < 0.7 * as_logged.nmse.mean()  # noise is the rest
 
 
+@pytest.mark.usefixtures("coarse_validation")
 def test_a_fit_moves_late_torques_and_its_evaluation_too(uncoupled):
     log = recorded(uncoupled, "joints", 0.0, late=0.004)
     model = build(ROBOTS / "six_dof.urdf", "closed-form")
@@ -277,6 +278,7 @@ def test_no_delay_is_estimated_with_an_unspecified_coupling(uncoupled):
     )
 
 
+@pytest.mark.usefixtures("coarse_validation")
 def test_a_fit_has_the_coupling_that_its_logs_show(uncoupled, tmp_path):
     """The fit is the one of an arm whose settings state the coupling, and so are its run and its delay."""
     log, names = recorded(uncoupled, "joints", 1.0, late=0.01), uncoupled.chain.joint_names
