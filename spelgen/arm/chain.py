@@ -185,9 +185,9 @@ def _longest(robot: Robot) -> ChainChoice:
 def _possible_gripper(robot: Robot, last: UrdfJoint, is_pair: bool) -> tuple[Diagnostic, ...]:
     """Return a remark if the last joint of the chain may open a gripper; otherwise no remark.
 
-    The joint may open a gripper if it is prismatic and moves by at most 0.1 m, if a mimic joint has the same parent link
-    (``is_pair``), or if its child link has the name of a gripper, and no joint of the robot has such a name. A revolute
-    joint with a range of more than half a turn rotates the gripper as a whole, because no jaw opens that far.
+    The joint may open a gripper if it is prismatic and moves by at most 0.1 m, if it is one of a pair of jaws
+    (``is_pair``), or if its child link has the name of a gripper, and no joint of the robot has such a name. A joint
+    with a range of more than half a turn rotates the gripper as a whole, because no jaw opens that far.
     """
     travel = last.upper - last.lower if last.lower is not None and last.upper is not None else 0.0
     is_named = bool(_GRIPPER.search(last.child)) and not any(map(_GRIPPER.search, robot.joint))
