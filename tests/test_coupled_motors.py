@@ -358,7 +358,7 @@ def test_initial_gains_that_are_far_off_are_replaced(uncoupled, tmp_path):
 
 
 def test_initial_gains_that_are_right_are_kept(uncoupled, tmp_path):
-    """The factor is that of joint torques: `gear` is not applied a second time."""
+    """The slope is computed from joint torques: `gear` is not applied a second time."""
     model = trained_gains(tmp_path, uncoupled.chain.joint_names, gear=40)
     log = recorded(uncoupled, "joints", 0.0)
     (samples,) = dynamics_samples([replace(log, tau=log.tau / 40.0)])

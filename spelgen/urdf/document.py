@@ -22,7 +22,7 @@ _OTHER_FORMATS = {
     "COLLADA": ("a COLLADA mesh", "name the URDF that uses it"),
     "html": ("a web page", "download the file itself: 'Raw' on the page of a repository"),
 }
-# {first bytes of a file in lower case: what it is, the remedy}
+# {first bytes of a file in lower case: (kind of file, remedy)}
 _NOT_XML = {
     b"version https://git-lfs": ("a pointer of Git LFS", "run 'git lfs pull' first"),
     b"<!doctype html": _OTHER_FORMATS["html"],
