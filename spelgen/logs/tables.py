@@ -84,6 +84,11 @@ class LogFormat(NamedTuple):
     folder: str = ""
 
 
+SERVO_ADVICE = (
+    "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
+)
+
+
 def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, file: Path) -> Layout:
     """Return the layout of a table with this schema. Raises LogError if a column is missing or occurs twice.
 
@@ -174,7 +179,7 @@ def missing_columns(
             "the others do not move, or map its columns under 'logs'"
         )
     elif mapping.input == "torque" and _are_commands(columns, mapping, joints):
-        do = "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
+        do = SERVO_ADVICE
     elif list(missing) == [mapping.columns.t]:
         do = (
             "write its name as 'columns: {t: NAME}' under 'logs' in the robot's YAML, or 'sample_rate: HZ' if there is "
