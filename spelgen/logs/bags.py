@@ -7,7 +7,6 @@ body. https://mcap.dev/spec
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ from spelgen.errors import LogError, in_one_line
 from spelgen.files import limited_memory, require_regular_file
 from spelgen.labels import counted
 from spelgen.logs.joint_signals import mapping_line
-from spelgen.logs.tables import LogTable, table_layout
+from spelgen.logs.tables import LogTable
 from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
@@ -67,8 +66,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     # ROS defines the fields of a joint state in SI units, so columns and units of the mapping do not apply
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
-    layout = table_layout(table.schema, joints, mapping, path)
-    return [(replace(layout, remarks=tuple(remarks)), table)]
+    return [LogTable.of(table, mapping, remarks=tuple(remarks))]
 
 
 def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[TimedState]:

@@ -4,7 +4,6 @@ import codecs
 import csv
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import accumulate, takewhile, zip_longest
 from pathlib import Path
 from statistics import mode
@@ -15,7 +14,7 @@ import pyarrow.csv
 
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
-from spelgen.logs.tables import LogTable, table_layout
+from spelgen.logs.tables import LogTable
 from spelgen.logs.values import is_number, stamps
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
@@ -45,19 +44,12 @@ class Beginning(NamedTuple):
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return a list with one table, the content of a CSV file; an incomplete last line is omitted, with a remark."""
-    table, header, cut = _csv_table(file)
+    table, header, cut = csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
-    return [
-        (replace(table_layout(table.schema, joints, mapping, file), remarks=remarks, header=header), table)
-    ]
+    return [LogTable.of(table, mapping, remarks=remarks, header=header)]
 
 
-def csv_columns(file: Path) -> pa.Table:
-    """Return all columns of a CSV file as logged."""
-    return _csv_table(file)[0]
-
-
-def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
+def csv_table(file: Path) -> tuple[pa.Table, int, str]:
     """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
 
     Columns may be separated by commas, semicolons, tabs, bars or spaces; numbers may have decimal commas; the encoding

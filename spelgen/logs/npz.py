@@ -1,7 +1,7 @@
 """Reader of NPZ archives that contain one array per column, or matrices with one column per joint."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Collection, Sequence
+from itertools import starmap
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.logs.tables import LogTable, missing_columns, stored_columns, table_layout
+from spelgen.logs.tables import LogTable, missing_columns
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
@@ -84,16 +84,6 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     return [_table(text, arrays, joints, mapping.of_trajectory(text)) for text in texts]
 
 
-def npz_columns(file: Path) -> pa.Table:
-    """Return a table of all arrays with as many rows as the longest one; matrices become columns of lists."""
-    arrays = NpzArrays(file)
-    names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
-    lengths = {name: arrays[name].size if arrays.is_vector(name) else len(arrays[name]) for name in names}
-    samples = max(lengths.values(), default=0)
-    columns = [name for name, length in lengths.items() if length == samples]
-    return pa.table({name: arrays.column(name, is_list=not arrays.is_vector(name)) for name in columns})
-
-
 def _trajectory_text(pattern: str, name: str) -> str | None:
     """Return the text that an array's name has in place of `{trajectory}`; None if the name does not match the pattern.
 
@@ -109,26 +99,44 @@ def _trajectory_text(pattern: str, name: str) -> str | None:
 
 def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping) -> LogTable:
     """Return the table of one recording of the archive; `recording` is its name, None if it is the only one."""
-    for quantity in mapping.quantities:
+    for quantity in mapping.quantities if joints else ():
         mapping = _with_matrix_columns(quantity, arrays, joints, mapping)
+    # The mapping names an array as a whole, or the columns of a matrix, such as q[0].
+    whole = {mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))}
+
+    def read(names: list[str] | None) -> pa.Table:
+        return _longest(arrays) if names is None else _equally_long(arrays, names, whole)
+
     # the schema has names without types, since the type of an array is known only after reading it
     schema = pa.schema([(name, pa.null()) for name in arrays.names])
-    layout = table_layout(schema, joints, mapping, arrays.file)
-    if recording is not None:
-        layout = replace(layout, labels=None, recording=recording)
-    columns, matrices, samples = stored_columns(layout, arrays.names), set(), None
-    for name in columns:
-        shape = arrays[name].shape
-        # The layout names an array as a whole, or the columns of a matrix, such as q[0].
-        if name not in layout.columns and len(shape) == 2:
-            matrices.add(name)
-        length = shape[0] if name in matrices else arrays[name].size
+    return LogTable(schema, read, mapping, recording=recording)
+
+
+def _equally_long(arrays: NpzArrays, names: Sequence[str], whole: Collection[str]) -> pa.Table:
+    """Return a table of arrays; matrices (T, n) become columns of lists. Raises LogError if lengths differ.
+
+    whole: names of arrays that are vectors, also if they have the shape (T, 1) or (1, T).
+    """
+    columns: dict[str, pa.Array] = {}
+    samples = None
+    for name in names:
+        array, is_list = arrays[name], name not in whole and arrays[name].ndim == 2
+        length = len(array) if is_list else array.size
         samples = length if samples is None else samples
-        if length != samples or not (arrays.is_vector(name) or name in matrices):
-            expected = f"a value for each of the {samples} times"
-            do = "resample it to these times"
-            raise arrays.error(name, f"an array of shape {shape}", expected, do)
-    return layout, pa.table({name: arrays.column(name, is_list=name in matrices) for name in columns})
+        if length != samples or not (is_list or arrays.is_vector(name)):
+            expected, do = f"a value for each of the {samples} times", "resample it to these times"
+            raise arrays.error(name, f"an array of shape {array.shape}", expected, do)
+        columns[name] = arrays.column(name, is_list=is_list)
+    return pa.table(columns)
+
+
+def _longest(arrays: NpzArrays) -> pa.Table:
+    """Return a table of the arrays with as many rows as the longest one; matrices (T, n) become columns of lists."""
+    names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
+    vectors = set(filter(arrays.is_vector, names))
+    rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
+    samples = max(rows.values(), default=0)
+    return _equally_long(arrays, [name for name in names if rows[name] == samples], vectors)
 
 
 def _with_matrix_columns(
