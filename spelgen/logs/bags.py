@@ -128,7 +128,7 @@ def _joint_states(
             # ROS allows empty fields in a joint state, such as a missing effort
             if len(array):
                 values[logged, row] = array[indices]
-    columns = {}
+    columns: dict[str, np.ndarray] = {}
     for quantity, by_joint in zip(FIELDS, data, strict=True):
         if not np.isnan(by_joint).all():
             pattern = PLAIN[quantity]
