@@ -4,7 +4,7 @@ import codecs
 import csv
 import re
 from collections.abc import Sequence
-from itertools import accumulate, takewhile, zip_longest
+from itertools import takewhile, zip_longest
 from pathlib import Path
 from statistics import mode
 from typing import NamedTuple
@@ -145,7 +145,9 @@ def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int)
     ):
         start += 1
     if is_repeated and start > between:
-        filled = list(accumulate(names, lambda left, name: name or left))
+        filled = names[:1]
+        for name in names[1:]:
+            filled.append(name or filled[-1])
         columns = zip_longest(filled, *cells[between:start], fillvalue="")
         names = ["_".join(filter(None, dict.fromkeys(column))) for column in columns]
     return names, start
