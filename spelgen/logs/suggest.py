@@ -16,12 +16,12 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
-from spelgen.logs.formats import FORMATS, LEROBOT, format_of
+from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
 from spelgen.logs.tables import SERVO_ADVICE, names_joint, reading
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit
-from spelgen.settings.log_mapping import CURRENTS
+from spelgen.settings.log_mapping import CURRENTS, LogMapping
 
 WORDS = {
     "t": {"t", "ts", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis", "zeit"},
@@ -80,17 +80,13 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     log_format = format_of(file)
     if log_format is LEROBOT:
         return _dataset_mapping(file, joints)
-    if log_format is None or log_format.columns is None:
-        suffixes = [x.suffixes[0] for x in FORMATS if x.columns is not None]
-        got = (
-            f"a file of kind {file.suffix!r}"
-            if log_format is None
-            else "messages of ROS, with names and units"
-        )
-        do = "other names of joints are mapped by 'name' under 'logs', 'joints'" if log_format else None
-        raise LogError(got, file=file, expected=" or ".join(suffixes), do=do)
+    assert log_format is not None, "log_files gives logs alone"
+    if log_format is BAG:
+        suffixes = " or ".join(x.suffixes[0] for x in FORMATS if not x.marker)
+        do = "other names of joints are mapped by 'name' under 'logs', 'joints'"
+        raise LogError("messages of ROS, with names and units", file=file, expected=suffixes, do=do)
     with reading(file):
-        table = log_format.columns(file)
+        table = log_format.read(file, (), LogMapping())[0].read(None)
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     columns = [_column_name(name, {"time"} if name in dates else set()) for name in _names(table)]
     columns_of = _by_quantity(columns, commands, joints)
