@@ -37,12 +37,11 @@ HISTORY = re.compile(
 )
 SLOW = {"tutorial_servo.md"}  # a fit of half a minute: only `pytest --update` runs it
 # Without the rows of the table of control.md that it does not assert, with shorter motions, above all without an
-# estimator, and with larger steps of the simulated robot.
+# estimator.
 SHORTER = {
     "control.md": {
         '("estimator", "learned", "URDF"):': '("estimator", "learned"):',
-        "PICKED, END = 3.0, 11.0": "PICKED, END = 3.0, 7.0",
-        "substeps=8": "substeps=4",
+        "PICKED, END = 3.0, 11.0": "PICKED, END = 3.0, 9.0",
         "END, dynamics=with_load": "END if estimator else 5.5, dynamics=with_load",
     }
 }

@@ -65,9 +65,9 @@ def levels(arm):
 
 @pytest.fixture(scope="module")
 def run(arm, levels, tmp_path_factory):
-    """A run folder of the model, with noise levels."""
+    """A run folder of the model, with noise levels from half a minute of logs."""
     folder = saved_run(arm[0], ROBOTS / "six_dof.urdf", tmp_path_factory.mktemp("live"))
-    folder.estimator.write_text(json.dumps(levels.model_dump(mode="json")))
+    folder.estimator.write_text(json.dumps(levels.model_dump(mode="json") | {"minutes": 0.5}))
     config = json.loads(folder.config.read_text())
     folder.config.write_text(json.dumps(config | {"joints": list(arm[0].joint_names)}))
     return folder.path
@@ -411,6 +411,29 @@ def test_thresholds_keep_the_rate_of_alarms_after_short_logs(levels, minutes):
     assert np.median(thresholds) < 25.0
 
 
+def test_scales_of_peaks_are_shrunk_by_their_error(levels):
+    """Equal scales become nearly equal; different scales that many peaks determine remain different."""
+    random, n = np.random.default_rng(2), len(EFFORT)
+
+    def scales(windows, true):
+        peaks = [1.0 + true * random.exponential(size=(windows, n)) for _ in range(3)]
+        tail = held_out_tail(peaks, levels)
+        pooled = np.concatenate(peaks)
+        single = np.maximum(pooled - np.quantile(pooled, 0.8, axis=0), 0).sum(axis=0)
+        return tail["peak_scale"] / tail["peak_scale"].mean(), single / single.mean(), tail["peak_count"]
+
+    shrunk, single, count = scales(40, np.ones(n))
+    assert np.std(shrunk) < 0.5 * np.std(single) and 24 < count < n * 24 + 1
+    true = np.linspace(1.0, 6.0, n)
+    shrunk, single, count = scales(1000, true)
+    np.testing.assert_allclose(shrunk, true / true.mean(), rtol=0.1)
+    assert 600 < count < 610
+    # one joint, and joints without any residual
+    for joints in (1, 3):
+        tail = held_out_tail([np.zeros((20, joints))] * 3, nominal_levels(*np.ones((3, joints))))
+        assert all(np.isfinite(value).all() for value in tail.values())
+
+
 def test_thresholds_hold_in_a_log_that_differs(levels):
     """One log of three has residuals that are twice as large; a further log is like it."""
     random = np.random.default_rng(1)
@@ -486,6 +509,7 @@ def test_the_command_prints_payload_contacts_and_drift(arm, levels, run, tmp_pat
     assert "contact at 9.0" in result.output
     assert "friction at the end" in result.output
     assert "contact thresholds in motion; at rest: joint1" in result.output
+    assert "(training logs support >= 2): the training logs are too short" in " ".join(result.output.split())
     page = (tmp_path / "page.html").read_text()
     assert "Mass of the payload" in page
     result = CliRunner().invoke(app, [*arguments, "--format", "json"])

@@ -143,12 +143,13 @@ def estimate(
     smallest = ", ".join(
         f"{joint} {moving:.3g}; {resting:.3g}" for joint, (moving, resting) in thresholds.items()
     )
-    supported = fill(
+    supported = (
         f"contact thresholds in motion; at rest: {smallest} Nm, N, for a rate of false alarms of {alarm_rate:g} per "
-        f"minute (training logs support >= {rate:.2g})",
-        WIDTH,
-        subsequent_indent="    ",
+        f"minute (training logs support >= {rate:.2g})"
     )
+    if alarm_rate < rate:
+        supported += ": the training logs are too short for this rate, train with longer logs"
+    supported = fill(supported, WIDTH, subsequent_indent="    ")
     answer(format, record, *(result.text() for result in results), supported, f"wrote {page}")
 
 

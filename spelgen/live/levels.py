@@ -297,7 +297,14 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     # The number of peaks above `start` is the same for all joints except joints without residuals, which have none.
     count = max(int((together > start).sum(axis=0).max()), 1)
     scale = np.maximum(together - start, 0).sum(axis=0) / count
-    return {"peak_start": start, "peak_scale": scale, "peak_count": count}
+    # The scales are similar, and each has an error of 1 / sqrt(count) of its value. They are shrunk towards their mean
+    # with the weight of this variance in the variance over the joints (James and Stein, 1961). The mean over n joints
+    # is estimated from at most n times as many peaks.
+    n, mean = len(scale), scale.mean()
+    variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)
+    weight = min(mean**2 / count / variance, 1 - 1 / n)
+    scale += weight * (mean - scale)
+    return {"peak_start": start, "peak_scale": scale, "peak_count": count / (1 - weight)}
 
 
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:

@@ -57,7 +57,7 @@ class NoiseLevels(BaseModel):
         resting_speed: Velocity scale of the additional threshold, (n,) [rad/s, m/s].
         peak_start: Smallest value of the exponential distribution, (n,) [1].
         peak_scale: Scale of the exponential distribution, (n,) [1].
-        peak_count: Number of peaks per joint from which the scale is estimated.
+        peak_count: Effective number of peaks from which the scale of a joint is estimated.
         load_variance: Factor by which the covariance of an estimated payload is multiplied.
         load_freedom: Degrees of freedom of the estimate of `load_variance`.
         speed: Largest speed of the training logs, (n,) [rad/s, m/s].
@@ -77,7 +77,7 @@ class NoiseLevels(BaseModel):
     resting_speed: Vector
     peak_start: Vector
     peak_scale: Vector
-    peak_count: int
+    peak_count: float
     load_variance: float
     load_freedom: float
     speed: Vector

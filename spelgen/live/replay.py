@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from spelgen.errors import LogError
 from spelgen.fitting.fitted import Fit
 from spelgen.listing import WIDTH
 from spelgen.live.estimator import Estimator, EstimatorState
@@ -134,10 +133,6 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
     """
     require_torques(logs)
     joints, results = fit.model.joint_names, []
-    for log in logs:
-        if log.q.shape[1] != len(joints):
-            expected = f"{len(joints)}, as the model has"
-            raise LogError(f"{log.q.shape[1]} joints", file=log.file, expected=expected)
     check(logs, joints, fit.model.joint_types)
     estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
     for log in logs:
