@@ -272,13 +272,40 @@ def test_factors_of_torques_that_differ_are_stated_per_joint(robots, tmp_path):
 
 
 def test_magnitudes_of_a_torque_are_not_explained_by_factors(shared):
-    """A driver may log the magnitude of a current; own factors of all joints would lower the error a little."""
+    """A driver logs the magnitude of a current: no own factors of all joints, which would lower the error a little."""
     arm = load_arm(shared / "logs" / "airbot" / "airbot.urdf")
     (log,) = read_logs(shared / "logs" / "airbot" / "ga_N12T25.parquet", arm)
     tau = log.tau.copy()
     tau[:, 1] = np.abs(tau[:, 1])
-    codes = {x.code for x in check_logs([replace(log, tau=tau)], arm).findings}
-    assert "torque-without-gravity" in codes and "torque-unit" not in codes
+    error = told(arm, replace(log, tau=tau))
+    assert "joint 'joint2', tau: got torques without sign" in error and "gain" not in error
+    assert "--accept torque-without-sign" in error
+
+
+@pytest.mark.parametrize("of_all", [False, True])
+def test_torques_that_were_logged_as_magnitudes_are_named(arm, of_all):
+    """The joint whose torque changes its direction most often, or all joints that do so in a tenth of the time."""
+    log = recorded(arm, 14)
+    share = np.minimum((log.tau > 0).mean(axis=0), (log.tau < 0).mean(axis=0))
+    unsigned = np.full(len(share), True) if of_all else share == share.max()
+    error = told(arm, replace(log, tau=np.where(unsigned, np.abs(log.tau), log.tau)))
+    assert "--accept torque-without-sign" in error
+    named = [name in error for name in arm.chain.joint_names]
+    np.testing.assert_array_equal(named, unsigned & (share > 0.1))
+
+
+def test_torques_of_one_direction_by_nature_are_believed(robots, tmp_path):
+    """Gravity loads both joints to one side, in all positions of the log."""
+    arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
+    upright = replace(arm, chain=replace(arm.chain, gravity=(0.0, -9.81, 0.0)))
+
+    def level(arm, rng):
+        t, q = excitation(arm, rng)
+        return t, 0.3 * (q - q.mean(axis=0))
+
+    log = recorded(upright, 15, level, noise=0.01)
+    assert (log.tau > 0).all()
+    assert check_logs([log], upright).errors == ()
 
 
 ROBOT = """<robot name="made">

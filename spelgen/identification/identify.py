@@ -144,8 +144,8 @@ class _Equations:
         count, first = sum(len(block.q) for block in self._blocks), 0
         group = np.arange(count) * BLOCKS // count  # contiguous blocks of samples
         products = np.zeros((len(self.drives.speeds), BLOCKS, parameters + 1, parameters + 1))
-        for regressor, tau in self._rows(friction):
-            rows = np.concatenate([regressor, tau[..., None]], axis=2).swapaxes(0, 1)
+        for columns, tau in self._rows(friction):
+            rows = np.concatenate([columns, tau[..., None]], axis=2).swapaxes(0, 1)
             numbers = group[first : first + len(tau)]
             for number in np.unique(numbers).tolist():
                 block = rows[:, numbers == number]
