@@ -188,6 +188,16 @@ def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
     np.testing.assert_allclose(list(map(float, lines[0].split(","))), gravity, atol=0.3)
 
 
+def test_a_small_tilt_of_the_base_is_a_warning(arm):
+    """Five degrees about the x axis: the mounting of a robot may be as wrong."""
+    tilted = replace(arm, chain=replace(arm.chain, gravity=(0.0, 0.85, -9.77)))
+    report = check_logs([recorded(tilted, 16, noise=0.01)], arm)
+    assert report.errors == ()
+    (note,) = (x for x in report.findings if x.code == "gravity")
+    gravity = list(map(float, re.search(r"write 'gravity: \[(.*?)\]'", note.message)[1].split(",")))
+    np.testing.assert_allclose(gravity, [0.0, 0.85, -9.77], atol=0.3)
+
+
 @pytest.mark.parametrize("part", [0.0, -0.12, 0.2])
 def test_compensated_gravity_is_called_so(arm, part):
     error = told(arm, recorded(arm, 5, gravity=part))

@@ -68,8 +68,10 @@ class LogGeometryTuning:
     coarse_samples: int = 200
     # [1] Largest number of samples for the final comparison of the best hypotheses.
     confirming_samples: int = 800
-    # [rad] Zero offsets and tilts of the base below this bound are calibration errors.
+    # [rad] Zero offsets below this bound are calibration errors.
     min_angle: float = 0.09
+    # [rad] Tilts of the base below this bound are errors of the mounting.
+    min_tilt: float = 0.06
     # [m] Zero offsets of prismatic joints below this bound are calibration errors.
     min_shift: float = 0.01
     # [s] Delays of single joints below this bound are ascribed to friction, whose apparent delay is up to 30 ms.
