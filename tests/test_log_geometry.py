@@ -230,6 +230,21 @@ def test_a_link_with_a_mistyped_mass_is_named(arm):
     assert not [x for x in check_logs([log], arm).findings if x.code == "urdf-inertials"]
 
 
+@pytest.mark.parametrize("arm", ["ur10e"], indirect=True)
+@pytest.mark.parametrize("k", [3, 5])
+def test_a_mistyped_mass_at_the_wrist_is_named(arm, k):
+    """Ten times the mass of a link whose centre of mass is near its joint: only the joints before it carry it."""
+    t, q = excitation(arm, np.random.default_rng(17))
+    motion = q, np.gradient(q, t, axis=0), np.gradient(np.gradient(q, t, axis=0), t, axis=0)
+    log = Trajectory(t, *motion[:2], regressor(arm.chain, *motion) @ urdf_parameters(arm.chain), "exact")
+    bodies = list(arm.chain.bodies)
+    mass, *rest = bodies[k].inertia
+    bodies[k] = replace(bodies[k], inertia=(10 * mass, *(10 * x for x in rest[:3]), *rest[3:]))
+    report = check_logs([log], replace(arm, chain=replace(arm.chain, bodies=tuple(bodies))))
+    assert report.errors == ()
+    assert [x.where for x in report.findings if x.code == "urdf-inertials"] == [f"link {bodies[k].link!r}"]
+
+
 def test_training_refuses_it_unless_it_is_accepted(arm):
     wrong = flipped(recorded(arm, 7), 1, True, False)
     with pytest.raises(SpelgenError, match="--accept joint-sense"):

@@ -265,31 +265,40 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
 
 
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
-    """Yield a warning for each link whose first moment (mass times centre of mass) differs much from the URDF's.
+    """Yield a warning for each link whose mass or first moment (mass times centre of mass) is far from the URDF's.
 
-    The component along the URDF's first moment is compared. A difference must be large enough to be visible in the
-    torques, since wrong parameters of small distal bodies can compensate each other.
+    Of the first moment, the component along the URDF's is compared. A difference must be large enough to be visible in
+    the torques, since wrong parameters of small distal bodies can compensate each other.
     """
     visible = 0.5 * float(problem.samples.tau.std(axis=0).max())
     gravity = float(np.linalg.norm(fit.hypothesis.gravity))
+    levers: list[float] = []  # [m] length of the chain from the first joint to each body
     for k, body in enumerate(problem.arm.bodies):
-        block = slice(10 * k + 1, 10 * k + 4)
-        stated, moment = problem.prior_mean[block], fit.parameters[block]
-        length = float(np.linalg.norm(stated))
-        if not length or float(np.linalg.norm(moment - stated)) * gravity < visible:
-            continue
-        axis = stated / length
-        ratio = float(axis @ moment) / length
-        deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / length
-        # CAD models are wrong by a factor of less than 2.5. Four standard deviations are required, since one of many
-        # bodies may exceed two by chance.
-        if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
-            continue
-        message = (
-            f"its first moment (mass times centre of mass) is {ratio:.2f} +- {deviation:.2f} times the URDF's by "
-            "least squares: check its mass and centre of mass in the URDF"
+        length = float(np.linalg.norm(np.array(body.translation, dtype=float)))
+        levers.append(0.0 if body.parent < 0 else levers[body.parent] + length)
+        first = 10 * k
+        quantities = (
+            ("first moment (mass times centre of mass)", slice(first + 1, first + 4), 1.0),
+            ("mass", slice(first, first + 1), levers[k]),
         )
-        yield Diagnostic("warning", WRONG_LINK, f"link {body.link!r}", None, message)
+        for name, block, lever in quantities:
+            stated, found = problem.prior_mean[block], fit.parameters[block]
+            size = float(np.linalg.norm(stated))
+            if not size or float(np.linalg.norm(found - stated)) * lever * gravity < visible:
+                continue
+            axis = stated / size
+            ratio = float(axis @ found) / size
+            deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / size
+            # CAD models are wrong by a factor of less than 2.5. Four standard deviations are required, since one of
+            # many bodies may exceed two by chance.
+            if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
+                continue
+            message = (
+                f"its {name} is {ratio:.2f} +- {deviation:.2f} times the URDF's by least squares: check its mass and "
+                "centre of mass in the URDF"
+            )
+            yield Diagnostic("warning", WRONG_LINK, f"link {body.link!r}", None, message)
+            break
 
 
 def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic:
