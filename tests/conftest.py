@@ -23,20 +23,30 @@ LONGEST_FILES = (
     "test_torque_fit",
     "test_servo",
     "test_export_onnx",
-    "test_log_geometry",
     "test_workflow",
-    "test_types",
-    "test_live_c",
-    "test_comparison",
     "test_coupled_motors",
+    "test_comparison",
     "test_contracts",
-    "test_evaluation",
     "test_training",
-    "test_mapping_kept",
-    "test_export_torch",
+    "test_advice",
+    "test_late_joints",
+    "test_log_geometry",
+    "test_live_c",
+    "test_types",
+    "test_live",
     "test_check_logs",
+    "test_evaluation",
+    "test_export_torch",
     "test_fit",
+    "test_export_c",
+    "test_ros2_controller",
     "test_cli",
+    "test_arm",
+    "test_evidence",
+    "test_mapping_kept",
+    "test_emitted_module",
+    "test_good_data",
+    "test_ros2_estimator",
     "test_reference_arms",
 )
 
@@ -79,7 +89,18 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+def coarse_validation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rollouts of the validation have at most two steps per sample, for tests that do not look at its loss.
+
+    Steep friction would otherwise be integrated with 1, 2, 4, ... 32 steps, which takes longer than a torque fit.
+    """
+    from spelgen.fitting.tuning import FittingTuning
+
+    monkeypatch.setattr("spelgen.fitting.rollout.TUNING", FittingTuning(max_substeps=2))
+
+
+@pytest.fixture
+def short_torque_fits(monkeypatch: pytest.MonkeyPatch, coarse_validation: None) -> None:
     """Torque fits take two steps in few outer iterations, for tests of files, commands and messages."""
     from spelgen.fitting.torque.tuning import TorqueTuning
 

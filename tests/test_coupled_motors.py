@@ -71,6 +71,11 @@ def on_motors(q, qd, qdd, arm, strength, armature):
     return joint, np.linalg.solve(arm.actuation.matrix(), joint.T).T
 
 
+def noisy(tau):
+    """Torques (T, 6) with 1 % of noise, with which a fit takes a seventh of the time that it takes without noise."""
+    return tau + 0.01 * tau.std(axis=0) * np.random.default_rng(2).standard_normal(tau.shape)
+
+
 def test_motor_speeds_are_of_the_joint_that_each_moves_most(wrist):
     _, arm = wrist
     found = motor_speeds(arm.actuation.matrix())
@@ -108,7 +113,7 @@ def test_a_closed_form_model_is_fitted_to_a_coupled_wrist(wrist):
     motion = moved(module, 6.0)
     _, tau = on_motors(*motion, arm, strength, armature)
     model = module.Model()
-    fit_torque(model, [DynamicsSamples("x", *motion, tau)])
+    fit_torque(model, [DynamicsSamples("x", *motion, noisy(tau))])
     fresh = moved(module, 10.0, seed=1)
     _, tau = on_motors(*fresh, arm, strength, armature)
     with torch.no_grad():
@@ -176,7 +181,7 @@ def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
     found = least_squares(arm.chain, samples, LeastSquares("range"), arm.actuation.drives())
     assert (np.square(found.torque(*fresh) - expected).mean(axis=0) / expected.var(axis=0)).max() < 1e-10
     model = module.Model()
-    fit_torque(model, samples)
+    fit_torque(model, [DynamicsSamples("x", *motion, noisy(tau))])
     with torch.no_grad():
         learned = model.inverse_dynamics(*(torch.from_numpy(x) for x in fresh)).numpy()
     assert (np.square(learned - expected).mean(axis=0) / expected.var(axis=0)).max() < 2e-3
@@ -248,6 +253,7 @@ def test_logs_show_torques_that_are_late_or_early(uncoupled, tmp_path, late):
         assert aligned.nmse.mean() < 0.7 * as_logged.nmse.mean()  # noise is the rest
 
 
+@pytest.mark.usefixtures("coarse_validation")
 def test_a_fit_moves_late_torques_and_its_evaluation_too(uncoupled):
     log = recorded(uncoupled, "joints", 0.0, late=0.004)
     model = build(ROBOTS / "six_dof.urdf", "closed-form")
@@ -272,6 +278,7 @@ def test_no_delay_is_estimated_with_an_unspecified_coupling(uncoupled):
     )
 
 
+@pytest.mark.usefixtures("coarse_validation")
 def test_a_fit_has_the_coupling_that_its_logs_show(uncoupled, tmp_path):
     """The fit is the one of an arm whose settings state the coupling, and so are its run and its delay."""
     log, names = recorded(uncoupled, "joints", 1.0, late=0.01), uncoupled.chain.joint_names

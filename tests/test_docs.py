@@ -36,12 +36,14 @@ HISTORY = re.compile(
     re.IGNORECASE,
 )
 SLOW = {"tutorial_servo.md"}  # a fit of half a minute: only `pytest --update` runs it
-# Without the rows of the table of control.md that it does not assert, and with shorter motions without an estimator.
+# Without the rows of the table of control.md that it does not assert, with shorter motions, above all without an
+# estimator, and with larger steps of the simulated robot.
 SHORTER = {
     "control.md": {
         '("estimator", "learned", "URDF"):': '("estimator", "learned"):',
-        "PICKED, END = 3.0, 11.0": "PICKED, END = 3.0, 9.0",
-        "END, dynamics=with_load": "END if estimator else 6.0, dynamics=with_load",
+        "PICKED, END = 3.0, 11.0": "PICKED, END = 3.0, 7.0",
+        "substeps=8": "substeps=4",
+        "END, dynamics=with_load": "END if estimator else 5.5, dynamics=with_load",
     }
 }
 RUN = [page for page in PAGES if page.name not in SLOW or "--update" in sys.argv]

@@ -156,6 +156,32 @@ def test_no_spring_from_one_recording_at_a_joint_without_load(robots):
     assert (limits["raw_torque_splines"][gravity > 0.5 * gravity.max()] > 0).all()
 
 
+def test_ripple_has_frequencies_of_which_the_samples_contain_two_periods(hybrid):
+    """A range of 2 rad contains two periods of 7 per revolution (1.8 rad), but not of 6 (2.1 rad)."""
+    from spelgen.fitting.torque.joint_functions import RIPPLE, joint_functions
+
+    q = torch.stack([torch.linspace(-1, 1, 500).double(), torch.zeros(500).double()], dim=1)
+    candidates = joint_functions(hybrid, residual_of(q.sin(), q), Unabsorbed(), {(RIPPLE, 0)})
+    (candidate,) = candidates
+    cosines, sines = candidate.columns.chunk(2, dim=1)
+    for waves in (cosines, sines):
+        assert not waves[:, :6].any() and (waves[:, 6:].abs().amax(dim=0) > 0.1).all()
+
+
+def test_spring_extrapolates_to_positions_without_samples(hybrid):
+    """A linear spring with its neutral position at -0.3 rad is fitted from -0.5 to 0.5 rad."""
+    from spelgen.fitting.torque.joint_functions import TORQUE, joint_functions
+
+    q = torch.stack([torch.linspace(-0.5, 0.5, 500).double(), torch.zeros(500).double()], dim=1)
+    (candidate,) = joint_functions(hybrid, residual_of(q, q), Unabsorbed(), {(TORQUE, 0)})
+    candidate.write(hybrid.residuals, candidate.fit(3 * (q[:, 0] + 0.3), 1.0).coef)
+    beyond = torch.tensor([[-1.5, 0.0], [-0.8, 0.0], [0.8, 0.0], [1.5, 0.0]]).double()
+    with torch.no_grad():
+        torque = hybrid.residuals.at(beyond, hybrid.residuals.prepare(torch.eye(2).double())).torque[:, 0]
+        hybrid.residuals.raw_torque_splines.zero_()
+    torch.testing.assert_close(torque, 3 * (beyond[:, 0] + 0.3), rtol=0.02, atol=0.02)
+
+
 def test_slow_passes_are_few_errors(hybrid):
     """A joint that passes its range once has as many independent errors as the range has splines."""
     from spelgen.fitting.torque.joint_functions import joint_functions

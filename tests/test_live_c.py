@@ -25,6 +25,8 @@ SHARED = Path(__file__).parents[1] / ".." / "shared"
 RECORDED = ("ur10e", "panda", "shanghai", "xmate3", "ar5", "airbot", "tx40")
 """Arms with measured torques: logs of position commands have no estimator."""
 SAMPLES = 2000
+PLAIN = "-O0"
+"""Compiled in a quarter of the time; users compile with -O2, as some of the tests do."""
 
 
 def randomised(urdf, preset="hybrid"):
@@ -72,7 +74,7 @@ def test_c_equals_python_along_recordings(name, tmp_path):
     # The log odds of airbot amplify rounding errors most: without a delay, as in most fits.
     levels = levels_of(model, log, 0.02, delay=0.0 if name == "airbot" else 0.015)
     estimator = Estimator(load_run(saved_run(model, urdf, tmp_path).path), levels=levels)
-    compiled = CompiledEstimator(model, arm, levels)
+    compiled = CompiledEstimator(model, arm, levels, *([PLAIN] if name != "ur10e" else []))
     found = compiled.run(log.t, log.q, log.qd, log.tau)
     require_equal(found, estimator.replay(log), 1e-9)
     at = log.q[-1], log.qd[-1], 0.5 * log.qd[-1]
@@ -104,7 +106,7 @@ def test_c_equals_python_for_friction_without_a_state(tmp_path):
     model = randomised(urdf, tmp_path / "plain.yaml")
     log = motion_of(model, 8.0)
     levels = levels_of(model, log, 0.02)
-    found = CompiledEstimator(model, load_arm(urdf), levels).run(log.t, log.q, log.qd, log.tau)
+    found = CompiledEstimator(model, load_arm(urdf), levels, PLAIN).run(log.t, log.q, log.qd, log.tau)
     estimator = Estimator(load_run(saved_run(model, urdf, tmp_path / "run").path), levels=levels)
     require_equal(found, estimator.replay(log), 1e-9)
 
@@ -172,7 +174,7 @@ def test_float_is_close_to_double():
 
     double, single = (
         CompiledEstimator(model, arm_of("six_dof"), levels, *flags).run(log.t, log.q, log.qd, log.tau)
-        for flags in ((), ("-DSIX_DOF_FLOAT",))
+        for flags in ((PLAIN,), (PLAIN, "-DSIX_DOF_FLOAT"))
     )
     scale = np.abs(double.threshold).mean(axis=0)
     assert (np.abs(double.external_torque - single.external_torque).max(axis=0) < 0.1 * scale).all()
@@ -184,7 +186,7 @@ def test_a_saved_state_is_restored_and_a_damaged_one_is_not():
     log = motion_of(model, 10.0)
     from exported_runs import arm_of
 
-    compiled = CompiledEstimator(model, arm_of("six_dof"), levels_of(model, log))
+    compiled = CompiledEstimator(model, arm_of("six_dof"), levels_of(model, log), PLAIN)
     before = compiled.run(log.t, log.q, log.qd, log.tau)
     state = compiled.saved()
     compiled.start()

@@ -77,6 +77,7 @@ def test_trained_gains_are_stated_with_intervals_by_training_and_report(folder):
     assert message in (folder / "run" / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("coarse_validation")
 def test_a_run_is_adapted_with_the_mapping_that_it_was_trained_with(folder):
     data = ["--data", str(folder / "log.csv")]
     invoke("train", "--from", str(folder / "run"), *data, "-o", str(folder / "adapted"))
@@ -85,6 +86,7 @@ def test_a_run_is_adapted_with_the_mapping_that_it_was_trained_with(folder):
     ).read_bytes()
 
 
+@pytest.mark.usefixtures("coarse_validation")
 def test_the_lines_that_reproduce_a_run_give_the_same_model(folder, monkeypatch):
     run = RunFolder(folder / "run")
     (work := folder / "again").mkdir()

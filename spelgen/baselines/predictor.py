@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.equations import MotionEquations, equations_of
-from spelgen.dynamics.protocol import RigidDynamics, memory_after, sliding_memory
+from spelgen.dynamics.protocol import RigidDynamics, is_stateful, memory_after, sliding_memory
 from spelgen.logs.trajectory import LogRows
 from spelgen.logs.windows import Windows, thinned
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
@@ -38,7 +38,8 @@ def roll_out_stiff(
     disturbance: constant disturbance (W, n) from `observe`. If a prediction diverges, its later states are NaN.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
-    z = sliding_memory(dynamics, qd) if windows.z is None else windows.z
+    # The windows may have the friction state of another model: for friction without a state, it is omitted.
+    z = windows.z if windows.z is not None and is_stateful(dynamics) else sliding_memory(dynamics, qd)
     largest = windows.qd.abs().amax(dim=(0, 1))
     largest = torch.maximum(largest, 1e-3 * largest.max()).clamp(min=1e-2)
     if disturbance is None:

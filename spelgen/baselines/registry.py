@@ -1,4 +1,4 @@
-"""List of all baselines, in the order of tables. `fit` fits the baselines, `evaluate` compares a model with them."""
+"""List of all baselines, in the order of tables. `evaluate` compares a model with them; `baselines.fit` fits them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,25 +9,19 @@ from typing import Any
 import numpy as np
 
 from spelgen.arm.configured_arm import Arm
+from spelgen.baselines.fit import FRICTION, FittedBaselines
 from spelgen.baselines.predictor import CommandFollower, Predictor, States, of_dynamics
-from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import identified_dynamics
-from spelgen.errors import Diagnostic, LogError, in_one_line
+from spelgen.errors import Diagnostic, in_one_line
 from spelgen.labels import (
     CONSTANT_VELOCITY,
     DELAYED_COMMAND,
-    LEAST_SQUARES,
-    LEAST_SQUARES_WITH_MEMORY,
     LINEAR_SERVOS,
     URDF,
     URDF_WITH_DRIVES,
 )
-from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory, coverage, require_torques
 from spelgen.logs.windows import Windows
 
-FittedBaselines = dict[str, Any]
-"""Content of least_squares.json: the fitted baselines, and the range of motion of the training logs."""
 LinearServoRecord = Mapping[str, Any]
 """Parameters of `LinearServos` in the record of a fit, by name."""
 
@@ -99,13 +93,6 @@ def _missing(where: str, reason: str) -> Diagnostic:
     return Diagnostic("info", "no-urdf-baseline", where, None, f"no comparison with the URDF: {reason}")
 
 
-FRICTION = {
-    LEAST_SQUARES: ("parameters", FrictionModel()),
-    LEAST_SQUARES_WITH_MEMORY: ("parameters_with_memory", FrictionModel(memory=True)),
-}
-"""{name of a predictor: (key of its parameters in least_squares.json, its friction model)}."""
-
-
 def least_squares(arm: EvaluatedArm) -> list[Predictor]:
     """Return one predictor per friction model, with the parameters that `fit_baselines` has identified.
 
@@ -132,35 +119,6 @@ BASELINES: tuple[Callable[[EvaluatedArm], list[Predictor]], ...] = (
 def torque_predictors(arm: EvaluatedArm) -> list[Predictor]:
     """Return all baselines for an arm under torques."""
     return list(chain.from_iterable(baseline(arm) for baseline in BASELINES))
-
-
-def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> FittedBaselines:
-    """Return the content of least_squares.json: the motion that the logs cover, and identified parameters.
-
-    The motion is described by the duration, and by ranges and histograms of positions and velocities (see `coverage`).
-    For each friction model, inertial and friction parameters are identified by linear least squares. The parameters are
-    absent if the logs have no torques or no accelerations.
-
-    preprocessing: preprocessing of the fit, in which all default values are resolved.
-    """
-    # Imported here: evaluation reads the fitted baselines.
-    from spelgen.identification.identification import LeastSquares
-    from spelgen.identification.identify import identify_by
-
-    # The coverage is stored for the assessment of an evaluation, which compares the motion in test logs with it.
-    fitted: FittedBaselines = {"coverage": coverage(logs)}
-    methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
-    try:
-        require_torques(logs)
-        identified = identify_by(arm, logs, methods, preprocessing)
-    # An error of the identification is ignored, because the model can be fitted without this baseline.
-    except (LogError, np.linalg.LinAlgError):
-        return fitted
-    fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
-    # The whole identification is recorded for the friction model without bristles. For the friction model with
-    # bristles, only the parameters are recorded.
-    parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
-    return {**fitted, **fits["parameters"].to_dict(), **parameters}
 
 
 def command_followers(

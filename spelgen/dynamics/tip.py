@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from scipy.spatial.transform import Rotation
 
-from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.urdf.read import read_urdf
-from spelgen.urdf.robot import Robot, UrdfJoint
+from spelgen.urdf.robot import Robot, UrdfJoint, mimic_constraint
 
 if TYPE_CHECKING:
     from pytorch_kinematics import SerialChain

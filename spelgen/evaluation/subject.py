@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 
 from spelgen.arm.configured_arm import Arm, urdf_path
-from spelgen.baselines.registry import FittedBaselines, LinearServoRecord
+from spelgen.baselines.fit import FittedBaselines
+from spelgen.baselines.registry import LinearServoRecord
 from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.emission.specify import arm_of_spec

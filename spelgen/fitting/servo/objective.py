@@ -19,7 +19,7 @@ import torch
 from spelgen.dynamics.bristles import encoder_step
 from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import FitRequest, PreparedLogs, digest
-from spelgen.fitting.levenberg_marquardt import SolverState, initial_state, levenberg_marquardt
+from spelgen.fitting.levenberg_marquardt import SolverState, levenberg_marquardt
 from spelgen.fitting.objective import Objective, Status
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_record import Content
@@ -110,9 +110,10 @@ class ServoObjective(Objective):
         show = partial(_show_progress, progress, number)
         # The damping is smaller in the second and third outer iteration, which start near the minimum.
         damping = DAMPING.initial_damping if number == 1 else TUNING.later_damping
+        x = self._iterates[-1]
         result = levenberg_marquardt(
             problem,
-            initial_state(problem, self._iterates[-1], damping, self._steps),
+            SolverState(x, self._errors, problem.cost(x, self._errors), damping, self._steps),
             max_steps=TUNING.steps if number < OUTER_ITERATIONS else TUNING.last_steps,
             min_decrease=TUNING.min_decrease,
             min_relative_decrease=TUNING.min_relative_decrease,
@@ -153,14 +154,14 @@ class ServoObjective(Objective):
             rollouts = replace(rollouts, windows=replace(rollouts.windows, steps=self._windows.steps))
         if self._iterates:
             rollouts = rollouts.linearized(x, rollouts.predicted_motion(x))
-        errors = rollouts.residual(x)
-        self._rollouts, self._problem = rollouts, ServoProblem.of(rollouts, self._noise, errors)
+        self._errors = rollouts.residual(x)
+        self._rollouts, self._problem = rollouts, ServoProblem.of(rollouts, self._noise, self._errors)
         # The model's weights are set to x, since the checkpoint contains them: an interrupted fit then has a usable
         # model.
         rollouts.parameters.write(x)
         self._iterates.append(x)
         self._first_steps = self._steps
-        self._update_checkpoint(float(errors.square().mean().sqrt()))
+        self._update_checkpoint(float(self._errors.square().mean().sqrt()))
 
     def _update_checkpoint(self, rms: float) -> None:
         """Set the content of checkpoint.pt. rms: RMS position error of all joints [rad, m]."""

@@ -40,7 +40,7 @@ class JointFunction:
 
     The term has W entries for the joint, for example spline coefficients; the parameter in the model is the entries
     divided by `scale`. The last W weights of the linear model are changes of single entries. The first L weights are
-    coefficients of trends, for example of a straight line over all spline coefficients.
+    coefficients of trends: the mean and the slope of all spline coefficients.
 
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
@@ -194,10 +194,12 @@ def joint_functions(
 ) -> Iterator[JointFunction]:
     """Yield the candidate terms of each joint (smooth torque, friction factor, ripple), or only the selected ones.
 
-    The spline coefficients of a smooth torque or of a friction factor have one common prior precision; ripple has one
-    per frequency. A smooth torque also has a straight line with its own precision, since, unlike splines, a line
-    extrapolates to positions without samples (torque of a spring). selected: (parameter, joint) of the terms to yield;
-    None: all.
+    The spline coefficients of a smooth torque or of a friction factor have one common prior precision. A smooth torque
+    also has the mean and the slope of its coefficients with precisions of their own, since, unlike splines, a line
+    extrapolates to positions without samples (torque of a spring). Ripple has one precision per frequency, and only
+    frequencies of which the samples contain two periods: slower ones fit a trend, and are wrong at other positions.
+
+    selected: (parameter, joint) of the terms to yield; None: all.
     """
     terms, motors = model.residuals, motors_of(model)
     with torch.no_grad():
@@ -206,11 +208,15 @@ def joint_functions(
     # The number of visits of a joint is 1 + path length / knot spacing of the splines.
     visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
     one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
-    line = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1)
+    # At least two periods: width >= 2 * 2 pi / frequency.
+    width = (samples.q.amax(dim=0) - samples.q.amin(dim=0)).unsqueeze(-1)
+    ripple = ripple * (terms.frequencies * width >= 4 * torch.pi).repeat(1, 2)
     friction = splines * samples.friction.unsqueeze(-1)
+    line = torch.stack([torch.ones(SPLINES), torch.linspace(-1, 1, SPLINES)], dim=1).double()
+    mean_slope_others = torch.arange(SPLINES + 2).clamp(max=2)
     no_line, no_trend = line[:, :0], torch.zeros(len(frequencies), 0).double()
     forms = (
-        (TORQUE, splines, unit, joints, line, F.pad(one_group + 1, (1, 0))),
+        (TORQUE, splines, unit, joints, line, mean_slope_others),
         (FRICTION, friction, torch.ones(len(motors)), motors, no_line, one_group),
         (RIPPLE, ripple, unit, joints, no_trend, frequencies),
     )
