@@ -104,11 +104,20 @@ class TestChain:
             "finger_2",
         ]
 
-    def test_two_sliders_side_by_side_at_the_end_are_a_gripper(self, robot):
-        jaws = joint("j7", "1", "l", "prismatic"), joint("j8", "1", "r", "prismatic")
-        arm = make_arm(robot(joint("a", "0", "1"), *jaws))
-        assert names(arm) == ["a"]
+    @pytest.mark.parametrize("kind, mimic", [("prismatic", ""), ("prismatic", "j7"), ("revolute", "j7")])
+    def test_two_jaws_side_by_side_at_the_end_are_a_gripper_or_stated(self, robot, kind, mimic):
+        jaw = joint("j8", "1", "r", kind, inside=mimic and f'<mimic joint="{mimic}"/>')
+        arm = make_arm(robot(joint("a", "0", "1"), joint("j7", "1", "l", kind), jaw))
+        assert names(arm) == (["a"] if kind == "prismatic" else ["a", "j7"])
         assert "ambiguous-chain" in codes(arm)
+
+    @pytest.mark.parametrize("travel", [0.04, 0.4])
+    def test_a_short_slide_at_the_end_may_open_a_gripper(self, robot, travel):
+        slide = joint("b", "1", "2", "prismatic")
+        slide = re.sub('lower="[^"]*" upper="[^"]*"', f'lower="0" upper="{travel}"', slide)
+        arm = make_arm(robot(joint("a", "0", "1"), slide))
+        assert names(arm) == ["a", "b"]
+        assert ("ambiguous-chain" in codes(arm)) == (travel < 0.1)
 
     def test_a_joint_of_effort_zero_decides_a_draw(self, robot):
         spring = joint("spring", "1", "s").replace('effort="3"', 'effort="0"')

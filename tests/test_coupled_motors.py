@@ -316,10 +316,10 @@ def test_logs_of_plain_drives_suggest_nothing(uncoupled):
     assert not codes & {"coupled-motors", "torque-delay"}
 
 
-def trained_gains(tmp_path, names):
-    """A closed-form model of six_dof.urdf whose settings state no gears; all gains are trained."""
+def trained_gains(tmp_path, names, gear=1):
+    """A closed-form model of six_dof.urdf in which all gains are trained, from `gear` on."""
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
-    joints = ", ".join(f"{x}: {{gear: 1, gain: trained}}" for x in names)
+    joints = ", ".join(f"{x}: {{gear: {gear}, gain: trained}}" for x in names)
     (tmp_path / "arm.yaml").write_text(f"torque: motor\njoints: {{{joints}}}\n", encoding="utf-8")
     return build(tmp_path / "arm.urdf", "closed-form")
 
@@ -354,3 +354,14 @@ def test_initial_gains_that_are_far_off_are_replaced(uncoupled, tmp_path):
     np.testing.assert_allclose(found[1:5] / gains[1:5], 1.0, atol=0.35)
     assert found[0] == pytest.approx(np.median(found[1:5]), rel=0.3)
     assert found[5] == 1.0
+
+
+def test_initial_gains_that_are_right_are_kept(uncoupled, tmp_path):
+    """The slope is computed from joint torques: `gear` is not applied a second time."""
+    model = trained_gains(tmp_path, uncoupled.chain.joint_names, gear=40)
+    log = recorded(uncoupled, "joints", 0.0)
+    (samples,) = dynamics_samples([replace(log, tau=log.tau / 40.0)])
+    set_initial_gains(model, TorqueSamples.of([samples], 2), 0.3)
+    with torch.no_grad():
+        found = model.input_matrix(torch.zeros(6).double()).diagonal().numpy()
+    np.testing.assert_allclose(found, 40.0, rtol=1e-12)

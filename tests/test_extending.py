@@ -74,7 +74,7 @@ def test_a_log_format(tmp_path, monkeypatch, log):
 
     def read(path, joints, mapping):
         path.with_suffix(".csv").write_text(path.read_text().replace(";", ","))
-        return formats.read_tables(path.with_suffix(".csv"), joints, mapping)
+        return formats.CSV.read(path.with_suffix(".csv"), joints, mapping)
 
     monkeypatch.setattr(formats, "FORMATS", [*formats.FORMATS, LogFormat(read, suffixes=(".toy",))])
     spelgen.write_logs(tmp_path / "log.csv", [log], JOINTS)

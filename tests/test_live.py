@@ -18,13 +18,14 @@ from spelgen.cli.main import app
 from spelgen.dynamics.body_regressor import chain_regressor, pseudo_inertia
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.emission.build import build
-from spelgen.errors import RunError
+from spelgen.errors import LogError, RunError
 from spelgen.fitting.fitted import load_run
 from spelgen.live.estimator import Estimator
 from spelgen.live.filters import Block
 from spelgen.live.levels import block_noise, held_out_tail
 from spelgen.live.momentum import balance, load_terms
 from spelgen.live.payload import find_payload
+from spelgen.live.replay import replay
 from spelgen.live.tuning import TUNING
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -433,6 +434,13 @@ def test_models_that_it_cannot_use_are_refused(arm, levels, tmp_path):
     plain.estimator.write_text('{"minutes": "many"}')
     with pytest.raises(RunError, match=r"estimator\.json"):
         Estimator(load_run(plain.path))
+
+
+def test_logs_with_errors_are_refused_as_by_evaluate(arm, run):
+    log = arm[1]
+    degrees = dataclasses.replace(log, q=np.degrees(log.q), qd=np.degrees(log.qd))
+    with pytest.raises(LogError, match="q in deg"):
+        replay(load_run(run), [degrees])
 
 
 def test_training_from_a_run_prints_the_load(arm, run, tmp_path):

@@ -26,7 +26,7 @@ from spelgen.logs import checks, formats, npz
 from spelgen.logs.formats import FORMATS
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.suggest import suggest_mapping
-from spelgen.logs.tables import LogFormat, table_layout
+from spelgen.logs.tables import LogFormat, LogTable
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import LogMapping
 
@@ -274,7 +274,7 @@ def test_delan_characters_are_read(shared):
 NPZ = {
     "missing": (
         {"t": T, "q": Q, "tau": TAU},
-        "{}: missing columns qd_shoulder, qd_elbow: got only the columns t, q, tau, "
+        "{}: missing columns qd_shoulder, qd_elbow: got only the columns t, q, tau, q_shoulder, q_elbow, and 2 more, "
         "expected t, q_<joint>, qd_<joint>, tau_<joint>; "
         "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged",
     ),
@@ -357,15 +357,11 @@ def test_arrays_that_promise_more_than_they_hold_are_refused(tmp_path):
 def test_a_new_format_is_a_reader_and_its_name_among_the_formats(tmp_path, monkeypatch):
     """As docs/extending.md says: reading, folders, messages and suggestions follow."""
 
-    def as_table(file):
-        rows = [[float(x) for x in line.split()] for line in file.read_text().splitlines()]
-        return pa.table(dict(zip(columns(), np.transpose(rows), strict=True)))
-
     def read(file, joints, mapping):
-        table = as_table(file)
-        return [(table_layout(table.schema, joints, mapping, file), table)]
+        rows = [[float(x) for x in line.split()] for line in file.read_text().splitlines()]
+        return [LogTable.of(pa.table(dict(zip(columns(), np.transpose(rows), strict=True))), mapping)]
 
-    monkeypatch.setattr(formats, "FORMATS", [*FORMATS, LogFormat(read, suffixes=(".txt",), columns=as_table)])
+    monkeypatch.setattr(formats, "FORMATS", [*FORMATS, LogFormat(read, suffixes=(".txt",))])
     np.savetxt(tmp_path / "x.txt", np.stack(list(columns().values()), axis=1), fmt="%.17g")
     check(read_logs(tmp_path, JOINTS)[0], "x")
     assert "q_shoulder" in suggest_mapping(tmp_path / "x.txt", JOINTS).text

@@ -182,6 +182,10 @@ def test_pairs_and_links_that_cannot_be_checked_are_named(urdf, monkeypatch):
     text = collisions(urdf, Surroundings()).statement
     assert "Not checked, since their shapes overlap in most positions: b and d." in text
     assert text.endswith("Not checked, since their shapes cannot be read: c (c.stl).")
+    urdf.write_text(ARM.replace("collision", "visual", ARM.count("collision") - 2))  # one shape remains
+    assert collisions(urdf, Surroundings()).statement.startswith(
+        "Not checked: collisions (there are no pairs of"
+    )
     urdf.write_text(ARM.replace("collision", "visual"))
     found = excite(load_arm(urdf), **QUICK)
     assert found.collisions == "Not checked: collisions (the URDF has no collision geometry)."

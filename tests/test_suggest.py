@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.errors import LogError
 from spelgen.logs.read import read_logs
 from spelgen.logs.suggest import suggest_mapping
 
@@ -184,3 +185,13 @@ def test_the_command_writes_the_mapping_and_uses_it(robots, tmp_path):
     assert told.stdout.startswith(
         f"wrote {tmp_path}/map.yaml; check it, then pass it by --mapping\nscara: 1 trajectory"
     )
+
+
+@pytest.mark.parametrize("command, measured", [("u", "q"), ("goal_position", "present_position")])
+def test_commands_beside_a_load_register_are_those_of_servos(scara, tmp_path, command, measured):
+    names = [x.name for x in scara.chain.coordinates]
+    head = ["t", *(f"{x}_{name}" for x in (measured, command, "load") for name in names)]
+    path = written(tmp_path / "log.csv", head, np.column_stack([T, Q, Q, TAU]))
+    with pytest.raises(LogError, match=r"got commanded positions and no torques.*write 'input: position'"):
+        suggest_mapping(path, names)
+    assert f'"u": "{command}_{names[0]}"' in suggest_mapping(path, names, commands=True).text

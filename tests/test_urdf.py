@@ -141,7 +141,22 @@ DOCUMENTS = {
     "empty": ("  \n", "FILE: got an empty file, expected a URDF document"),
     "not xml": (
         "joint1: 0.3\n",
-        "FILE:1: not well-formed XML (Start tag expected, '<' not found)",
+        "FILE:1: not well-formed XML (Start tag expected, '<' not found); "
+        "name the URDF: this is a file of another kind",
+    ),
+    "web page": (
+        "\n<!DOCTYPE html><html></html>",
+        "FILE: got a web page, expected a URDF document; download the file itself: 'Raw' on the page of a "
+        "repository",
+    ),
+    "zip": (
+        b"PK\3\4\0",
+        "FILE: got a ZIP archive, expected a URDF document; unpack it, and name the URDF in it",
+    ),
+    "srdf": (
+        '<robot name="r"><group name="arm"/></robot>',
+        "FILE:1: <robot>: got no <link>, expected a tree of links and joints; this is an SRDF file: name the URDF "
+        "that it belongs to",
     ),
     "cut off": (
         '<robot name="r">\n<link name="a">',
@@ -271,9 +286,13 @@ CONTENTS = {
     ),
     "commas": (
         LINKS + joint('<origin xyz="0, 0, 0"/>'),
-        "FILE:5: joint 'j' origin xyz: got '0,', expected three numbers in decimal notation; separate "
-        "numbers by "
-        "spaces",
+        "FILE:5: joint 'j' origin xyz: got '0,', expected three numbers in decimal notation; write "
+        "decimal points, and spaces between numbers",
+    ),
+    "quaternion": (
+        LINKS + joint('<origin quat_xyzw="0 0 0 1"/>'),
+        "FILE:5: joint 'j' origin quat_xyzw: got the attribute 'quat_xyzw', expected xyz [m] and rpy [rad]; "
+        "convert the rotation to rpy",
     ),
     "not a number": (
         LINKS + joint('<origin xyz="0 nan 0"/>'),

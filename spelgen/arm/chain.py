@@ -13,6 +13,8 @@ from spelgen.urdf.robot import Robot, UrdfJoint
 # Names of joints of grippers. The arm ends at the first joint of a gripper.
 _GRIPPER = re.compile(r"gripper|finger|thumb|knuckle|(?:^|[^a-z])jaws?(?:[^a-z]|$)", re.IGNORECASE)
 
+_LARGEST_JAW = 0.1  # [m] longest travel of a prismatic joint that probably opens a gripper
+
 
 class ChainChoice(NamedTuple):
     """The joints of the chain, from the root to the tip, and diagnostics of their selection."""
@@ -143,8 +145,8 @@ def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain of joints from the root to a tip, without the joints of grippers.
 
     If several chains are the longest, and only one of them has effort limits for all joints, this chain is returned;
-    otherwise ArmError is raised. Exception: if the chains differ only in their last joints, prismatic joints with the
-    same parent link (a pair of jaws), the chain without these joints is returned.
+    otherwise ArmError is raised. Exception: the last joint is omitted if it is one of a pair of jaws, prismatic joints
+    with the same parent link. They are a joint and its mimic joint, or the joints in which the longest chains differ.
     """
     # The end of each branch may be the tip. The longest chain is the arm, because hands, tools and sensors are on
     # shorter branches.
@@ -156,16 +158,16 @@ def _longest(robot: Robot) -> ChainChoice:
     if not length:
         return ChainChoice(())
     first, last = longest[0], longest[0][-1]
-    if len(longest) == 1:
-        return ChainChoice(first, _possible_gripper(robot, last))
-    # The two jaws of a gripper form two chains of equal length, which differ only in the last joint: a prismatic joint
-    # with the same parent link.
-    if first[:-1] and {(*x[:-1], x[-1].type, x[-1].parent) for x in longest} == {
-        (*first[:-1], "prismatic", last.parent)
-    }:
-        jaws = ", ".join(repr(chain[-1].name) for chain in longest)
-        message = f"{jaws} slide side by side at the end of the chain: taken as a gripper's and locked"
+    by_leader = leaders(robot)
+    jaws = [chain[-1] for chain in longest]
+    jaws += [joint for joint in robot.joints if joint.mimic and by_leader[joint.name].leader == last]
+    is_pair = len(jaws) > 1 and {(x.type, x.parent) for x in jaws} == {(last.type, last.parent)}
+    if first[:-1] and is_pair and last.type == "prismatic":
+        names = ", ".join(repr(joint.name) for joint in jaws)
+        message = f"{names} slide side by side at the end of the chain: taken as a gripper's and locked"
         return ChainChoice(first[:-1], _remark(last, "info", message))
+    if len(longest) == 1:
+        return ChainChoice(first, _possible_gripper(robot, last, is_pair))
     # A joint without effort limit (absent, or 0 in the file) probably has no motor: the chain without such joints is
     # the arm.
     driven = [chain for chain in longest if all(joint.effort is not None for joint in chain)]
@@ -180,14 +182,17 @@ def _longest(robot: Robot) -> ChainChoice:
     raise ArmError(got, file=robot.source, expected="one longest chain", do=do)
 
 
-def _possible_gripper(robot: Robot, last: UrdfJoint) -> tuple[Diagnostic, ...]:
+def _possible_gripper(robot: Robot, last: UrdfJoint, is_pair: bool) -> tuple[Diagnostic, ...]:
     """Return a remark if the last joint of the chain may open a gripper; otherwise no remark.
 
-    The joint may open a gripper if its child link has the name of a gripper, and no joint of the robot has such a name.
-    A joint with a range of more than half a turn rotates the gripper as a whole, because no jaw opens that far.
+    The joint may open a gripper if it is prismatic and moves by at most 0.1 m, if it is one of a pair of jaws
+    (``is_pair``), or if its child link has the name of a gripper, and no joint of the robot has such a name. A joint
+    with a range of more than half a turn rotates the gripper as a whole, because no jaw opens that far.
     """
-    turns = last.lower is not None and last.upper is not None and last.upper - last.lower > math.pi
-    if turns or not _GRIPPER.search(last.child) or any(map(_GRIPPER.search, robot.joint)):
+    travel = last.upper - last.lower if last.lower is not None and last.upper is not None else 0.0
+    is_named = bool(_GRIPPER.search(last.child)) and not any(map(_GRIPPER.search, robot.joint))
+    is_jaw = is_pair or (last.type == "prismatic" and 0 < travel <= _LARGEST_JAW)
+    if travel > math.pi or not (is_jaw or is_named):
         return ()
     message = (
         f"moves the link {last.child!r}, as the last joint of the arm: if it opens a gripper, exclude it by "

@@ -173,11 +173,10 @@ def report(
         say(f"wrote {write_runs(runs, output or Path('runs.html'))}")
         return
     path, folder = write_report(runs[0], output, robot), RunFolder(runs[0])
-    listing = None
     if folder.evaluation.exists():
         listing = summary(Results.from_dict(folder.read_json(folder.evaluation)))
-    if listing is not None:
-        say(listing.text() + "\n")
+        if listing is not None:
+            say(listing.text() + "\n")
     say(f"wrote {path}: the report, for any browser" if path.suffix == ".html" else f"wrote {path}")
 
 

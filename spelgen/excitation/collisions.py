@@ -99,7 +99,9 @@ class Collisions:
         """Text for users that lists the pairs that are checked for collisions and the pairs that are not."""
         pairs = counted(self.pairs, "pair")
         clearance = f"approach included; all keep {1e3 * self.clearance:g} mm"
-        text = f"Checked: {pairs} of links{self._surroundings}, {clearance}."
+        text = "Not checked: collisions (there are no pairs of links whose shapes can be compared)."
+        if self.pairs:
+            text = f"Checked: {pairs} of links{self._surroundings}, {clearance}."
         if self.ignored:
             text += f" Not checked, since their shapes overlap in most positions: {', '.join(self.ignored)}."
         if self.unread:

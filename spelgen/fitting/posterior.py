@@ -208,10 +208,9 @@ class Posterior:
     def listings(self) -> tuple[Listing, Listing]:
         """Two tables with 95 % intervals: the determined base parameters, and constants of the drives."""
         determined = [x for x in self.base_parameters if x.determined in PRECISE]
-        note = (
-            f"{len(self.base_parameters) - len(determined)} more are not determined to 20 %. Unidentifiable on their "
-            f"own: {', '.join(self.unidentifiable) or 'none'}."
-        )
+        others = len(self.base_parameters) - len(determined)
+        note = f"{others} more are not determined to 20 %. " if others else ""
+        note += f"Unidentifiable on their own: {', '.join(self.unidentifiable) or 'none'}."
         title = f"Base parameters [{self.base_units}], with half 95 % intervals; numbers after names: joint"
         columns = {"joint": list(self.model.joint_names), **self.drive_columns}
         drives = tuple(zip(*columns.values(), strict=True))

@@ -13,6 +13,7 @@ from spelgen.listing import WIDTH
 from spelgen.live.estimator import Estimator, EstimatorState
 from spelgen.live.payload import Payload
 from spelgen.live.tuning import TUNING
+from spelgen.logs.checks import check
 from spelgen.logs.trajectory import Trajectory, require_torques
 
 
@@ -74,7 +75,7 @@ class LogEstimate:
         """Return the estimates as text for users."""
         lines = [f"{self.log.name}: {payload_sentence(self.payload)}"]
         if self.since is not None:
-            lines.append(f"  reported first at {self.since:.1f} s")
+            lines.append(f"  a payload was reported first at {self.since:.1f} s")
         lines += [f"  another load at {at:.1f} s" for at in self.changes]
         for contact in self.contacts:
             pairs = zip(contact.joints, contact.torques, strict=True)
@@ -128,15 +129,18 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
         fit: fit of an arm's model to torques.
         logs: logs of the same arm.
         alarms_per_minute: rate of false contact alarms [1/min]; None: default.
+
+    Raises LogError for logs that cannot be used, such as positions in degrees.
     """
     require_torques(logs)
-    estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
     joints, results = fit.model.joint_names, []
     for log in logs:
-        if log.q.shape[1] != fit.model.n:
-            raise LogError(
-                f"{log.q.shape[1]} joints", file=log.file, expected=f"{fit.model.n}, as the model has"
-            )
+        if log.q.shape[1] != len(joints):
+            expected = f"{len(joints)}, as the model has"
+            raise LogError(f"{log.q.shape[1]} joints", file=log.file, expected=expected)
+    check(logs, joints, fit.model.joint_types)
+    estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
+    for log in logs:
         estimator.reset()
         states = estimator.replay(log)
         times = log.t - log.t[0]

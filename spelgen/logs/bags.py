@@ -7,7 +7,6 @@ body. https://mcap.dev/spec
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ from spelgen.errors import LogError, in_one_line
 from spelgen.files import limited_memory, require_regular_file
 from spelgen.labels import counted
 from spelgen.logs.joint_signals import mapping_line
-from spelgen.logs.tables import LogTable, table_layout
+from spelgen.logs.tables import LogTable
 from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
@@ -49,10 +48,6 @@ class StampedState(NamedTuple):
     state: Any
 
 
-TimedState = tuple[int, Any]
-"""Time [ns] of a joint state, and the joint state."""
-
-
 def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return the joint states of a bag, or of a single file of a bag, as one table.
 
@@ -63,27 +58,19 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     remarks: list[str] = []
     names = list(map(mapping.log_name, joints))
     messages = _of_one_arm(list(_messages(path, mapping.topic, remarks)), names, path, remarks)
-    table = _joint_states(path, _stamped(messages, remarks), names)
+    stamped = [message for message in messages if message.stamp]
+    times = np.array([message.stamp for message in stamped])
+    # The clocks of publisher and recorder may differ by hours and are never mixed.
+    if not stamped:
+        remarks.append("no message has a stamp: times are those at which the recorder received them")
+        stamped, times = messages, np.array([message.recorded for message in messages])
+    elif len(stamped) < len(messages):
+        remarks.append(f"{counted(len(messages) - len(stamped), 'message')} without a stamp left out")
+    columns = {"t": (times - times[0]) * 1e-9} | _joint_states(path, stamped, names)
     # ROS defines the fields of a joint state in SI units, so columns and units of the mapping do not apply
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
-    layout = table_layout(table.schema, joints, mapping, path)
-    return [(replace(layout, remarks=tuple(remarks)), table)]
-
-
-def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[TimedState]:
-    """Return the joint states, each with its time stamp [ns]; messages without a stamp are omitted.
-
-    If no message has a stamp, the times are those at which the recorder received the messages. The two clocks may
-    differ by hours and are never mixed.
-    """
-    stamped = [(x.stamp, x.state) for x in messages if x.stamp]
-    if messages and not stamped:
-        remarks.append("no message has a stamp: times are those at which the recorder received them")
-        return [(x.recorded, x.state) for x in messages]
-    if len(stamped) < len(messages):
-        remarks.append(f"{counted(len(messages) - len(stamped), 'message')} without a stamp left out")
-    return stamped
+    return [LogTable.of(pa.table(columns), mapping, remarks=tuple(remarks))]
 
 
 def _of_one_arm(
@@ -122,34 +109,31 @@ def _of_one_arm(
     return of_arm
 
 
-def _joint_states(path: Path, messages: Sequence[TimedState], names: Sequence[str]) -> pa.Table:
-    """Return a table with the columns `t`, `q_<name>`, `qd_<name>` and `tau_<name>` of the joints `names`.
+def _joint_states(
+    path: Path, messages: Sequence[StampedState], names: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """Return the columns `q_<name>`, `qd_<name>` and `tau_<name>` of the joints `names`, each (T,).
 
     Fields that are empty in all messages are omitted; values of joints that a message does not contain are NaN.
     """
-    times: list[int] = []
-    rows: list[np.ndarray] = []
-    for stamp, state in messages:
-        row = np.full((len(FIELDS), len(names)), np.nan)
+    data = np.full((len(FIELDS), len(names), len(messages)), np.nan)
+    for row, (*_, state) in enumerate(messages):
         logged = [k for k, name in enumerate(names) if name in state.name]
         indices = [state.name.index(names[k]) for k in logged]
-        for values, field in zip(row, FIELDS.values(), strict=True):
+        for values, field in zip(data, FIELDS.values(), strict=True):
             array = np.asarray(getattr(state, field), dtype=float)
             if len(array) not in (0, len(state.name)):
-                got, element = f"{len(array)} values for {len(state.name)} joints", f"message {len(rows) + 1}"
+                got, element = f"{len(array)} values for {len(state.name)} joints", f"message {row + 1}"
                 raise LogError(got, file=path, element=f"{element}, {field}", expected="one of each")
             # ROS allows empty fields in a joint state, such as a missing effort
             if len(array):
-                values[logged] = array[indices]
-        times.append(stamp)
-        rows.append(row)
-    columns = {"t": (np.array(times) - times[0]) * 1e-9}
-    # array of the three quantities q, qd and tau of n joints at T times, (3, n, T)
-    for quantity, by_joint in zip(FIELDS, np.array(rows).transpose(1, 2, 0), strict=True):
+                values[logged, row] = array[indices]
+    columns: dict[str, np.ndarray] = {}
+    for quantity, by_joint in zip(FIELDS, data, strict=True):
         if not np.isnan(by_joint).all():
-            for name, values in zip(names, by_joint, strict=True):
-                columns[PLAIN[quantity].replace("{joint}", name)] = values
-    return pa.table(columns)
+            pattern = PLAIN[quantity]
+            columns |= {pattern.replace("{joint}", x): y for x, y in zip(names, by_joint, strict=True)}
+    return columns
 
 
 def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
@@ -189,14 +173,21 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
         # A damaged bag could exhaust the memory, since rosbags unpacks chunks of any size. Messages decoded to arrays
         # need ten times their size in the file, so the bound of 20 times the file size suffices.
         with limited_memory(MEMORY + 20 * size):
-            messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, topic, path)
+            messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, path)
             unfinished = [] if is_ros1 else _unfinished(path)
             if unfinished:
-                messages = _without_end(unfinished, topic, path, remarks)
+                messages = _without_end(unfinished, path, remarks)
+            topics = set()
             for name, recorded, raw in messages:
-                state: Any = decode(raw, MESSAGE)
-                clock = state.header.stamp
-                yield StampedState(name, clock.sec * 1_000_000_000 + clock.nanosec, recorded, state)
+                topics.add(name)
+                if topic in (None, name):
+                    state: Any = decode(raw, MESSAGE)
+                    clock = state.header.stamp
+                    yield StampedState(name, clock.sec * 1_000_000_000 + clock.nanosec, recorded, state)
+        if topic is not None and topic not in topics:
+            raise LogError(
+                f"no joint states on {topic}", file=path, expected=f"one of {', '.join(sorted(topics))}"
+            )
     except (LogError, GeneratorExit):
         raise
     except Exception as error:  # rosbags and its decompressors raise exceptions of many types
@@ -205,14 +196,15 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
         raise LogError(got, file=path, do=None if isinstance(error, MemoryError) else do) from error
 
 
-def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> Iterator[RawState]:
-    """Yield the encoded joint states on `topic`, or on all topics if it is None, read with `rosbags`."""
+def _read_by(open_bag: Callable[[Path], Any], path: Path) -> Iterator[RawState]:
+    """Yield the encoded joint states on all topics, read with `rosbags`. Raises LogError for a bag without any."""
     with open_bag(path) as reader:
-        topics = {f"{x.topic} ({x.msgtype})" for x in reader.connections}
         connections = [x for x in reader.connections if x.msgtype == MESSAGE]
-        _require_topic({x.topic for x in connections}, topics, topic, path)
-        chosen = [x for x in connections if topic in (None, x.topic)]
-        for connection, recorded, raw in reader.messages(chosen):
+        if not connections:
+            topics = sorted({f"{x.topic} ({x.msgtype})" for x in reader.connections})
+            got = f"only the topics {', '.join(topics) or '(none)'}"
+            raise LogError(got, file=path, expected=f"one of {MESSAGE}")
+        for connection, recorded, raw in reader.messages(connections):
             yield connection.topic, recorded, raw
 
 
@@ -228,31 +220,14 @@ def _unfinished(path: Path) -> list[Path]:
     return []
 
 
-def _without_end(
-    files: Sequence[Path], topic: str | None, path: Path, remarks: list[str]
-) -> Iterator[RawState]:
-    """Yield the encoded joint states on `topic`, or on all topics if it is None, from MCAP files without an end."""
+def _without_end(files: Sequence[Path], path: Path, remarks: list[str]) -> Iterator[RawState]:
+    """Yield the encoded joint states on all topics from MCAP files without an end."""
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
         got = "a recording that was not closed, without a complete message of joint states"
         raise LogError(got, file=path, expected="an MCAP file with an end", do="try `mcap recover FILE`")
-    _require_topic({name for name, _, _ in messages}, set(), topic, path)
     remarks.append("the recording was not closed: all complete messages were read")
-    yield from (message for message in messages if topic in (None, message[0]))
-
-
-def _require_topic(topics: set[str], present: set[str], topic: str | None, path: Path) -> None:
-    """Raise LogError for a bag without joint states, or without joint states on the requested topic.
-
-    topics: all topics with joint states. present: topics with any type of message, which the error lists. topic: the
-    requested topic; None if any topic is accepted.
-    """
-    if not topics:
-        got, expected = f"only the topics {', '.join(sorted(present)) or '(none)'}", f"one of {MESSAGE}"
-        raise LogError(got, file=path, expected=expected)
-    if topic is not None and topic not in topics:
-        expected = f"one of {', '.join(sorted(topics))}"
-        raise LogError(f"no joint states on {topic}", file=path, expected=expected)
+    yield from messages
 
 
 def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:

@@ -252,8 +252,7 @@ class LogChecks:
         self.products += products
         factors, correlations = velocity_agreement(products)
         for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
-            columns, fits = (trajectory.q[:, k], trajectory.qd[:, k]), correlations[:, k].tolist()
-            signals = JointSignals(trajectory, k, kind, self._joints, *columns, factors.tolist(), fits)
+            signals = JointSignals(trajectory, k, kind, self._joints, factors, correlations[:, k])
             for check, advice in run_checks(CHECKS, signals, trajectory.accepted):
                 self._add(joint, check, advice, trajectory)
 
@@ -272,7 +271,8 @@ class LogChecks:
             # For checks with `everywhere`, the fault must occur in all trajectories: a joint may rest in some of them,
             # for example.
             if not check.everywhere or len(occurrences) == self._count:
-                is_error = check.severity == "error" or occurrences[0][0].is_line
+                advice, _, _ = occurrences[0]
+                is_error = check.severity == "error" or advice.joint or advice.keys
                 groups.setdefault((check, "" if is_error else group), []).append(group)
         for (check, _), names in groups.items():
             occurrences = self._results[names[0], check]

@@ -4,8 +4,7 @@ import codecs
 import csv
 import re
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import accumulate, takewhile, zip_longest
+from itertools import takewhile, zip_longest
 from pathlib import Path
 from statistics import mode
 from typing import NamedTuple
@@ -15,7 +14,7 @@ import pyarrow.csv
 
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
-from spelgen.logs.tables import LogTable, table_layout
+from spelgen.logs.tables import LogTable
 from spelgen.logs.values import is_number, stamps
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
@@ -45,19 +44,12 @@ class Beginning(NamedTuple):
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return a list with one table, the content of a CSV file; an incomplete last line is omitted, with a remark."""
-    table, header, cut = _csv_table(file)
+    table, header, cut = csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
-    return [
-        (replace(table_layout(table.schema, joints, mapping, file), remarks=remarks, header=header), table)
-    ]
+    return [LogTable.of(table, mapping, remarks=remarks, header=header)]
 
 
-def csv_columns(file: Path) -> pa.Table:
-    """Return all columns of a CSV file as logged."""
-    return _csv_table(file)[0]
-
-
-def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
+def csv_table(file: Path) -> tuple[pa.Table, int, str]:
     """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
 
     Columns may be separated by commas, semicolons, tabs, bars or spaces; numbers may have decimal commas; the encoding
@@ -102,39 +94,63 @@ def _csv_table(file: Path) -> tuple[pa.Table, int, str]:
 
 
 def _beginning(file: Path) -> Beginning:
-    """Return the beginning of a CSV file.
-
-    The header is the first line with as many cells as most lines have, which is a comment only if values follow it
-    directly. Between header and values there may be lines without digits, such as units, and repeats of the header.
-    """
+    """Return the beginning of a CSV file."""
     encoding, head = _decoded_head(file)
     lines = head.lstrip("\ufeff").splitlines() or [""]
+    delimiter, cells, width = _divided(lines)
+    header = _header_row(lines, cells, width)
+    names, start = cells[header], header
+    if not is_number(names[0]):
+        names, start = _column_names(lines, cells, header)
+        names = names + [""] * (width - len(names))
+    return Beginning(encoding, delimiter, names, start, "\n".join(lines[start:]))
+
+
+def _divided(lines: Sequence[str]) -> tuple[str, list[list[str]], int]:
+    """Return the delimiter of the columns, the cells of each line, and the most frequent number of cells of a line."""
     # Names of columns may contain spaces, and numbers decimal commas, so spaces and commas are tried last.
     for delimiter in "\t;|, ":
         cells = [_cells(COMMENT.sub("", line), delimiter) for line in lines]
         width = mode(map(len, cells[:-1] or cells))
         if width > 2:
             break
+    return delimiter, cells, width
+
+
+def _header_row(lines: Sequence[str], cells: Sequence[Sequence[str]], width: int) -> int:
+    """Return the index of the header, or of the first row of values in a file without a header.
+
+    The header is the first line with as many cells as most lines have (`width`), which is a comment only if values
+    follow it directly.
+    """
     # In rows that end with a delimiter, the last cell has no name.
-    ends = width - all(row[-1] == "" for row in cells[1:-1] if len(row) == width)
-    full = [k for k, row in enumerate(cells) if len(row) in (ends, width)] or [0]
+    is_ended = all(row[-1] == "" for row in cells[1:-1] if len(row) == width)
+    full = [k for k, row in enumerate(cells) if len(row) in (width, width - is_ended)] or [0]
     first = next((k for k in full if not COMMENT.match(lines[k])), full[0])
-    if is_number(cells[first][0]):
-        first = max((k for k in full if k < first), default=first)
-    names, rows = cells[first], range(first + 1, len(lines) - 1)
-    if is_number(names[0]):
-        return Beginning(encoding, delimiter, names, first, "\n".join(lines[first:]))
-    # Names may be in two lines: the quantities, repeated or once for several joints, and below them the joints.
+    before = full.index(first) - 1
+    return full[before] if before >= 0 and is_number(cells[first][0]) else first
+
+
+def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int) -> tuple[list[str], int]:
+    """Return the names of the columns, and the index of the first row of values.
+
+    Between header and values there may be lines without digits, such as units, and repeats of the header. Names may be
+    in two lines: the quantities, repeated or once for several joints, and below them the joints.
+    """
+    names, between = cells[header], header + 1
     is_repeated = len(set(names)) < len(names) - 1
-    named = cells if is_repeated else [None] * len(cells)
-    between = [*takewhile(lambda k: _is_text(lines[k], lines[first], named[k]), rows)]
-    if is_repeated and between:
-        filled = accumulate(names, lambda left, name: name or left, initial="")
-        columns = zip_longest([*filled][1:], *(cells[k] for k in between), fillvalue="")
+    start = between
+    while start < len(lines) - 1 and _is_text(
+        lines[start], lines[header], cells[start] if is_repeated else None
+    ):
+        start += 1
+    if is_repeated and start > between:
+        filled = names[:1]
+        for name in names[1:]:
+            filled.append(name or filled[-1])
+        columns = zip_longest(filled, *cells[between:start], fillvalue="")
         names = ["_".join(filter(None, dict.fromkeys(column))) for column in columns]
-    start = first + 1 + len(between)
-    names = names + [""] * (width - len(names))
-    return Beginning(encoding, delimiter, names, start, "\n".join(lines[start:]))
+    return names, start
 
 
 def _is_text(line: str, header: str, cells: Sequence[str] | None) -> bool:

@@ -5,13 +5,15 @@ To add a format, write a module like `csv_files.py` and add a `LogFormat` to FOR
 
 import pkgutil
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
+import pyarrow as pa
+
 from spelgen.errors import LogError, SpelgenError
 from spelgen.files import local, require_regular_file
-from spelgen.logs.tables import LogFormat, LogTable, reading
+from spelgen.logs.tables import Layout, LogFormat, LogTable, reading, stored_columns, table_layout
 from spelgen.settings.log_mapping import LogMapping
 
 LogPaths = Path | str | Iterable[Path | str]
@@ -39,17 +41,11 @@ def _lazy(name: str) -> Callable[..., list[LogTable]]:
     return lambda *arguments: pkgutil.resolve_name(f"spelgen.logs.{name}")(*arguments)
 
 
-PARQUET = LogFormat(
-    _lazy("parquet_files:read_parquet"), (".parquet",), _lazy("parquet_files:parquet_columns")
-)
-CSV = LogFormat(_lazy("csv_files:read_csv"), (".csv", ".tsv"), _lazy("csv_files:csv_columns"))
-NPZ = LogFormat(_lazy("npz:read_npz"), (".npz",), _lazy("npz:npz_columns"))
-JSON_LINES = LogFormat(
-    _lazy("parquet_files:read_json_lines"), (".jsonl", ".ndjson"), _lazy("parquet_files:json_columns")
-)
-BAG = LogFormat(
-    _lazy("bags:read_bag"), (".mcap", ".db3", ".bag"), marker="metadata.yaml", folder="a ROS 2 bag"
-)
+PARQUET = LogFormat(_lazy("parquet_files:read_parquet"), (".parquet",))
+CSV = LogFormat(_lazy("csv_files:read_csv"), (".csv", ".tsv"))
+NPZ = LogFormat(_lazy("npz:read_npz"), (".npz",))
+JSON_LINES = LogFormat(_lazy("parquet_files:read_json_lines"), (".jsonl", ".ndjson"))
+BAG = LogFormat(_lazy("bags:read_bag"), (".mcap", ".db3", ".bag"), "metadata.yaml", "a ROS 2 bag")
 LEROBOT = LogFormat(_lazy("parquet_files:read_dataset"), marker="meta/info.json", folder="a LeRobot data set")
 FORMATS = [PARQUET, CSV, NPZ, JSON_LINES, BAG, LEROBOT]
 
@@ -63,15 +59,17 @@ def format_of(path: Path) -> LogFormat | None:
     return None
 
 
-def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the tables of a log, read by the reader of its format.
+def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> Iterator[tuple[Layout, pa.Table]]:
+    """Yield the tables of a log with their layouts, read by the reader of its format, one at a time.
 
     path: file or folder, one of the results of `log_files`. Raises LogError for a damaged file and for missing columns.
     """
     log_format = format_of(path)
     assert log_format is not None, "log_files gives logs alone"
     with reading(path):
-        return log_format.read(path, joints, mapping)
+        for log in log_format.read(path, joints, mapping):
+            layout = table_layout(log, joints, path)
+            yield layout, log.read(stored_columns(layout, log.schema.names))
 
 
 def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], list[SpelgenError]]:

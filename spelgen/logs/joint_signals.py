@@ -33,11 +33,6 @@ class Advice(NamedTuple):
     joint: Mapping[str, Any] = {}
     keys: Mapping[str, Any] = {}
 
-    @property
-    def is_line(self) -> bool:
-        """True if settings that correct the log are known."""
-        return bool(self.joint or self.keys)
-
 
 def settings_line(keys: Mapping[str, object]) -> str:
     """Return settings as one line of YAML, without the outer braces."""
@@ -76,20 +71,26 @@ class JointSignals(NamedTuple):
         number: index of the joint.
         kind: joint type: "continuous", "revolute" or "prismatic".
         joints: names of all joints.
-        q: (T,) positions of the joint [rad, m].
-        qd: (T,) velocities of the joint [rad/s, m/s].
-        factors: ratio of dq/dt to qd of each of the n joints, 1 for correct units; NaN for joints at rest.
-        correlations: correlation of this joint's dq/dt with the qd of each of the n joints; NaN for joints at rest.
+        factors: (n,) ratio of dq/dt to qd of each joint, 1 for correct units; NaN for joints at rest.
+        correlations: (n,) correlation of this joint's dq/dt with the qd of each joint; NaN for joints at rest.
     """
 
     trajectory: Trajectory
     number: int
     kind: str
     joints: Sequence[str]
-    q: np.ndarray
-    qd: np.ndarray
-    factors: Sequence[float]
-    correlations: Sequence[float]
+    factors: np.ndarray
+    correlations: np.ndarray
+
+    @property
+    def q(self) -> np.ndarray:
+        """Positions of the joint (T,) [rad, m]."""
+        return self.trajectory.q[:, self.number]
+
+    @property
+    def qd(self) -> np.ndarray:
+        """Velocities of the joint (T,) [rad/s, m/s]."""
+        return self.trajectory.qd[:, self.number]
 
     @property
     def turns(self) -> bool:
@@ -127,16 +128,12 @@ class JointSignals(NamedTuple):
     @property
     def factor(self) -> float:
         """Ratio of dq/dt to qd; NaN for a joint at rest."""
-        return self.factors[self.number]
+        return float(self.factors[self.number])
 
     @property
     def correlation(self) -> float:
         """Correlation of this joint's dq/dt with its own qd."""
-        return self.correlations[self.number]
-
-    def changes_by(self, unit: float) -> bool:
-        """Return True if dq/dt is about `unit` times qd: the unit of q or qd is then wrong by this factor."""
-        return self.correlation > SIGNALS.agreement and is_factor(self.factor, unit)
+        return float(self.correlations[self.number])
 
 
 def is_factor(value: float, unit: float) -> bool:
@@ -189,8 +186,11 @@ def find_dropouts(signals: JointSignals) -> str | None:
 
 def find_words(signals: JointSignals) -> Advice | None:
     """Return a finding if a signal of the joint consists of undecoded register words or of wrapped angles."""
-    found = (_find_words(signals, name) for name in signals.trajectory.quantities)
-    return next((advice for advice in found if advice is not None), None)
+    for name in signals.trajectory.quantities:
+        advice = _find_words(signals, name)
+        if advice is not None:
+            return advice
+    return None
 
 
 def find_jumps(signals: JointSignals) -> str | None:

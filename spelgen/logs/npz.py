@@ -1,7 +1,8 @@
 """Reader of NPZ archives that contain one array per column, or matrices with one column per joint."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+import re
+from collections.abc import Collection, Sequence
+from itertools import starmap
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -9,12 +10,15 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.logs.tables import LogTable, missing_columns, stored_columns, table_layout
+from spelgen.logs.tables import LogTable, missing_columns
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
 JOINT_NAMES = "joints"  # name of an optional array with the names of the joints in the columns of matrices
 TRAJECTORY = "{trajectory}"
+
+Columns = dict[str, tuple[str, int]]
+"""Columns of matrices: {name of the column: (name of the matrix, index)}."""
 
 
 class NpzArrays:
@@ -59,15 +63,6 @@ class NpzArrays:
         """Return True for an array (T,), (T, 1) or (1, T): MATLAB stores vectors as matrices."""
         return max(self[name].shape, default=0) == self[name].size
 
-    def column(self, name: str, *, is_list: bool) -> pa.Array:
-        """Return the array of this name as a column of a table. is_list: the rows of a matrix become lists."""
-        array = self[name]
-        # The array is converted to double precision and native byte order, since Arrow rejects other types and byte
-        # orders.
-        wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
-        values = pa.array(array.astype(wide).ravel())
-        return pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if is_list else values
-
 
 def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return one table per recording; only the arrays that the mapping names are read.
@@ -78,100 +73,97 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     arrays, times = NpzArrays(file), mapping.columns.t
     if TRAJECTORY not in times:
         return [_table(None, arrays, joints, mapping)]
-    texts = [text for text in (_trajectory_text(times, name) for name in arrays.names) if text is not None]
+    # A text that occurs several times is the same text: a second wildcard could take exponential time on long names.
+    first, *others = map(re.escape, times.split(TRAJECTORY))
+    pattern = re.compile(first + "(.+)" + r"\1".join(others), re.DOTALL)
+    texts = [match[1] for match in map(pattern.fullmatch, arrays.names) if match]
     if not texts:
         raise missing_columns([times], arrays.names, file, mapping, joints)
     return [_table(text, arrays, joints, mapping.of_trajectory(text)) for text in texts]
 
 
-def npz_columns(file: Path) -> pa.Table:
-    """Return a table of all arrays with as many rows as the longest one; matrices become columns of lists."""
-    arrays = NpzArrays(file)
-    names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
-    lengths = {name: arrays[name].size if arrays.is_vector(name) else len(arrays[name]) for name in names}
-    samples = max(lengths.values(), default=0)
-    columns = [name for name, length in lengths.items() if length == samples]
-    return pa.table({name: arrays.column(name, is_list=not arrays.is_vector(name)) for name in columns})
-
-
-def _trajectory_text(pattern: str, name: str) -> str | None:
-    """Return the text that an array's name has in place of `{trajectory}`; None if the name does not match the pattern.
-
-    A pattern may contain `{trajectory}` several times, for the same text. The length of the text is computed from the
-    length of the name. A regular expression with several wildcards could take exponential time on long names.
-    """
-    start = pattern.index(TRAJECTORY)
-    length = (len(name) - len(pattern)) // pattern.count(TRAJECTORY) + len(TRAJECTORY)
-    text = name[start : start + length]
-    fits = length > 0 and pattern.replace(TRAJECTORY, text) == name
-    return text if fits else None
-
-
 def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping) -> LogTable:
     """Return the table of one recording of the archive; `recording` is its name, None if it is the only one."""
-    for quantity in mapping.quantities:
-        mapping = _with_matrix_columns(quantity, arrays, joints, mapping)
+    columns: Columns = {}
+    patterns: dict[str, str] = {}
+    for quantity in mapping.quantities if joints else ():
+        pattern = mapping.pattern(quantity)
+        # The name of a matrix may have no placeholder.
+        named = pattern if "{joint}" in pattern else pattern + "_{joint}"
+        found = _matrix_columns(named, arrays, [mapping.log_name(joint) for joint in joints])
+        if found:
+            columns, patterns[quantity] = columns | found, named
+    mapping = mapping.model_copy(update={"columns": mapping.columns.model_copy(update=patterns)})
+    # The other columns in the mapping are vectors, or elements of a matrix, such as data[0].
+    vectors = {mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))}
+
+    def read(names: list[str] | None) -> pa.Table:
+        return _longest(arrays) if names is None else _equally_long(arrays, names, vectors, columns)
+
     # the schema has names without types, since the type of an array is known only after reading it
-    schema = pa.schema([(name, pa.null()) for name in arrays.names])
-    layout = table_layout(schema, joints, mapping, arrays.file)
-    if recording is not None:
-        layout = replace(layout, labels=None, recording=recording)
-    columns, matrices, samples = stored_columns(layout, arrays.names), set(), None
-    for name in columns:
-        shape = arrays[name].shape
-        # The layout names an array as a whole, or the columns of a matrix, such as q[0].
-        if name not in layout.columns and len(shape) == 2:
-            matrices.add(name)
-        length = shape[0] if name in matrices else arrays[name].size
-        samples = length if samples is None else samples
-        if length != samples or not (arrays.is_vector(name) or name in matrices):
-            expected = f"a value for each of the {samples} times"
-            do = "resample it to these times"
-            raise arrays.error(name, f"an array of shape {shape}", expected, do)
-    return layout, pa.table({name: arrays.column(name, is_list=name in matrices) for name in columns})
+    schema = pa.schema([(name, pa.null()) for name in [*arrays.names, *columns]])
+    return LogTable(schema, read, mapping, recording=recording)
 
 
-def _with_matrix_columns(
-    quantity: str, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping
-) -> LogMapping:
-    """Return the mapping with columns such as `q[0]` for a quantity that is stored as a matrix (T, n).
+def _equally_long(
+    arrays: NpzArrays, names: Sequence[str], vectors: Collection[str], matrix_columns: Columns
+) -> pa.Table:
+    """Return a table of arrays; other matrices (T, n) become columns of lists. Raises LogError if lengths differ.
 
-    If the archive contains no such matrix, the mapping is returned unchanged.
+    vectors: names of arrays that are vectors, also if they have the shape (T, 1) or (1, T).
     """
-    pattern = mapping.pattern(quantity)
-    matrix = pattern.replace("{joint}", "").rstrip("_")
-    if matrix not in arrays.names or arrays[matrix].ndim < 2:
-        return mapping
-    if arrays[matrix].ndim > 2:
-        got, expected = f"an array of shape {arrays[matrix].shape}", "a row per time and a column per joint"
-        raise arrays.error(matrix, got, expected, "store an array per recording, such as q_1, q_2")
-    names = [mapping.log_name(joint) for joint in joints]
-    column_of = dict(zip(names, _matrix_columns(arrays, matrix, names), strict=True))
-    columns: dict[str, dict[str, str | None]] = {}
-    for joint, name in zip(joints, names, strict=True):
-        column = mapping.column(quantity, joint)
-        # The mapping may assign the column of another joint to this joint; owners[0] is the joint whose column it is.
-        owners = [x for x in (name, *names) if pattern.replace("{joint}", x) == column]
-        columns[joint] = {quantity: f"{matrix}[{column_of[owners[0]]}]" if owners else column}
-    return mapping.with_joint_columns(columns)
+    table: dict[str, pa.Array] = {}
+    samples = None
+    for name in names:
+        stored, index = matrix_columns.get(name, (name, None))
+        array = arrays[stored]
+        is_matrix = array.ndim == 2 and (index is not None or name not in vectors)
+        length = len(array) if is_matrix else array.size
+        samples = length if samples is None else samples
+        if length != samples or not (is_matrix or arrays.is_vector(stored)):
+            expected, do = f"a value for each of the {samples} times", "resample it to these times"
+            raise arrays.error(stored, f"an array of shape {array.shape}", expected, do)
+        # The array is converted to double precision and native byte order, since Arrow rejects other types and byte
+        # orders.
+        wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
+        values = pa.array((array if index is None else array[:, index]).astype(wide).ravel())
+        is_list = is_matrix and index is None
+        table[name] = pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if is_list else values
+    return pa.table(table)
 
 
-def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str]) -> list[int]:
-    """Return the index of each joint's column in a matrix.
+def _longest(arrays: NpzArrays) -> pa.Table:
+    """Return a table of the arrays with as many rows as the longest one; matrices (T, n) become columns of lists."""
+    names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
+    vectors = set(filter(arrays.is_vector, names))
+    rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
+    samples = max(rows.values(), default=0)
+    return _equally_long(arrays, [name for name in names if rows[name] == samples], vectors, {})
+
+
+def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Columns:
+    """Return the columns of a matrix (T, n) by names such as `q_<joint>`; {} if the archive has no such matrix.
 
     The array `joints` of the archive states the order of the columns; without it the order is the arm's.
+
+    pattern: name of the columns, with a placeholder. names: names of the arm's joints in the log.
     """
-    width = arrays[matrix].shape[1]
-    if JOINT_NAMES not in arrays.names:
-        if width != len(joints):
-            expected, do = f"{len(joints)}, one for each joint", f"name them by an array {JOINT_NAMES!r}"
-            if len(arrays[matrix]) == len(joints):
-                do = "transpose it: rows are times"
-            raise arrays.error(matrix, f"{width} columns", expected, do)
-        return list(range(width))
-    names = list(map(str, arrays[JOINT_NAMES].ravel()))
-    for joint in joints:
-        if joint not in names or len(names) != width:
-            expected = f"{joint} among the names of the {width} columns of {matrix}"
-            raise arrays.error(JOINT_NAMES, f"the joints {', '.join(names)}", expected)
-    return list(map(names.index, joints))
+    matrix = pattern.replace("{joint}", "").rstrip("_")
+    if matrix not in arrays.names or arrays[matrix].ndim < 2:
+        return {}
+    rows, width, *others = arrays[matrix].shape
+    if others:
+        got, expected = f"an array of shape {arrays[matrix].shape}", "a row per time and a column per joint"
+        raise arrays.error(matrix, got, expected, "store an array per recording, such as q_1, q_2")
+    if JOINT_NAMES in arrays.names:
+        logged = list(map(str, arrays[JOINT_NAMES].ravel()))
+        absent = [name for name in names if name not in logged or len(logged) != width]
+        if absent:
+            expected = f"{absent[0]} among the names of the {width} columns of {matrix}"
+            raise arrays.error(JOINT_NAMES, f"the joints {', '.join(logged)}", expected)
+        names = logged
+    elif width != len(names):
+        is_turned = rows == len(names)
+        do = "transpose it: rows are times" if is_turned else f"name them by an array {JOINT_NAMES!r}"
+        raise arrays.error(matrix, f"{width} columns", f"{len(names)}, one for each joint", do)
+    return {pattern.replace("{joint}", name): (matrix, index) for index, name in enumerate(names)}

@@ -1,7 +1,6 @@
 """Reader of Parquet logs, of JSON lines, and of LeRobot 3 data sets, which consist of Parquet files."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import pyarrow.parquet
 
 from spelgen.errors import LogError, collect
 from spelgen.files import read_json, require_regular_file
-from spelgen.logs.tables import LogTable, reading, stored_columns, table_layout
+from spelgen.logs.tables import LogTable, reading
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.yaml_document import YamlDocument, validated
 
@@ -30,28 +29,19 @@ UNLESS_NORMALISED = "unless they are LeRobot's normalised values"
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return a list with one table, the content of a file. The mapping is ignored for files that spelgen wrote."""
     schema = pa.parquet.read_schema(file)
-    flat = _flat(schema.empty_table()).schema
-    layout = table_layout(flat, joints, mapping, file)
-    read = stored_columns(layout, flat.names)
-    columns = [x for x in schema.names if any(name == x or name.startswith(f"{x}.") for name in read)]
-    # Pre-buffering is disabled, because it would keep the compressed file in memory in addition to the table.
-    return [(layout, _flat(pa.parquet.read_table(file, columns=columns, pre_buffer=False)))]
 
+    def read(names: list[str] | None) -> pa.Table:
+        if names is not None:
+            names = [x for x in schema.names if any(name == x or name.startswith(f"{x}.") for name in names)]
+        # Pre-buffering would keep the compressed file in memory in addition to the table.
+        return _flat(pa.parquet.read_table(file, columns=names, pre_buffer=False))
 
-def parquet_columns(file: Path) -> pa.Table:
-    """Return all columns of a Parquet file."""
-    return _flat(pa.parquet.read_table(file))
+    return [LogTable(_flat(schema.empty_table()).schema, reading(file)(read), mapping)]
 
 
 def read_json_lines(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return a list with one table, the content of a file with a JSON object per line and row."""
-    table = json_columns(file)
-    return [(replace(table_layout(table.schema, joints, mapping, file), header=0), table)]
-
-
-def json_columns(file: Path) -> pa.Table:
-    """Return all columns of a file of JSON lines."""
-    return _flat(pa.json.read_json(file))
+    return [LogTable.of(_flat(pa.json.read_json(file)), mapping, header=0)]
 
 
 def _flat(table: pa.Table) -> pa.Table:
@@ -98,11 +88,10 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
             f"times are frame numbers at {fps:g} frames per second and not measured: delays, damping and armatures are "
             "as right as this rate; 'sample_rate: HZ' under 'logs' states another one",
         )
-    tables: list[LogTable] = []
+    tables = []
     for file in files:
         with reading(file):
-            ((layout, table),) = read_parquet(file, joints, mapping)
-            tables.append((replace(layout, file=folder, remarks=remarks), table))
+            tables += [table._replace(remarks=remarks) for table in read_parquet(file, joints, mapping)]
     return tables
 
 

@@ -94,10 +94,9 @@ def _read(
     files, errors = log_files(paths, role)
     for file in files:
         try:
-            tables = read_tables(file, source.joints, source.mapping)
-            # A table is removed from the list before it is added, so that its memory can be freed afterwards.
-            while tables:
-                segments.add(*tables.pop(0))
+            for layout, table in read_tables(file, source.joints, source.mapping):
+                segments.add(layout, table)
+                del table  # so that its memory can be freed before the next table is read
         except LogError as error:
             errors.append(error)
     trajectories = []

@@ -1,6 +1,6 @@
 """Conversion of rows in SI units to trajectories: sorting, unwrapping, removal of repeats, velocities, torque delay."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 from math import pi
 
@@ -21,60 +21,104 @@ from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import SIGNALS, TUNING
 from spelgen.logs.values import foreign_rows, is_split
-from spelgen.settings.log_mapping import LogMapping
-
-Repaired = tuple[np.ndarray, tuple[str, ...]]
-"""Rows of a log, (T, C) with C columns, after a repair, and messages about the changes."""
 
 
-def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:
+class Rows:
+    """Rows of one recording in SI units while they are repaired.
+
+    Attributes:
+        data: (T, C) values of the C columns of the layout; the first column contains the times [s].
+        numbers: (T,) row numbers in the file, for errors.
+        layout: names of the columns, and the mapping with units, signs and offsets.
+        signals: quantity and joint of each column after the times.
+        repairs: messages about rows that were changed or removed.
+        remarks: messages about properties of the recording.
+    """
+
+    def __init__(self, data: np.ndarray, numbers: np.ndarray, layout: Layout) -> None:
+        self.data, self.numbers, self.layout = data, numbers, layout
+        self.signals = layout.mapping.signals(layout.joints)
+        self.repairs: list[str] = []
+        self.remarks = list(layout.remarks)
+
+    @property
+    def t(self) -> np.ndarray:
+        """Times (T,) [s]."""
+        return self.data[:, 0]
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Positions (T, n) [rad, m]."""
+        return self.data[:, 1 : 1 + len(self.layout.joints)]
+
+    @property
+    def columns(self) -> dict[tuple[str, str], np.ndarray]:
+        """{(quantity, joint): values (T,)}, which are views of the data."""
+        return dict(zip(self.signals, self.data[:, 1:].T, strict=True))
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Keep the rows of a mask (T,), or rows with the given indices in the given order."""
+        self.data, self.numbers = self.data[rows], self.numbers[rows]
+
+    def leave_out(self, rows: np.ndarray, reason: str) -> None:
+        """Remove the rows of a mask (T,), if there are any, with a message that begins with their number."""
+        if rows.any():
+            self.keep(~rows)
+            self.repairs.append(f"{counted(int(rows.sum()), 'row')} {reason}")
+
+
+def make_trajectory(data: np.ndarray, numbers: np.ndarray, layout: Layout, name: str) -> Trajectory:
     """Return the trajectory of the rows `data`, (T, C) in SI units, with the C columns of the layout.
 
-    First wrapped angles and overflowed registers are unwrapped, and repeated rows are removed; with the setting
-    'dropouts: dropped' lost rows and outliers are removed, too. Then the signals are shifted by the mapping's delays,
-    and velocities that were not logged are computed by differentiation. repairs: messages about changed rows.
+    Rows get increasing times (see `_order_in_time`). Then wrapped angles and overflowed registers are unwrapped, and
+    repeated rows are removed; with the setting 'dropouts: dropped' lost rows and outliers are removed, too. At last the
+    signals are shifted by the mapping's delays, and velocities that were not logged are computed by differentiation.
+
+    numbers: (T,) row numbers in the file, for errors. Raises LogError for wrong times.
     """
-    mapping = layout.mapping
-    signals = mapping.signals(layout.joints)
-    data, wraps = _without_wraps(data, signals, mapping)
-    data, dropped = _without_repeats(data, len(layout.joints), mapping)
-    repairs += dropped
+    rows, mapping = Rows(data, numbers, layout), layout.mapping
+    if is_split(data):
+        _join_signals(rows)
+    rows.leave_out(
+        foreign_rows(rows.data, len(layout.joints)),
+        "left out, of another topic or publisher: without values, or with positions only",
+    )
+    rows.leave_out(np.isnan(rows.data).any(axis=1), "left out, with a signal without a number")
+    if mapping.sample_rate:
+        rows.t[:] = np.arange(len(rows.t)) / mapping.sample_rate
+    else:
+        _order_in_time(rows)
+    _unwrap(rows)
+    _leave_out_repeats(rows)
     if mapping.dropouts == "dropped":
-        data, dropped = _without_outliers(data, signals)
-        repairs += dropped
-    data = _without_delays(data, signals, mapping)
-    t, *columns = np.split(data, [1 + len(layout.joints) * k for k in range(len(mapping.quantities))], axis=1)
-    t, logged = t[:, 0], dict(zip(mapping.quantities, columns, strict=True))
+        _leave_out_outliers(rows)
+    _remove_delays(rows)
+    t, count = rows.t, len(layout.joints)
+    columns = np.split(rows.data[:, 1:], range(count, count * len(mapping.quantities), count), axis=1)
+    logged = dict(zip(mapping.quantities, columns, strict=True))
     q = logged["q"]
-    qd = logged.get("qd", np.zeros_like(q))
     if "qd" not in logged:
-        for rows in _pieces(t):
-            qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # central difference of q
-    tau = logged.get("tau", np.zeros((len(t), 0)))
+        logged["qd"] = np.zeros_like(q)
+        for piece in _pieces(t):
+            logged["qd"][piece] = np.gradient(q[piece], t[piece], axis=0)  # central difference of q
+    logged.setdefault("tau", np.zeros((len(t), 0)))
     return Trajectory(
-        t, q, qd, tau, name, layout.file, layout.accepted, logged.get("u"), repairs, layout.remarks + wraps, mapping
+        t, **logged, name=name, file=layout.file, accepted=layout.accepted, mapping=mapping,
+        repairs=tuple(rows.repairs), remarks=tuple(rows.remarks),
     )  # fmt: skip
 
 
-def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> Repaired:
-    """Return the rows `data`, (T, C) with C columns, after unwrapping of signals, and remarks about the wraps.
-
-    Signals are unwrapped if the mapping states a period for them. signals: quantity and joint of each column after the
-    times.
-    """
-    remarks: list[str] = []
-    if not any(mapping.word("period", *signal) for signal in signals):
-        return data, ()
-    data = data.copy()
-    values = dict(zip(signals, data[:, 1:].T, strict=True))
-    for (quantity, joint), column in values.items():
-        period = abs(mapping.scale(quantity, joint)) * (mapping.word("period", quantity, joint) or 0.0)
+def _unwrap(rows: Rows) -> None:
+    """Unwrap the signals for which the mapping states a period, with remarks about the wraps."""
+    mapping, columns = rows.layout.mapping, rows.columns
+    for (quantity, joint), column in columns.items():
+        period = mapping.period(quantity, joint)
         if not period:
             continue
+        scale, offset = mapping.scale(quantity, joint), mapping.offset(quantity, joint)
         count = jump_count(column, period)
         if count and quantity == "q":
-            scale = mapping.scale(quantity, joint)
-            word = read_as_words((column - mapping.offset(quantity, joint)) / scale, 2 * pi / abs(scale))
+            word = read_as_words((column - offset) / scale, 2 * pi / abs(scale))
             # a sign bit of whole turns: unwrapped, the words would be magnitudes
             if word is not None and word.key == "sign_bit":
                 continue
@@ -82,82 +126,73 @@ def _without_wraps(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping
         if quantity == "u":
             # Registers of commands and of positions may start in different revolutions. The commands are shifted by
             # whole periods, so that their median difference from the positions is at most half a period.
-            result = result - period * np.round(np.median(result - values["q", joint]) / period)
+            result = result - period * np.round(np.median(result - columns["q", joint]) / period)
         # Signals are shifted by whole periods to a median close to 0. Only angles without a wrap remain unchanged:
         # their revolution is known.
         elif count or abs(period - 2 * pi) > 1e-6:
-            offset = mapping.offset(quantity, joint)
             result = centred(result - offset, period) + offset
         if count:
-            remarks.append(f"{quantity} of {joint!r} wraps at {period:.4g}: {counted(count, 'jump')} removed")
+            rows.remarks.append(
+                f"{quantity} of {joint!r} wraps at {period:.4g}: {counted(count, 'jump')} removed"
+            )
         column[:] = result
-    return data, tuple(remarks)
 
 
-def _without_repeats(data: np.ndarray, positions: int, mapping: LogMapping) -> Repaired:
-    """Return the rows `data`, (T, C) with C columns, without repeated rows, and a message about the repeats.
+def _leave_out_repeats(rows: Rows) -> None:
+    """Remove repeated rows if every row is written several times, or with the setting 'dropouts: dropped'.
 
-    Repeats are removed if every row is written several times, or with the setting 'dropouts: dropped'; otherwise they
-    are only reported. positions: number of columns of positions.
+    Otherwise repeated rows are only reported.
     """
+    t, samples = rows.t, len(rows.t)
     # a recording of so few rows does not show whether the arm moves or rests
-    if len(data) < TUNING.jump_window:
-        return data, ()
-    repeats, copies = repeated_rows(data[:, 1:], positions)
+    if samples < TUNING.jump_window:
+        return
+    repeats, copies = repeated_rows(rows.data[:, 1:], len(rows.layout.joints))
     count = int(np.count_nonzero(repeats))
     # up to 2 % of repeated rows have no effect on a fit
-    if count <= 0.02 * len(data):
-        return data, ()
-    rate = (len(data) - 1 - count) / (data[-1, 0] - data[0, 0])
-    if copies > 1:
-        return data[~repeats], (
-            f"every row is written {copies} times: repeats were left out, {rate:.3g} Hz remain",
-        )
+    if count <= 0.02 * samples:
+        return
+    is_kept = copies == 1 and rows.layout.mapping.dropouts == "kept"
     message = f"{count} rows repeat the row before in motion"
-    if mapping.dropouts == "kept":
-        return data, (f"{message}: 'dropouts: dropped' under 'logs' removes them, {rate:.3g} Hz remain",)
-    return data[~repeats], (f"{message}: repeats were left out, {rate:.3g} Hz remain",)
+    if copies > 1:
+        message = f"every row is written {copies} times"
+    effect = "'dropouts: dropped' under 'logs' removes them" if is_kept else "repeats were left out"
+    rate = (samples - 1 - count) / (t[-1] - t[0])
+    rows.repairs.append(f"{message}: {effect}, {rate:.3g} Hz remain")
+    if not is_kept:
+        rows.keep(~repeats)
 
 
-def _without_outliers(data: np.ndarray, signals: Sequence[tuple[str, str]]) -> Repaired:
-    """Return the rows `data`, (T, C) with C columns, without rows that contain lost samples, outliers or stale values.
-
-    The second result is a message that lists the removed rows. signals: quantity and joint of each column after the
-    times.
-    """
-    outliers = np.zeros(len(data), bool)
-    dropped = []
-    columns = dict(zip(signals, data[:, 1:].T, strict=True))
+def _leave_out_outliers(rows: Rows) -> None:
+    """Remove rows that contain lost samples, outliers or stale values, with a message that lists them."""
+    outliers = np.zeros(len(rows.t), bool)
+    dropped, columns = [], rows.columns
     for (quantity, joint), values in columns.items():
-        rows = outlier_rows(quantity, values)
+        found = outlier_rows(quantity, values)
         if ("qd", joint) in columns:
-            rows |= stale_rows(quantity, values, data[:, 0], columns["q", joint], columns["qd", joint])
+            found |= stale_rows(quantity, values, rows.t, columns["q", joint], columns["qd", joint])
         # Jumps of commands are no faults, since a command may jump at any time.
-        if quantity != "u" and rows.any():
-            outliers |= rows
-            dropped.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
-    if not dropped:
-        return data, ()
-    message = f"{counted(int(outliers.sum()), 'row')} left out as dropouts: {'; '.join(dropped)}"
-    return data[~outliers], (message,)
+        if quantity != "u" and found.any():
+            outliers |= found
+            dropped.append(f"{quantity} of {joint!r} at t = {listed_times(rows.t[found])}")
+    rows.leave_out(outliers, f"left out as dropouts: {'; '.join(dropped)}")
 
 
-def _without_delays(data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping) -> np.ndarray:
-    """Return the rows `data`, (T, C) with C columns, in which signals are shifted back by their delays in the mapping.
+def _remove_delays(rows: Rows) -> None:
+    """Shift signals back by their delays in the mapping.
 
     Rows near the ends of a gap-free piece, for which a delayed signal was not logged, are removed.
     """
-    delays = np.array([mapping.delay(*signal) for signal in signals])
+    delays = np.array([rows.layout.mapping.delay(*signal) for signal in rows.signals])
     if not delays.any():
-        return data
-    t, moved = data[:, 0], data.copy()
-    for column in np.flatnonzero(delays):
-        moved[:, [1 + column]] = earlier(t, data[:, [1 + column]], delays[column])
-    kept = np.zeros(len(t), bool)
-    for rows in _pieces(t):
-        first, last = t[rows][0] - delays.min(initial=0.0), t[rows][-1] - delays.max(initial=0.0)
-        kept[rows] = (t[rows] >= first - TUNING.shortest_step) & (t[rows] <= last + TUNING.shortest_step)
-    return moved[kept]
+        return
+    t, kept = rows.t, np.zeros(len(rows.t), bool)
+    for column, delay in zip(rows.columns.values(), delays.tolist(), strict=True):
+        column[:] = earlier(t, column, delay)
+    for piece in _pieces(t):
+        first, last = t[piece][0] - delays.min(initial=0.0), t[piece][-1] - delays.max(initial=0.0)
+        kept[piece] = (t[piece] >= first - TUNING.shortest_step) & (t[piece] <= last + TUNING.shortest_step)
+    rows.keep(kept)
 
 
 def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
@@ -192,62 +227,34 @@ def listed_times(t: np.ndarray) -> str:
     return f"{times} s" + (f" and {unlisted} more" if unlisted > 0 else "")
 
 
-def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> Repaired:
-    """Return the rows `data`, (T, C) with C columns, with increasing times, and messages about repairs.
+def _order_in_time(rows: Rows) -> None:
+    """Give the rows increasing times, with messages about the repairs.
 
-    Signals in separate rows are joined, and rows of another topic or publisher are removed. Rows are sorted by time,
-    unless positions are then less smooth. Of several rows with equal times only the first is kept. If many of them
-    differ, the resolution of the clock is too low, and evenly spaced times are reconstructed. With the setting
-    `sample_rate`, the logged times are replaced by evenly spaced times.
-
-    data: values in SI units, with times in the first column. rows: (T,) row numbers in the file, for errors. Raises
-    LogError for a clock that restarts, and for times that cannot be reconstructed.
+    Rows are sorted by time, unless positions are then less smooth. Of several rows with equal times only the first is
+    kept. If many of them differ, the resolution of the clock is too low, and evenly spaced times are reconstructed.
+    Raises LogError for a clock that restarts, and for times that cannot be reconstructed.
     """
-    repairs: tuple[str, ...] = ()
-    if is_split(data):
-        data, repairs = _joined_rows(data, layout)
-        rows = np.arange(len(data))
-    rate, others = (
-        layout.mapping.sample_rate,
-        "another topic or publisher: without values, or with positions only",
-    )
-    left_out: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-        f"of {others}": lambda x: foreign_rows(x, len(layout.joints)),
-        "with a signal without a number": lambda x: np.isnan(x).any(axis=1),
-        "with times far from those of all other rows": lambda x: _is_timeless(x[:, 0]) & (not rate),
-    }
-    for reason, find in left_out.items():
-        found = find(data)
-        if found.any():
-            data, rows = data[~found], np.asarray(rows)[~found]
-            repairs += (f"{counted(int(found.sum()), 'row')} left out, {reason}",)
-    if rate:
-        return np.column_stack([np.arange(len(data)) / rate, data[:, 1:]]), repairs
-    if len(data) and abs(data[0, 0]) > 1e8:  # a date, if the first rows had no time
-        data[:, 0] -= data[0, 0]
-    t = data[:, 0]
-    late = int(np.count_nonzero(np.diff(t) < 0))
+    rows.leave_out(_is_timeless(rows.t), "left out, with times far from those of all other rows")
+    if len(rows.t) and abs(rows.t[0]) > 1e8:  # a date, if the first rows had no time
+        rows.t[:] -= rows.t[0]
+    late = int(np.count_nonzero(np.diff(rows.t) < 0))
     if late:
-        ordered = data[np.argsort(t, kind="stable")]
-        positions = slice(1, 1 + len(layout.joints))
+        order = np.argsort(rows.t, kind="stable")
         # If sorted positions are rougher, the clock restarted between two recordings in the file, and sorting would
         # interleave the recordings.
-        if _roughness(ordered[:, positions]) > _roughness(data[:, positions]):
-            raise _backward_times(t, rows, layout)
-        data = ordered
-        repairs += (f"{counted(late, 'time')} before that of the row above: the rows were sorted",)
-    is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
-    differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
+        if _roughness(rows.positions[order]) > _roughness(rows.positions):
+            raise _backward_times(rows)
+        rows.keep(order)
+        rows.repairs.append(f"{counted(late, 'time')} before that of the row above: the rows were sorted")
+    is_repeat = np.diff(rows.t, prepend=-np.inf) == 0
+    differs = is_repeat & np.append(False, (np.diff(rows.data[:, 1:], axis=0) != 0).any(axis=1))
     # The resolution of the clock is too low if more than ten rows, and more than 2 % of all rows, have the same time as
     # the row before but other values.
-    if np.count_nonzero(differs) > max(10, 0.02 * len(data)):
-        t, message = _reconstructed(data[:, 0], layout)
-        return np.column_stack([t, data[:, 1:]]), (*repairs, message)
-    repeats = np.count_nonzero(is_repeat)
-    if repeats:
-        data = data[~is_repeat]
-        repairs += (f"{counted(int(repeats), 'row')} with the time of the row before left out",)
-    return data, repairs
+    if np.count_nonzero(differs) > max(10, 0.02 * len(differs)):
+        rows.t[:], message = _reconstructed(rows.t, rows.layout)
+        rows.repairs.append(message)
+        return
+    rows.leave_out(is_repeat, "with the time of the row before left out")
 
 
 def _is_timeless(t: np.ndarray) -> np.ndarray:
@@ -258,35 +265,36 @@ def _is_timeless(t: np.ndarray) -> np.ndarray:
     return np.asarray((np.abs(t - middle) > 1e4 * (last - first)) & (last > first))
 
 
-def _joined_rows(data: np.ndarray, layout: Layout) -> Repaired:
-    """Return rows (T, C) that contain all C columns, from signals that are logged in separate rows, and a message.
+def _join_signals(rows: Rows) -> None:
+    """Join signals that are logged in separate rows to rows that contain all signals.
 
     The times are the times of the signal with the fewest samples. If more than 90 % of its rows contain all signals,
-    the complete rows are returned. Otherwise the other signals are interpolated at these times. Rows within a gap of a
+    only the complete rows are kept. Otherwise the other signals are interpolated at these times. Rows within a gap of a
     signal, or before its first or after its last sample, are omitted.
     """
+    data, mapping = rows.data, rows.layout.mapping
     finite = np.isfinite(data)
     base = finite[:, 1 + int(finite[:, 1:].sum(axis=0).argmin())]
     complete = finite.all(axis=1)
     if complete.sum() > 0.9 * base.sum():
-        message = f"{counted(int((~complete).sum()), 'row')} without all signals left out: signals have different rates"
-        return data[complete], (message,)
+        rows.leave_out(~complete, "without all signals left out: signals have different rates")
+        return
     order = np.argsort(data[:, 0], kind="stable")
     data, finite, base = data[order], finite[order], base[order]
-    joined, mapping = data[base], layout.mapping
+    joined = data[base]
     times = joined[:, 0]
-    for k, signal in enumerate(mapping.signals(layout.joints), start=1):
-        rows = finite[:, k]
-        t, values = data[rows, 0], data[rows, k]
-        period = abs(mapping.scale(*signal)) * (mapping.word("period", *signal) or 0.0)
+    for k, signal in enumerate(rows.signals, start=1):
+        t, values = data[finite[:, k], 0], data[finite[:, k], k]
+        period = mapping.period(*signal)
         if period:  # interpolated angles are wrong across a wrap
             values = unwrapped(values, period)
         joined[:, k] = np.interp(times, t, values, left=np.nan, right=np.nan)
         after = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
         gaps = (t[after] - t[after - 1] > TUNING.gap * np.median(np.diff(t))) & ~np.isin(times, t)
         joined[gaps, k] = np.nan
-    message = "signals in separate rows or messages: interpolated at the times of the rarest one"
-    return joined[np.isfinite(joined).all(axis=1)], (message,)
+    rows.data = joined[np.isfinite(joined).all(axis=1)]
+    rows.numbers = np.arange(len(rows.data))
+    rows.repairs.append("signals in separate rows or messages: interpolated at the times of the rarest one")
 
 
 def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
@@ -324,13 +332,13 @@ def _roughness(positions: np.ndarray) -> float:
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
 
 
-def _backward_times(t: np.ndarray, rows: np.ndarray, layout: Layout) -> LogError:
-    """Return the error about times t (T,) [s] that do not increase. rows: (T,) row numbers in the file."""
-    backward = np.flatnonzero(np.diff(t) < TUNING.shortest_step)
+def _backward_times(rows: Rows) -> LogError:
+    """Return the error about times that do not increase."""
+    t, backward = rows.t, np.flatnonzero(np.diff(rows.t) < TUNING.shortest_step)
     k = backward[0]
     got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"
     do = "sort the rows, drop repeats, or split recordings by a column 'trajectory'"
-    return layout.row_error(got, rows[k + 1], layout.columns[0], "increasing times", do)
+    return rows.layout.row_error(got, rows.numbers[k + 1], rows.layout.columns[0], "increasing times", do)
 
 
 def _pieces(t: np.ndarray) -> Iterator[slice]:
@@ -339,7 +347,7 @@ def _pieces(t: np.ndarray) -> Iterator[slice]:
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Return delayed values (T, n), sampled at times t (T,), shifted back by the delay [s].
+    """Return delayed values (T, ...), sampled at times t (T,), shifted back by the delay [s].
 
     At the ends of a gap-free piece, the first or last value of the piece replaces values that were not logged.
     """

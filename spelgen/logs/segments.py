@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.logs.recording import in_time_order, make_trajectory
+from spelgen.logs.recording import make_trajectory
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.tuning import TUNING
@@ -89,8 +89,7 @@ class LogSegments:
             values = np.concatenate([x.values for x in group]) if len(group) > 1 else first.values
             rows = np.concatenate([x.rows for x in group])
             try:
-                values, repairs = in_time_order(values, rows, first.layout)
-                yield make_trajectory(values, first.layout, first.name, repairs)
+                yield make_trajectory(values, rows, first.layout, first.name)
             except LogError as error:
                 yield error
 

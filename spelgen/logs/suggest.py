@@ -16,12 +16,12 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
-from spelgen.logs.formats import FORMATS, LEROBOT, format_of
+from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
-from spelgen.logs.tables import names_joint, reading
+from spelgen.logs.tables import SERVO_ADVICE, names_joint, reading
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit
-from spelgen.settings.log_mapping import CURRENTS
+from spelgen.settings.log_mapping import CURRENTS, LogMapping
 
 WORDS = {
     "t": {"t", "ts", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis", "zeit"},
@@ -33,7 +33,7 @@ WORDS = {
 # Words that distinguish the names of commanded values from the names of measured values.
 COMMANDED = {
     "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
-    "demand", "planned", "ipo", "set", "soll",
+    "demand", "planned", "ipo", "set", "soll", "u",
 }  # fmt: skip
 # Words in names of signals other than measured joint signals.
 NOT_MEASURED = COMMANDED | {
@@ -75,22 +75,18 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     """Return a draft of the mapping for a log file.
 
     commands: True if the log contains commanded positions instead of torques. Raises LogError if the file cannot be
-    read, and if it has no column of times.
+    read, if it has no column of times, or commanded positions and no torques without `commands`.
     """
     log_format = format_of(file)
     if log_format is LEROBOT:
         return _dataset_mapping(file, joints)
-    if log_format is None or log_format.columns is None:
-        suffixes = [x.suffixes[0] for x in FORMATS if x.columns is not None]
-        got = (
-            f"a file of kind {file.suffix!r}"
-            if log_format is None
-            else "messages of ROS, with names and units"
-        )
-        do = "other names of joints are mapped by 'name' under 'logs', 'joints'" if log_format else None
-        raise LogError(got, file=file, expected=" or ".join(suffixes), do=do)
+    assert log_format is not None, "log_files gives logs alone"
+    if log_format is BAG:
+        suffixes = " or ".join(x.suffixes[0] for x in FORMATS if not x.marker)
+        do = "other names of joints are mapped by 'name' under 'logs', 'joints'"
+        raise LogError("messages of ROS, with names and units", file=file, expected=suffixes, do=do)
     with reading(file):
-        table = log_format.columns(file)
+        table = log_format.read(file, (), LogMapping())[0].read(None)
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     columns = [_column_name(name, {"time"} if name in dates else set()) for name in _names(table)]
     columns_of = _by_quantity(columns, commands, joints)
@@ -98,6 +94,10 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
         do = "name it so, or write 'columns' and 'sample_rate' under 'logs' if there is none and rows are evenly spaced"
         raise LogError(got, file=file, expected="one of times, called t or time", do=do)
+    # The register "load" of a servo is no torque.
+    torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
+    if not commands and not torques and len(_by_quantity(columns, True, joints)["u"]) >= len(joints):
+        raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
     # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
     # measurement. Without a stamp, the name with the fewest words is used.
     clock = min(columns_of.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))

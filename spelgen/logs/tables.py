@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, starmap
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import pyarrow as pa
 
@@ -62,7 +62,27 @@ class Layout:
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
 
 
-LogTable = tuple[Layout, pa.Table]
+class LogTable(NamedTuple):
+    """Columns of a log as logged, the common result of all readers.
+
+    Attributes:
+        schema: names of the columns; also their types and metadata, if they are known before values are read.
+        read: function that returns a table with the given columns; None: with all columns.
+        mapping: mapping of the columns.
+        remarks, header, recording: see `Layout`.
+    """
+
+    schema: pa.Schema
+    read: Callable[[list[str] | None], pa.Table]
+    mapping: LogMapping
+    remarks: tuple[str, ...] = ()
+    header: int | None = None
+    recording: str | None = None
+
+    @classmethod
+    def of(cls, table: pa.Table, mapping: LogMapping, **properties: Any) -> Self:
+        """Return the log table of a table in memory. properties: values of the other attributes."""
+        return cls(table.schema, lambda names: table, mapping, **properties)
 
 
 class LogFormat(NamedTuple):
@@ -71,25 +91,28 @@ class LogFormat(NamedTuple):
     Attributes:
         read: reader (path, joint names, mapping) -> tables of a log; it raises LogError for a damaged log.
         suffixes: suffixes of files in this format.
-        columns: function that returns all columns of a file, for a draft of a mapping; None if the format itself
-            defines the columns.
         marker: path of a file that identifies a folder as a log of this format; "" if logs are single files.
         folder: description of such a folder, for messages.
     """
 
     read: Callable[[Path, Sequence[str], LogMapping], list[LogTable]]
     suffixes: tuple[str, ...] = ()
-    columns: Callable[[Path], pa.Table] | None = None
     marker: str = ""
     folder: str = ""
 
 
-def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, file: Path) -> Layout:
-    """Return the layout of a table with this schema. Raises LogError if a column is missing or occurs twice.
+SERVO_ADVICE = (
+    "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
+)
+
+
+def table_layout(log: LogTable, joints: Sequence[str], file: Path) -> Layout:
+    """Return the layout of a table. Raises LogError if a column is missing or occurs twice.
 
     Files that spelgen wrote have SI units and default column names. Of the mapping, only the input (torque or
     position), the accepted checks and the wraps of angles apply to them.
     """
+    schema, mapping = log.schema, log.mapping
     metadata = schema.metadata or {}
     # files of spelgen, e.g. simulated logs, are in SI units, even if the arm's mapping describes another logger
     if metadata.get(UNITS_KEY) == UNITS:
@@ -110,7 +133,9 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
         del missing[0]
     if missing:
         raise missing_columns(missing, schema.names, file, mapping, joints)
-    labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
+    labels = mapping.columns.trajectory if log.recording is None else None
+    if labels not in schema.names:
+        labels = None
     # A column of lists is rejected here: used as names of recordings, it would raise an error that is hard to
     # understand.
     if labels and pa.types.is_nested(schema.field(labels).type):
@@ -120,7 +145,9 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
-    return Layout(file, tuple(columns), labels, tuple(joints), mapping, accepted)
+    return Layout(
+        file, tuple(columns), labels, tuple(joints), mapping, accepted, log.recording, log.remarks, log.header
+    )
 
 
 def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
@@ -174,7 +201,7 @@ def missing_columns(
             "the others do not move, or map its columns under 'logs'"
         )
     elif mapping.input == "torque" and _are_commands(columns, mapping, joints):
-        do = "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
+        do = SERVO_ADVICE
     elif list(missing) == [mapping.columns.t]:
         do = (
             "write its name as 'columns: {t: NAME}' under 'logs' in the robot's YAML, or 'sample_rate: HZ' if there is "

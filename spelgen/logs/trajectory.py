@@ -156,7 +156,7 @@ def require_torques(trajectories: Sequence[Trajectory]) -> None:
     """Raise LogError if a trajectory has commanded positions instead of torques."""
     for trajectory in trajectories:
         if trajectory.u is not None:
-            do = "arms under position servos are fitted and judged by `train` and `evaluate`"
+            do = "arms with position servos have 'input: position' in the YAML beside the URDF; `train` fits them"
             raise trajectory.error("commanded positions and no torques", "torques", do)
 
 

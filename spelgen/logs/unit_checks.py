@@ -139,7 +139,8 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
     message, unit = f"a sample every {step:.3g} s", time_unit(step)
     if step <= SIGNALS.slowest_step:
         message = f"q that changes {signals.factor:.3g} times as fast as qd"
-        unit = next((x for x in TIMES if x != "s" and signals.changes_by(TIMES[x])), None)
+        is_known = signals.correlation > SIGNALS.agreement
+        unit = next((x for x in TIMES if x != "s" and is_known and is_factor(signals.factor, TIMES[x])), None)
     elif signals.number:
         # All joints have the same times, so the fault is reported only for joint 0.
         return None
@@ -152,7 +153,7 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 
 def _rate_by_velocities(signals: JointSignals) -> float | None:
     """Return the sample rate [Hz] at which qd of all joints is dq/dt; None if the times may be right or in a unit."""
-    factors = np.array(signals.factors)[~np.isnan(signals.factors)]
+    factors = signals.factors[~np.isnan(signals.factors)]
     mapping, steps = signals.trajectory.mapping, np.diff(signals.trajectory.t)
     if "qd" not in mapping.quantities or len(factors) < 2 or len(steps) <= 2 * SIGNALS.increments:
         return None
@@ -201,7 +202,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         # Only the sign of qd is wrong: q is correct, and its derivative can replace qd.
         return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
     trajectory, mapping, k = signals.trajectory, signals.trajectory.mapping, signals.number
-    for joint, fit in zip(signals.joints, signals.correlations, strict=True):
+    for joint, fit in zip(signals.joints, signals.correlations.tolist(), strict=True):
         if fit > max(SIGNALS.agreement, correlation):
             columns = {"qd": mapping.column("qd", joint)}
             return Advice(f"{message}; that of joint {joint!r} is", {"columns": columns})

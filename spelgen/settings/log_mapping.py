@@ -327,6 +327,10 @@ class LogMapping(Group):
         size: float | None = getattr(getattr(self.joint(joint), key), quantity)
         return size
 
+    def period(self, quantity: str, joint: str) -> float:
+        """Return the period of a quantity of a joint in SI units; 0 if it is not set."""
+        return abs(self.scale(quantity, joint)) * (self.word("period", quantity, joint) or 0.0)
+
     def unit(self, quantity: str, joint: str) -> str | None:
         """Return the unit of "q", "qd", "tau" or "u" of a joint; None if it is not set."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)

@@ -19,7 +19,7 @@ from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import LogError, SettingsError, in_one_line
 from spelgen.excitation.trajectory import Motion
 from spelgen.files import require_regular_file
-from spelgen.logs.csv_files import csv_columns
+from spelgen.logs.csv_files import csv_table
 from spelgen.settings.settings import Settings
 from spelgen.simulation.protocol import Progress, SimulatedLogs, make_friction, paths, sample_times, silent
 from spelgen.simulation.tracking import Recording, measured, quantized
@@ -40,7 +40,7 @@ def read_motion(file: Path, joints: Sequence[str]) -> Motion:
     columns = ["t", *(f"{quantity}_{joint}" for quantity in ("q", "qd", "qdd") for joint in joints)]
     refused = partial(LogError, file=file, do="`spelgen excite` writes such files for the same arm")
     try:
-        table = csv_columns(file)
+        table, _, _ = csv_table(file)
         missing = [name for name in columns if name not in table.column_names]
         if missing:
             raise refused(f"no column {', '.join(missing[:3])}", expected="t, q_, qd_ and qdd_ per joint")

@@ -20,6 +20,14 @@ _OTHER_FORMATS = {
     ),
     "sdf": ("an SDF file", "convert it to URDF first"),
     "COLLADA": ("a COLLADA mesh", "name the URDF that uses it"),
+    "html": ("a web page", "download the file itself: 'Raw' on the page of a repository"),
+}
+# {first bytes of a file in lower case: (kind of file, remedy)}
+_NOT_XML = {
+    b"version https://git-lfs": ("a pointer of Git LFS", "run 'git lfs pull' first"),
+    b"<!doctype html": _OTHER_FORMATS["html"],
+    b"pk\3\4": ("a ZIP archive", "unpack it, and name the URDF in it"),
+    b"\x1f\x8b": ("a gzip archive", "unpack it, and name the URDF in it"),
 }
 
 
@@ -96,10 +104,9 @@ def _refuse_damage(path: Path, data: bytes) -> None:
     """
     if not data.strip():
         raise UrdfError("an empty file", file=path, expected="a URDF document")
-    if data.startswith(b"version https://git-lfs"):
-        raise UrdfError(
-            "a pointer of Git LFS", file=path, expected="a URDF document", do="run 'git lfs pull' first"
-        )
+    for first, (got, do) in _NOT_XML.items():
+        if data[:100].lstrip().lower().startswith(first):
+            raise UrdfError(got, file=path, expected="a URDF document", do=do)
     # Conflict markers of git are the most common defect, and the message of the parser would not name them.
     conflict = _CONFLICT.search(data)
     if conflict:
@@ -133,6 +140,8 @@ def _syntax_error(path: Path, error: etree.XMLSyntaxError) -> UrdfError:
         )  # fmt: skip
     reason = " ".join(re.sub(r",? ?line \d+, column \d+.*", "", message).split())
     do = "save the file as UTF-8, or declare its encoding in <?xml ...?>" if "encoding" in reason else None
+    if reason.startswith(("Start tag expected", "Document is empty")):
+        do = "name the URDF: this is a file of another kind"
     return UrdfError(f"not well-formed XML ({reason})", file=path, line=error.lineno, do=do)
 
 

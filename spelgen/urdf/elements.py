@@ -120,6 +120,9 @@ def _read_end(joint: Element, tag: str) -> str | None:
 
 def _read_origin(parent: Element) -> tuple[Vector, Vector]:
     origin = parent.child("origin")
+    # Newer URDFs may have quaternions: a rotation that is not read would be a wrong geometry without a message.
+    for key in set(origin.xml.attrib if origin.xml is not None else ()) - {"xyz", "rpy"}:
+        origin.error(f"the attribute {key!r}", "xyz [m] and rpy [rad]", "convert the rotation to rpy", key)
     return origin.triple("xyz"), origin.triple("rpy")
 
 

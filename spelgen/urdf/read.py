@@ -88,7 +88,10 @@ def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
     if not elements:
         is_xacro = any(uri.endswith("/xacro") for uri in root.nsmap.values())
         do = "this is a xacro file: expand it with the xacro command first" if is_xacro else None
+        if root.find("group") is not None:
+            do = "this is an SRDF file: name the URDF that it belongs to"
         notes.error(root.sourceline, "<robot>", "no <link>", "a tree of links and joints", do)
+        collect(notes.errors)
     elif root.find("joint") is None:
         notes.error(root.sourceline, "<robot>", "no <joint>", "a tree of links and joints")
     return _unique(notes, [read_link(notes, element) for element in elements])

@@ -169,7 +169,7 @@ class Element:
                 self.error(f"a number of {len(word)} characters", f"at most {longest}", key=key)
                 return []
             if not _NUMBER.fullmatch(word):
-                hint = "separate numbers by spaces" if "," in word else None
+                hint = "write decimal points, and spaces between numbers" if "," in word else None
                 self.error(repr(word), f"{expected} in decimal notation", hint, key)
                 return []
         values = list(map(float, words))

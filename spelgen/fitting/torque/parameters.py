@@ -124,7 +124,9 @@ def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float)
     if not isinstance(inputs, MotorInputs) or inputs.raw_gains is None:
         return
     with torch.no_grad():
-        rigid = model.inverse_dynamics(q, qd, qdd) - model.friction_torque(q, qd)
+        # The inverse dynamics are logged torques, here converted to joint torques by the initial gains.
+        joint = model.inverse_dynamics(q, qd, qdd) @ model.input_matrix(q[:1])[0].mT
+        rigid = joint - model.friction_torque(q, qd)
         # The columns of each trained joint, (joints, T, 4), of which the first is the rigid-body torque.
         columns = torch.stack([rigid, qd, qd.sign(), torch.ones_like(qd)], dim=-1).transpose(0, 1)[
             inputs.gain_rows

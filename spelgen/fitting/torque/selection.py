@@ -151,31 +151,32 @@ def _best(
     # The second test is on halves: of all divisions, they have the largest distance in time between fitted and held-out
     # samples.
     first, last = split_halves(len(torque_residual), correlation_length)
-    best = best_within = None
+    best: list[SelectedTerm | None] = [None, None]
     for candidate in candidates:
         target = candidate.target(torque_residual, noise)
-        error, within = _cross_validate(candidate, target, correlation_length, recordings)
-        reduction = significant_reduction(block_squares(target), block_squares(error), significance)
-        reduction_within = significant_reduction(
-            block_squares(target * within), block_squares(error * within), significance
-        )
-        if reduction is None and reduction_within is None:
+        error, covered = _cross_validate(candidate, target, correlation_length, recordings)
+        everywhere = torch.ones_like(covered)
+        reductions = [
+            significant_reduction(block_squares(target * rows), block_squares(error * rows), significance)
+            for rows in (everywhere, covered)
+        ]
+        if reductions == [None, None]:
             continue
-        weights = candidate.fit(target, correlation_length, first).coef
+        torque = candidate.torque(candidate.fit(target, correlation_length, first).coef)
+        before, after = target[last].square(), (target - torque)[last].square()
         # A candidate whose torque is implausibly large is rejected: it probably fits a model error that repeats with
         # the motion, and not an effect in the joint, such as a spring.
-        if limits and candidate.torque(weights).std() > limits[candidate.parameter][candidate.joint]:
-            continue
-        before, after = target[last].square(), (target - candidate.torque(weights))[last].square()
-        if reduction is not None and after.sum() < before.sum():
-            best = _better(best, SelectedTerm(candidate.parameter, candidate.joint, reduction))
-        within = within_range(candidate.position[last], candidate.position[first])
-        if reduction_within is not None and after[within].sum() < before[within].sum():
-            accepted = SelectedTerm(candidate.parameter, candidate.joint, reduction_within)
-            best_within = _better(best_within, accepted)
+        limit = torch.inf if limits is None else float(limits[candidate.parameter][candidate.joint])
+        inside = within_range(candidate.position, candidate.position[first])
+        for index, rows in enumerate((everywhere, inside)):
+            reduction, lower = reductions[index], after[rows[last]].sum() < before[rows[last]].sum()
+            if reduction is not None and lower and torque[rows].std() <= limit:
+                best[index] = _better(
+                    best[index], SelectedTerm(candidate.parameter, candidate.joint, reduction)
+                )
     # A candidate that passes the tests on all held-out samples is preferred, since it also predicts the torque at
     # positions outside the fitted range.
-    return best or best_within
+    return best[0] or best[1]
 
 
 def _better(first: SelectedTerm | None, other: SelectedTerm) -> SelectedTerm:
