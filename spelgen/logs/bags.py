@@ -142,10 +142,10 @@ def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains
     the settings that map the names if every joint name is the end of exactly one logged name ("j1" and "left_j1").
     """
-    found = {name: [x for x in logged if x.endswith(name)] for name in names}
-    if any(len(each) != 1 for each in found.values()):
+    endings = {name: [x for x in logged if x.endswith(name)] for name in names}
+    if any(len(full_names) != 1 for full_names in endings.values()):
         return "map the joints' names under 'logs'"
-    return mapping_line({"joints": {name: {"name": each[0]} for name, each in found.items()}})
+    return mapping_line({"joints": {name: {"name": full_name} for name, (full_name,) in endings.items()}})
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:

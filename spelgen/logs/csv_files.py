@@ -127,8 +127,8 @@ def _header_row(lines: Sequence[str], cells: Sequence[Sequence[str]], width: int
     is_ended = all(row[-1] == "" for row in cells[1:-1] if len(row) == width)
     full = [k for k, row in enumerate(cells) if len(row) in (width, width - is_ended)] or [0]
     first = next((k for k in full if not COMMENT.match(lines[k])), full[0])
-    before = full.index(first) - 1
-    return full[before] if before >= 0 and is_number(cells[first][0]) else first
+    previous = full.index(first) - 1
+    return full[previous] if previous >= 0 and is_number(cells[first][0]) else first
 
 
 def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int) -> tuple[list[str], int]:

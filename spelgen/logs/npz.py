@@ -90,9 +90,9 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
         pattern = mapping.pattern(quantity)
         # The name of a matrix may have no placeholder.
         named = pattern if "{joint}" in pattern else pattern + "_{joint}"
-        found = _matrix_columns(named, arrays, [mapping.log_name(joint) for joint in joints])
-        if found:
-            columns, patterns[quantity] = columns | found, named
+        of_matrix = _matrix_columns(named, arrays, [mapping.log_name(joint) for joint in joints])
+        if of_matrix:
+            columns, patterns[quantity] = columns | of_matrix, named
     mapping = mapping.model_copy(update={"columns": mapping.columns.model_copy(update=patterns)})
     # The other columns in the mapping are vectors, or elements of a matrix, such as data[0].
     vectors = {mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))}
@@ -151,8 +151,8 @@ def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Column
     matrix = pattern.replace("{joint}", "").rstrip("_")
     if matrix not in arrays.names or arrays[matrix].ndim < 2:
         return {}
-    rows, width, *others = arrays[matrix].shape
-    if others:
+    rows, width, *further = arrays[matrix].shape
+    if further:
         got, expected = f"an array of shape {arrays[matrix].shape}", "a row per time and a column per joint"
         raise arrays.error(matrix, got, expected, "store an array per recording, such as q_1, q_2")
     if JOINT_NAMES in arrays.names:

@@ -168,13 +168,13 @@ def _leave_out_outliers(rows: Rows) -> None:
     outliers = np.zeros(len(rows.t), bool)
     dropped, columns = [], rows.columns
     for (quantity, joint), values in columns.items():
-        found = outlier_rows(quantity, values)
+        faulty = outlier_rows(quantity, values)
         if ("qd", joint) in columns:
-            found |= stale_rows(quantity, values, rows.t, columns["q", joint], columns["qd", joint])
+            faulty |= stale_rows(quantity, values, rows.t, columns["q", joint], columns["qd", joint])
         # Jumps of commands are no faults, since a command may jump at any time.
-        if quantity != "u" and found.any():
-            outliers |= found
-            dropped.append(f"{quantity} of {joint!r} at t = {listed_times(rows.t[found])}")
+        if quantity != "u" and faulty.any():
+            outliers |= faulty
+            dropped.append(f"{quantity} of {joint!r} at t = {listed_times(rows.t[faulty])}")
     rows.leave_out(outliers, f"left out as dropouts: {'; '.join(dropped)}")
 
 
@@ -186,13 +186,15 @@ def _remove_delays(rows: Rows) -> None:
     delays = np.array([rows.layout.mapping.delay(*signal) for signal in rows.signals])
     if not delays.any():
         return
-    t, kept = rows.t, np.zeros(len(rows.t), bool)
+    t, covered = rows.t, np.zeros(len(rows.t), bool)
     for column, delay in zip(rows.columns.values(), delays.tolist(), strict=True):
         column[:] = earlier(t, column, delay)
     for piece in _pieces(t):
         first, last = t[piece][0] - delays.min(initial=0.0), t[piece][-1] - delays.max(initial=0.0)
-        kept[piece] = (t[piece] >= first - TUNING.shortest_step) & (t[piece] <= last + TUNING.shortest_step)
-    rows.keep(kept)
+        covered[piece] = (t[piece] >= first - TUNING.shortest_step) & (
+            t[piece] <= last + TUNING.shortest_step
+        )
+    rows.keep(covered)
 
 
 def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
@@ -289,8 +291,8 @@ def _join_signals(rows: Rows) -> None:
         if period:  # interpolated angles are wrong across a wrap
             values = unwrapped(values, period)
         joined[:, k] = np.interp(times, t, values, left=np.nan, right=np.nan)
-        after = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
-        gaps = (t[after] - t[after - 1] > TUNING.gap * np.median(np.diff(t))) & ~np.isin(times, t)
+        following = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
+        gaps = (t[following] - t[following - 1] > TUNING.gap * np.median(np.diff(t))) & ~np.isin(times, t)
         joined[gaps, k] = np.nan
     rows.data = joined[np.isfinite(joined).all(axis=1)]
     rows.numbers = np.arange(len(rows.data))

@@ -138,17 +138,17 @@ def _nanoseconds(texts: Column) -> pa.Array | None:
     texts = pa.compute.utf8_trim_whitespace(pa.compute.replace_substring(texts.cast(pa.string()), "µ", "u"))
     first = next((x for x in texts.slice(0, 1).to_pylist() if x), "")
     if re.fullmatch(rf"{NUMBER} ?({'|'.join(TIMES)})", first):
-        parts = pa.compute.extract_regex(texts, rf"^(?P<number>{NUMBER}) ?(?P<unit>[mun]?s)$")
-        numbers, units = (pa.compute.struct_field(parts, name) for name in ("number", "unit"))
+        groups = pa.compute.extract_regex(texts, rf"^(?P<number>{NUMBER}) ?(?P<unit>[mun]?s)$")
+        numbers, units = (pa.compute.struct_field(groups, name) for name in ("number", "unit"))
         factors = [TIMES.get(unit, np.nan) for unit in units.to_pylist()]
         return pa.array(_numbers(numbers) * factors / TIMES["ns"])
     clock = r"^(?P<date>\d{4}-\d\d-\d\d[T ])?(?:(?P<h>\d+):)?(?P<m>\d+):(?P<s>\d+(?:[.,]\d*)?)$"
     if not re.match(clock, first):
         return None
-    parts = pa.compute.extract_regex(texts, clock)
-    hours, minutes, seconds = (_numbers(pa.compute.struct_field(parts, name)) for name in "hms")
+    groups = pa.compute.extract_regex(texts, clock)
+    hours, minutes, seconds = (_numbers(pa.compute.struct_field(groups, name)) for name in "hms")
     times = 3600 * np.nan_to_num(hours) + 60 * minutes + seconds
-    dates = pa.compute.struct_field(parts, "date").to_numpy(zero_copy_only=False)
+    dates = pa.compute.struct_field(groups, "date").to_numpy(zero_copy_only=False)
     if dates[0]:
         days = np.array([x[:10] if x else "NaT" for x in dates], dtype="datetime64[D]")
         times = times + 86400 * days.astype(float)
