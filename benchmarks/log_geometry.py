@@ -37,10 +37,10 @@ from truth import Case, Truth, record_log, wrong_urdf
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.identification.column_faults import position_factors
-from spelgen.identification.drive_hints import DriveLog
-from spelgen.identification.geometry_search import HypothesisComparison, compare_hypotheses, kinds_of_faults
-from spelgen.identification.hypotheses import Hypothesis, MotionSamples
+from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
+from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.motion_samples import DriveLog, MotionSamples
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -94,7 +94,7 @@ def samples_of(arm: Arm, logs: Sequence[Trajectory]) -> MotionSamples:
         collected.add(log)
     samples = collected.samples()
     assert samples is not None
-    return MotionSamples(samples.around, samples.bent, samples.times)
+    return samples
 
 
 def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
@@ -146,10 +146,10 @@ def wrong_log(log: Trajectory, right: Hypothesis) -> Trajectory:
     return replace(log, q=late[0][:, motion], qd=late[1][:, motion], tau=late[2][:, torque])
 
 
-def compared(problem: GeometryProblem) -> HypothesisComparison:
+def compared(problem: GeometryProblem) -> list[HypothesisFit]:
     """Return the readings of a log that are better than the unchanged one."""
     faults = kinds_of_faults(problem.arm, position_scale=problem.unchanged.scale[0])
-    return compare_hypotheses(problem, faults)
+    return list(compare_hypotheses(problem, faults)[1:])
 
 
 def is_same(one: Hypothesis, other: Hypothesis) -> bool:
@@ -173,8 +173,8 @@ def result_of(arm: Arm, true: Arm, logs: Sequence[Trajectory], kind: str, right:
         chain, ideal = replace(chain, gravity=right.gravity), replace(ideal, gravity=right.gravity)
         right = Hypothesis.unchanged(arm.chain)
     wrong = samples_of(arm, [wrong_log(log, right) for log in logs])
-    comparison = compared(GeometryProblem(chain, wrong, drives.speeds, SECONDS))
-    named = [is_same(fit.hypothesis, right) for fit in comparison.better]
+    better = compared(GeometryProblem(chain, wrong, drives.speeds, SECONDS))
+    named = [is_same(fit.hypothesis, right) for fit in better]
     if any(named):
         return "named" if named[0] else "with others"
     best = GeometryProblem(ideal, wrong.thinned(GEOMETRY.confirming_samples), drives.speeds, SECONDS)
@@ -206,7 +206,8 @@ def rows_of(urdf: Path, number: int, faults: int) -> Iterator[Row]:
     log = (urdf.stem, number, case.motion, case.noise)
     problem = GeometryProblem(arm.chain, samples_of(arm, logs), arm.actuation.drives().speeds, SECONDS)
     clean = compared(problem)
-    yield Row(*log, "clean", f"false: {' '.join(clean.codes)}" if clean.better else "silent")
+    codes = " ".join(fault.code for fit in clean[:1] for fault in fit.hypothesis.faults)
+    yield Row(*log, "clean", f"false: {codes}" if clean else "silent")
     rng = np.random.default_rng([number, 1])
     for fault in range(faults):
         kind = KINDS[(fault + number * faults) % len(KINDS)]

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 import yaml
 from servo_arm import servo_logs, write_servo_arm
-from test_log_geometry import recorded
+from test_log_geometry import pick_and_place, recorded
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import SpelgenError
@@ -95,6 +95,22 @@ def test_gain_of_torques_in_another_unit_and_of_the_opposite_sense(arm):
         assert "torques of another unit" in message
         arm = obeyed(arm, message)
     assert "torque" not in message_of(arm, path)
+
+
+@pytest.mark.parametrize("arm", ["rpr"], indirect=True)
+@pytest.mark.parametrize("turn", [2 * np.pi, -2 * np.pi])
+def test_offset_of_angles_of_another_turn(arm, turn):
+    """A driver that logs 0 to 360 degrees, of a joint that never crosses 0: its positions are beyond the limits."""
+
+    def within_limits(arm, rng):
+        t, q = pick_and_place(arm, rng)
+        return t, q * [1.0, 0.3, 1.0] + [0.0, 0.8, 0.0]
+
+    log = recorded(arm, 5, within_limits)
+    path = logged(arm, replace(log, q=log.q + turn * np.eye(3)[2]))
+    message = message_of(arm, path)
+    assert "another turn" in message and "offset: " in message
+    assert message_of(obeyed(arm, message), path) == ""
 
 
 def test_joints_that_were_not_logged(arm):

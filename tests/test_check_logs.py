@@ -15,8 +15,9 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor_dynamics import body_chain, regressor, urdf_parameters
 from spelgen.errors import LogError, SpelgenError
-from spelgen.identification import drive_hints
-from spelgen.identification.drive_hints import DriveLog, drive_problem, find_coupling
+from spelgen.identification import motion_samples
+from spelgen.identification.drive_hints import drive_problem, find_coupling
+from spelgen.identification.motion_samples import DriveLog
 from spelgen.log_checks import check_torque_logs, robot_checks
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.log_checks.statistics import noise_level, quantisation_step, statistics
@@ -468,7 +469,7 @@ def test_of_many_trajectories_an_even_part_is_filtered(monkeypatch):
         filtered.append(moved[0].name)
         return dynamics_samples(moved, **options)
 
-    monkeypatch.setattr(drive_hints, "dynamics_samples", counted)
+    monkeypatch.setattr(motion_samples, "dynamics_samples", counted)
     collected = drive_log(1)
     t = np.arange(0.0, 6.0, 0.02)
     for number in range(100):

@@ -188,6 +188,16 @@ def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
     np.testing.assert_allclose(list(map(float, lines[0].split(","))), gravity, atol=0.3)
 
 
+def test_a_small_tilt_of_the_base_is_a_warning(arm):
+    """Five degrees about the x axis: the mounting of a robot may be as wrong."""
+    tilted = replace(arm, chain=replace(arm.chain, gravity=(0.0, 0.85, -9.77)))
+    report = check_logs([recorded(tilted, 16, noise=0.01)], arm)
+    assert report.errors == ()
+    (note,) = (x for x in report.findings if x.code == "gravity")
+    gravity = list(map(float, re.search(r"write 'gravity: \[(.*?)\]'", note.message)[1].split(",")))
+    np.testing.assert_allclose(gravity, [0.0, 0.85, -9.77], atol=0.3)
+
+
 @pytest.mark.parametrize("part", [0.0, -0.12, 0.2])
 def test_compensated_gravity_is_called_so(arm, part):
     error = told(arm, recorded(arm, 5, gravity=part))
@@ -218,6 +228,21 @@ def test_a_link_with_a_mistyped_mass_is_named(arm):
     (note,) = (x for x in report.findings if x.code == "urdf-inertials")
     assert note.where == f"link {body.link!r}"
     assert not [x for x in check_logs([log], arm).findings if x.code == "urdf-inertials"]
+
+
+@pytest.mark.parametrize("arm", ["ur10e"], indirect=True)
+@pytest.mark.parametrize("k", [3, 5])
+def test_a_mistyped_mass_at_the_wrist_is_named(arm, k):
+    """Ten times the mass of a link whose centre of mass is near its joint: only the joints before it carry it."""
+    t, q = excitation(arm, np.random.default_rng(17))
+    motion = q, np.gradient(q, t, axis=0), np.gradient(np.gradient(q, t, axis=0), t, axis=0)
+    log = Trajectory(t, *motion[:2], regressor(arm.chain, *motion) @ urdf_parameters(arm.chain), "exact")
+    bodies = list(arm.chain.bodies)
+    mass, *rest = bodies[k].inertia
+    bodies[k] = replace(bodies[k], inertia=(10 * mass, *(10 * x for x in rest[:3]), *rest[3:]))
+    report = check_logs([log], replace(arm, chain=replace(arm.chain, bodies=tuple(bodies))))
+    assert report.errors == ()
+    assert [x.where for x in report.findings if x.code == "urdf-inertials"] == [f"link {bodies[k].link!r}"]
 
 
 def test_training_refuses_it_unless_it_is_accepted(arm):
@@ -272,13 +297,40 @@ def test_factors_of_torques_that_differ_are_stated_per_joint(robots, tmp_path):
 
 
 def test_magnitudes_of_a_torque_are_not_explained_by_factors(shared):
-    """A driver may log the magnitude of a current; own factors of all joints would lower the error a little."""
+    """A driver logs the magnitude of a current: no own factors of all joints, which would lower the error a little."""
     arm = load_arm(shared / "logs" / "airbot" / "airbot.urdf")
     (log,) = read_logs(shared / "logs" / "airbot" / "ga_N12T25.parquet", arm)
     tau = log.tau.copy()
     tau[:, 1] = np.abs(tau[:, 1])
-    codes = {x.code for x in check_logs([replace(log, tau=tau)], arm).findings}
-    assert "torque-without-gravity" in codes and "torque-unit" not in codes
+    error = told(arm, replace(log, tau=tau))
+    assert "joint 'joint2', tau: got torques without sign" in error and "gain" not in error
+    assert "--accept torque-without-sign" in error
+
+
+@pytest.mark.parametrize("of_all", [False, True])
+def test_torques_that_were_logged_as_magnitudes_are_named(arm, of_all):
+    """The joint whose torque changes its direction most often, or all joints that do so in a tenth of the time."""
+    log = recorded(arm, 14)
+    share = np.minimum((log.tau > 0).mean(axis=0), (log.tau < 0).mean(axis=0))
+    unsigned = np.full(len(share), True) if of_all else share == share.max()
+    error = told(arm, replace(log, tau=np.where(unsigned, np.abs(log.tau), log.tau)))
+    assert "--accept torque-without-sign" in error
+    named = [name in error for name in arm.chain.joint_names]
+    np.testing.assert_array_equal(named, unsigned & (share > 0.1))
+
+
+def test_torques_of_one_direction_by_nature_are_believed(robots, tmp_path):
+    """Gravity loads both joints to one side, in all positions of the log."""
+    arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
+    upright = replace(arm, chain=replace(arm.chain, gravity=(0.0, -9.81, 0.0)))
+
+    def level(arm, rng):
+        t, q = excitation(arm, rng)
+        return t, 0.3 * (q - q.mean(axis=0))
+
+    log = recorded(upright, 15, level, noise=0.01)
+    assert (log.tau > 0).all()
+    assert check_logs([log], upright).errors == ()
 
 
 ROBOT = """<robot name="made">

@@ -305,7 +305,7 @@ class Gravity(Compensation):
         # Without gravity the torques are the same as with gravity along the axes of all joints. Gravity along -z is the
         # nearest explanation of this, other directions are less likely than a compensation.
         is_likely = start is starts[0] or best.cost < problem.fit(turned(np.zeros(3))).cost - 1.0
-        if is_likely and np.linalg.norm(new - present) > GEOMETRY.min_angle * size:
+        if is_likely and np.linalg.norm(new - present) > GEOMETRY.min_tilt * size:
             nearest = np.linalg.norm(new) * np.sign(new) * (np.abs(new) == np.abs(new).max())
             axis = problem.fit(turned(nearest))
             is_axis = axis.cost < best.cost + GEOMETRY.right_angle

@@ -7,158 +7,27 @@ on held-out blocks of time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import permutations, product
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import chain_regressor
-from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.identification.least_squares import block_products, normal_solution, varying
+from spelgen.identification.motion_samples import MotionSamples
 from spelgen.identification.tuning import HINTS, TUNING
-from spelgen.logs.dynamics_samples import (
-    FREQUENCY,
-    SHORTEST,
-    DynamicsSamples,
-    dynamics_samples,
-    is_moving,
-    long_pieces,
-)
-from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.tuning import SAMPLES
 from spelgen.runtime.body_chain import BodyChain
 
 FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
-STEPS = max(HINTS.shifts)
-SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s] time shifts of the torque that are compared
-# [samples] Times around a sample at which its signals are kept: signals of the filter's bandwidth are determined by
-# values every 20 ms.
-OFFSETS = np.arange(-HINTS.longest_offset, HINTS.longest_offset + 1, 2)
-
-
-class DriveSamples(NamedTuple):
-    """S samples of a moving arm with n joints, and time-shifted signals.
-
-    Attributes:
-        around: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and joint torques [Nm, N] at each of the E times `OFFSETS` after
-            the sample; beyond the ends of a recording its first or last value.
-        times: (S,) times of the samples since the start of their recording [s].
-        bent: (S, n, K) bristle deflections, divided by the break-away displacements.
-        direction: (S, n) direction of dry friction, see `DynamicsSamples`.
-        torques: (S, n, D) joint torques [Nm, N], shifted in time by each of the D `SHIFTS`.
-    """
-
-    around: np.ndarray
-    times: np.ndarray
-    bent: np.ndarray
-    direction: np.ndarray
-    torques: np.ndarray
-
-    @property
-    def motion(self) -> np.ndarray:
-        """Positions, velocities and accelerations without time shift, (3, S, n) [rad, s; m, s]."""
-        return np.moveaxis(self.around[:, :, :3, len(OFFSETS) // 2], 2, 0)
-
-    @property
-    def tau(self) -> np.ndarray:
-        """Joint torques without time shift, (S, n) [Nm, N]."""
-        return self.torques[..., STEPS]
-
-    def thinned(self, stride: int) -> DriveSamples:
-        """Return a subset that contains every `stride`-th sample."""
-        return DriveSamples(*(column[::stride] for column in self))
-
-
-class DriveLog:
-    """Collector of the samples of successive trajectories.
-
-    Whenever it has more than twice `DriveHintTuning.samples` samples, every second one is removed. If there are many
-    trajectories, only every second, fourth, ... trajectory is used, since filtering all of a long log takes minutes.
-    """
-
-    def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
-        """Create a collector without samples.
-
-        Args:
-            joint_types: "revolute" or "prismatic" for each of the n joints.
-            drives: input matrix and speeds of the drives.
-            preprocessing: filter and gap of the samples; its torque delay is ignored.
-        """
-        self._inputs, self._preprocessing = drives.inputs, replace(preprocessing, torque_delay=0.0)
-        smoothing = np.full(len(joint_types), FrictionModel().coulomb_smoothing_velocity)
-        self._reach = replace(reach_of(joint_types, drives.speeds), smoothing_velocity=smoothing)
-        self._samples: list[DriveSamples] = []
-        self._every = self._step = 1
-        self._number = 0
-
-    def add(self, trajectory: Trajectory) -> None:
-        """Add the samples of a trajectory; nothing is added if it is too short, or its sample rate is too low."""
-        # tested before filtering, which would take too long for a log of ten thousand short motions
-        if trajectory.duration < SHORTEST:
-            return
-        self._number += 1
-        if self._number % self._step:
-            return
-        for piece in long_pieces(trajectory, self._preprocessing.gap):
-            # with pauses, so that the samples are evenly spaced, and a time shift is a shift by whole samples
-            samples = dynamics_samples(
-                [piece], pauses=True, preprocessing=self._preprocessing, reach=self._reach
-            )
-            start = float(piece.t[0] - trajectory.t[0])
-            self._samples += [self._shifted(x, start) for x in samples if len(x.q) > 2 * STEPS]
-        while self._count > 2 * HINTS.samples:
-            if len(self._samples) > HINTS.trajectories:
-                self._samples = self._samples[1::2]
-                self._step *= 2
-            else:
-                self._thin()
-
-    def _thin(self) -> None:
-        self._samples = [x.thinned(2) for x in self._samples]
-        self._every *= 2
-
-    def _shifted(self, samples: DynamicsSamples, start: float) -> DriveSamples:
-        """Return every `_every`-th sample at which the arm moves, with the time-shifted signals.
-
-        Samples at both ends are omitted, because shifted torques are not available there. start: time of the first
-        sample since the start of the recording [s].
-        """
-        inner = samples[STEPS:-STEPS]
-        assert inner.z is not None and inner.direction is not None
-        moving = np.flatnonzero(is_moving(inner.qd))
-        while (
-            len(moving[:: self._every]) > 2 * HINTS.samples
-        ):  # windows of all samples of hours would need gigabytes
-            self._thin()
-        tau = samples.tau @ self._inputs.T
-        signals = np.stack([samples.q, samples.qd, samples.qdd, tau], axis=2)
-        signals = np.pad(signals, ((OFFSETS[-1], OFFSETS[-1]), (0, 0), (0, 0)), mode="edge")
-        around = sliding_window_view(signals, 2 * OFFSETS[-1] + 1, axis=0)[STEPS:-STEPS, ..., ::2]
-        torques = sliding_window_view(tau, len(SHIFTS), axis=0)
-        times = start + np.arange(len(tau)) / FREQUENCY
-        columns = (around, times[STEPS:-STEPS], inner.z / self._reach.values, inner.direction, torques)
-        return DriveSamples(*(column[moving[:: self._every]] for column in columns))
-
-    @property
-    def _count(self) -> int:
-        return sum(len(x.around) for x in self._samples)
-
-    def samples(self) -> DriveSamples | None:
-        """Return the collected samples, at most `DriveHintTuning.samples`; None if there are none."""
-        if not self._count:
-            return None
-        columns = zip(*self._samples, strict=True)
-        return DriveSamples(*map(np.concatenate, columns)).thinned(-(-self._count // HINTS.samples))
 
 
 @dataclass(frozen=True)
@@ -193,7 +62,7 @@ def drive_rows(
     return np.concatenate([bodies, FRICTION.columns(qd, qdd, None, speeds)], axis=2)
 
 
-def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> DriveProblem:
+def drive_problem(chain: BodyChain, drives: Drives, samples: MotionSamples) -> DriveProblem:
     """Return the least-squares problem for the joint torques of samples without time shift."""
     q, qd, qdd = samples.motion
     regressors = drive_rows(chain, q, qd, qdd, drives.speeds)
@@ -214,7 +83,7 @@ class DriveProblem:
         size: (n,) mean over the blocks of the sum of squared torques in a block.
     """
 
-    samples: DriveSamples
+    samples: MotionSamples
     speeds: np.ndarray
     rows: np.ndarray
     products: np.ndarray
@@ -239,8 +108,7 @@ class DriveProblem:
     def in_one_block(self, stride: int) -> DriveProblem:
         """Return the problem on every `stride`-th sample, in a single block: without held-out samples."""
         rows = self.rows[::stride]
-        samples = self.samples.thinned(stride)
-        return replace(self, samples=samples, rows=rows, products=block_products(rows, 1))
+        return replace(self, samples=self.samples.every(stride), rows=rows, products=block_products(rows, 1))
 
     @cached_property
     def errors(self) -> np.ndarray:

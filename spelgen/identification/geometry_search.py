@@ -5,7 +5,7 @@ another direction of gravity. Single corrections, orders of all joints, and comb
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
@@ -56,27 +56,11 @@ def kinds_of_faults(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class HypothesisComparison:
-    """Result of the search for better hypotheses about a log.
+def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
+    """Return the fit of the unchanged log and, if any hypotheses fit significantly better, the fits of the best.
 
-    unchanged: fit of the unchanged log. better: fits that are significantly better than `unchanged`, and about equally
-    good; the best is first.
-    """
-
-    unchanged: HypothesisFit
-    better: tuple[HypothesisFit, ...]
-
-    @property
-    def codes(self) -> tuple[str, ...]:
-        """Codes of the faults of the log under the best hypothesis."""
-        return tuple(fault.code for fault in self.better[0].hypothesis.faults)
-
-
-def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> HypothesisComparison:
-    """Return the hypotheses that fit a log significantly better than the unchanged log.
-
-    faults: kinds of faults that are tested.
+    Fits that are about as good as the best one are returned, too; the best one is first. faults: kinds of faults that
+    are tested.
     """
     # the many hypotheses are compared on few samples, and the best ones below on more
     coarse = problem.thinned(GEOMETRY.coarse_samples)
@@ -103,12 +87,12 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> Hyp
         # faults for which there is other evidence than the cost
         known = [fit for fault in faults if not fault.needed for fit in fault.fits(coarse, unchanged)]
         best = min(known, key=RANK, default=unchanged)
-        return HypothesisComparison(unchanged, (best,) if best.cost < unchanged.cost else ())
+        return (unchanged, best) if best.cost < unchanged.cost else (unchanged,)
     finer = problem.thinned(GEOMETRY.confirming_samples)
     unchanged = finer.fit(problem.unchanged)
     # only three, since a message lists three hypotheses at most
     confirmed = _weighed(finer, [finer.fit(fit.hypothesis) for fit in likely[:3]], unchanged)
-    return HypothesisComparison(unchanged, _likely(unchanged, confirmed))
+    return unchanged, *_likely(unchanged, confirmed)
 
 
 def _weighed(

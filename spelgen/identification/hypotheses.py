@@ -2,93 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from spelgen.arm.arm import Chain
-from spelgen.identification.drive_hints import OFFSETS
-from spelgen.logs.dynamics_samples import FREQUENCY
+from spelgen.identification.motion_samples import MotionSamples
 
 if TYPE_CHECKING:
     from spelgen.identification.log_faults import Fault
 
 Vector3 = tuple[float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class MotionSamples:
-    """S samples of motion and joint torques of n joints.
-
-    Attributes:
-        values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at E times around each sample, see
-            `DriveSamples`; E = 1 for samples without their neighbours.
-        bent: (S, n, K) bristle deflections of the unchanged log; K = 0 for samples without a history of motion.
-        times: (S,) times of the samples [s], see `DriveSamples`; 0 for samples without their neighbours.
-    """
-
-    values: np.ndarray
-    bent: np.ndarray
-    times: np.ndarray
-
-    @classmethod
-    def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
-        """Return the samples of signals, (S, n) each, without their neighbours."""
-        return cls(np.stack([q, qd, qdd, tau], axis=2)[..., None], np.zeros((*q.shape, 0)), np.zeros(len(q)))
-
-    @property
-    def motion(self) -> np.ndarray:
-        """Positions, velocities and accelerations, (3, S, n)."""
-        return np.moveaxis(self.central[..., :3], 2, 0)
-
-    @property
-    def tau(self) -> np.ndarray:
-        """Joint torques, (S, n)."""
-        return self.central[..., 3]
-
-    @property
-    def central(self) -> np.ndarray:
-        """Signals (S, n, 4) at the times of the samples."""
-        return self.values[..., self.values.shape[3] // 2]
-
-    def at(self, delays: np.ndarray) -> np.ndarray:
-        """Return the signals (S, n, 4) at the times `delays`, (n, 4) or (S, n, 4) [s], after the samples.
-
-        Signals at a longer delay than `longest_delay` are those around the sample that is nearest in time.
-        """
-        if not delays.any():
-            return self.central
-        spline = _interpolation()
-        if delays.ndim == 2:
-            return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
-        # times of later recordings are larger, so that the nearest sample is of the same recording
-        recording = np.cumsum(np.diff(self.times, prepend=self.times[:1]) < 0)
-        present = self.times + 1e6 * recording
-        times = present[:, None, None] + delays
-        nearest = np.searchsorted((present[1:] + present[:-1]) / 2, times)
-        rest = np.clip(times - present[nearest], -self.longest_delay, self.longest_delay)
-        joint, signal = np.ogrid[: delays.shape[1], :4]
-        return np.asarray(np.einsum("snie,snie->sni", self.values[nearest, joint, signal], spline(rest)))
-
-    @property
-    def longest_delay(self) -> float:
-        """Longest delay [s] at which the signals are known; 0 for samples without their neighbours."""
-        return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
-
-    def thinned(self, count: int) -> MotionSamples:
-        """Return at most `count` samples, evenly spaced."""
-        stride = -(-len(self.values) // count) or 1
-        return MotionSamples(self.values[::stride], self.bent[::stride], self.times[::stride])
-
-
-def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
-    """Return the concatenation of several sets of samples."""
-    columns = zip(*((x.values, x.bent, x.times) for x in samples), strict=True)
-    return MotionSamples(*map(np.concatenate, columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,21 +67,15 @@ class Hypothesis:
         if self.drift.any():
             delays = delays + samples.times[:, None, None] * _per_signal(self.drift)
         values = samples.values if delays.any() else samples.central[..., None]
-        signals = replace(samples, values=_permuted(values, self.source)).at(delays) * _per_signal(self.scale)
+        signals = samples._replace(values=_permuted(values, self.source)).at(delays) * _per_signal(self.scale)
         signals[..., 0] += self.offset
-        return replace(samples, values=signals[..., None])
+        return samples._replace(values=signals[..., None])
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
         """Return the logged samples for `samples` of the joints, for a hypothesis of scales and offsets only."""
         signals = samples.values.copy()
         signals[:, :, 0] -= self.offset[:, None]
-        return replace(samples, values=signals / _per_signal(self.scale)[..., None])
-
-
-@cache
-def _interpolation() -> CubicSpline:
-    """Return the weights (E,) of the signals around a sample for their values at a time [s] after the sample."""
-    return CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
+        return samples._replace(values=signals / _per_signal(self.scale)[..., None])
 
 
 def _per_signal(values: np.ndarray) -> np.ndarray:

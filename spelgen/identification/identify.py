@@ -17,7 +17,7 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import Identification, LeastSquares
 from spelgen.identification.intervals import BLOCKS, jackknife_covariance, student_scale
-from spelgen.identification.least_squares import Columns, Solution, deviations, reduce, solve
+from spelgen.identification.least_squares import Solution, deviations, solve
 from spelgen.identification.torque_delay import TorqueDelay, find_torque_delay
 from spelgen.identification.tuning import TUNING
 from spelgen.logs.checks import check
@@ -127,7 +127,8 @@ class _Equations:
         """Return the regressor (T, n, 10 bodies) of the inertial parameters for a block of samples."""
         return regressor(self.arm, block.q, block.qd, block.qdd)
 
-    def _rows(self, friction: FrictionModel) -> Iterator[Columns]:
+    def _rows(self, friction: FrictionModel) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield the regressor (T, n, K) and the joint torques (T, n) [Nm, N] of each block of samples."""
         reach = reach_of(self.arm.joint_types).values
         regressors = self._regressors or map(self._regressor, self._blocks)
         for block, bodies in zip(self._blocks, regressors, strict=True):
@@ -135,40 +136,22 @@ class _Equations:
             columns = friction.columns(block.qd, block.qdd, deflection, self.drives.speeds)
             yield np.concatenate([bodies, columns], axis=2), block.tau
 
-    def _noise(self, friction: FrictionModel, solution: Solution) -> np.ndarray:
-        """Return standard deviations (n,) [Nm, N] of the torque residual, enlarged for its correlation in time."""
-        residuals = [rows @ solution.parameters - tau for rows, tau in self._rows(friction)]
-        return deviations(residuals, solution.rank)
+    def _products(self, friction: FrictionModel, parameters: int) -> np.ndarray:
+        """Return the Gram matrices (n, BLOCKS, K + 1, K + 1) of regressor and torque per joint and block of samples.
 
-    def _jackknife(
-        self, friction: FrictionModel, solution: Solution, weights: np.ndarray, combination: np.ndarray
-    ) -> np.ndarray:
-        """Return the standard deviations (r,) of linear combinations of the fitted parameters by a block jackknife.
-
-        weights: (n,) weights of the joints. combination: (r, k) coefficients of the k fitted parameters in each of
-        the r combinations. See `jackknife_covariance`.
+        parameters: number K of parameters.
         """
-        columns, count = solution.columns, sum(len(block.q) for block in self._blocks)
+        count, first = sum(len(block.q) for block in self._blocks), 0
         group = np.arange(count) * BLOCKS // count  # contiguous blocks of samples
-        curvature = np.zeros((BLOCKS, len(columns), len(columns)))
-        descent, first = np.zeros((BLOCKS, len(columns))), 0
-        for rows, tau in self._rows(friction):
-            residual = (tau - rows @ solution.parameters) * weights
-            weighted = rows[:, :, columns] * weights[:, None]
+        products = np.zeros((len(self.drives.speeds), BLOCKS, parameters + 1, parameters + 1))
+        for columns, tau in self._rows(friction):
+            rows = np.concatenate([columns, tau[..., None]], axis=2).swapaxes(0, 1)
             numbers = group[first : first + len(tau)]
             for number in np.unique(numbers).tolist():
-                samples = numbers == number
-                jacobian = weighted[samples].reshape(-1, len(columns))
-                curvature[number] += jacobian.T @ jacobian
-                descent[number] += residual[samples].ravel() @ jacobian
+                block = rows[:, numbers == number]
+                products[:, number] += block.swapaxes(1, 2) @ block
             first += len(tau)
-        # columns are scaled to length one, since they have different units
-        length = np.sqrt(curvature.sum(axis=0).diagonal())
-        curvature /= np.outer(length, length)
-        ridge = TUNING.negligible * np.eye(len(columns))
-        _, covariance = jackknife_covariance(*map(torch.from_numpy, (curvature, descent / length, ridge)))
-        root = combination / length
-        return np.asarray(np.sqrt(np.einsum("rk,kl,rl->r", root, covariance.numpy(), root)))
+        return products
 
     def solved(self, method: LeastSquares) -> Identification:
         """Return the result for a method. Raises LogError if there are no samples."""
@@ -178,24 +161,26 @@ class _Equations:
                 expected=f"motion sampled at {SLOWEST:g} Hz or faster, {SHORTEST:g} s without a gap at least",
             )
         base = base_parameters(self.arm, method.friction, self.drives.speeds)
-        triangles = reduce(self._rows(method.friction))
+        products = self._products(method.friction, len(base.parameters))
+        torques = np.concatenate([block.tau for block in self._blocks])
+        deviation = torques.std(axis=0)
         # bounded from below, since a joint with a constant torque would have an infinite weight
-        torque_range = np.maximum(triangles.deviation, 1e-3 * triangles.deviation.max())
+        torque_range = np.maximum(deviation, 1e-3 * deviation.max())
         weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
         # with the weights "noise", joints are reweighted by their residuals in each iteration
         for _ in range(1 + TUNING.rounds * (method.weights == "noise")):
+            weighted = np.tensordot(np.square(weights), products, 1)
             # only the base columns are fitted; the other parameters remain zero
-            solution = solve(triangles, weights, base.columns)
-            noise = np.maximum(self._noise(method.friction, solution), TUNING.least_noise * torque_range)
+            solution = solve(weighted.sum(axis=0), base.columns)
+            residuals = [rows @ solution.parameters - tau for rows, tau in self._rows(method.friction)]
+            noise = np.maximum(deviations(residuals, solution.rank), TUNING.least_noise * torque_range)
             used, weights = weights, 1.0 / noise
-        squares = triangles.squares(solution.parameters) / triangles.count
+        squares = np.square(np.concatenate(residuals)).mean(axis=0)
         combination = base.combination[:, base.columns]
-        std = solution.deviations(triangles, used**2 * noise, combination)
+        std = solution.deviations(products.sum(axis=1), used**2 * noise, combination)
         # no jackknife if some parameters are undetermined: fits without a block would be singular
-        if solution.rank == len(base) and triangles.count >= BLOCKS * MIN_BLOCK:
-            std = np.maximum(
-                std, student_scale(BLOCKS) * self._jackknife(method.friction, solution, used, combination)
-            )
+        if solution.rank == len(base) and len(torques) >= BLOCKS * MIN_BLOCK:
+            std = np.maximum(std, student_scale(BLOCKS) * _jackknife(weighted, solution, combination))
         return Identification(
             arm=self.arm,
             method=method,
@@ -206,8 +191,26 @@ class _Equations:
             condition=solution.condition,
             unseen=len(base) - solution.rank,
             residual=np.sqrt(squares),
-            nmse=squares / np.where(triangles.deviation > 0, triangles.deviation, np.nan) ** 2,
+            nmse=squares / np.where(deviation > 0, deviation, np.nan) ** 2,
             trajectories=tuple(x.name for x in self.samples),
-            samples=triangles.count,
+            samples=len(torques),
             drives=self.drives,
         )
+
+
+def _jackknife(products: np.ndarray, solution: Solution, combination: np.ndarray) -> np.ndarray:
+    """Return the standard deviations (r,) of combinations of the fitted parameters, see `jackknife_covariance`.
+
+    products: (B, K + 1, K + 1) weighted Gram matrices of regressor and torque per block of samples. combination:
+    (r, k) coefficients of the k fitted parameters in each of the r combinations.
+    """
+    columns = solution.columns
+    curvature, target = products[:, columns[:, None], columns], products[:, columns, -1]
+    descent = target - curvature @ solution.parameters[columns]
+    # columns are scaled to length one, since they have different units
+    length = np.sqrt(curvature.sum(axis=0).diagonal())
+    curvature = curvature / np.outer(length, length)
+    ridge = TUNING.negligible * np.eye(len(columns))
+    _, covariance = jackknife_covariance(*map(torch.from_numpy, (curvature, descent / length, ridge)))
+    root = combination / length
+    return np.asarray(np.sqrt(np.einsum("rk,kl,rl->r", root, covariance.numpy(), root)))

@@ -1,54 +1,16 @@
-"""Linear least squares on torques from one triangular factor per joint.
+"""Linear least squares on torques, from Gram matrices per joint.
 
-The factors do not depend on the weights of the joints, so that fits with several weights need one pass over the logs.
+The Gram matrices do not depend on the weights of the joints, so that fits with several weights need one pass over the
+logs.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import pinv
+from scipy.linalg import pinvh
 
 from spelgen.identification.tuning import TUNING
-
-Columns = tuple[np.ndarray, np.ndarray]
-"""Regressor (T, n, K) and joint torques (T, n) [Nm, N] of T samples."""
-
-
-@dataclass(frozen=True, eq=False)
-class Triangles:
-    """Triangular QR factors of the least-squares equations of n joints with K parameters.
-
-    Attributes:
-        factors: (n, K + 1, K + 1) upper triangular factor of each joint's matrix [regressor, torque].
-        count: number of samples.
-        deviation: (n,) standard deviation of the torque [Nm, N].
-    """
-
-    factors: np.ndarray
-    count: int
-    deviation: np.ndarray
-
-    def squares(self, x: np.ndarray) -> np.ndarray:
-        """Return the sum of squared torque residuals per joint, (n,) [Nm^2, N^2], for the parameters x (K,)."""
-        return np.asarray(np.square(self.factors @ np.append(x, -1.0)).sum(axis=1))
-
-
-def reduce(blocks: Iterable[Columns]) -> Triangles:
-    """Return the triangular factors of all blocks of samples together; one block is in memory at a time.
-
-    blocks: regressor (T, n, K) and torques (T, n) of each block.
-    """
-    factors: np.ndarray | None = None
-    count, total, square = 0, 0.0, 0.0
-    for regressor, torque in blocks:
-        rows = np.concatenate([regressor, torque[:, :, None]], axis=2).swapaxes(0, 1)
-        if factors is not None:
-            rows = np.concatenate([factors, rows], axis=1)
-        factors = np.asarray(np.linalg.qr(rows, mode="r"))
-        count, total, square = count + len(torque), total + torque.sum(0), square + np.square(torque).sum(0)
-    deviation = np.sqrt(np.maximum(square / count - np.square(total / count), 0.0))
-    return Triangles(np.asarray(factors), count, deviation)
 
 
 def varying(tau: np.ndarray) -> np.ndarray:
@@ -99,42 +61,40 @@ class Solution:
     condition: float
     rank: int
 
-    def deviations(self, triangles: Triangles, errors: np.ndarray, combination: np.ndarray) -> np.ndarray:
+    def deviations(self, products: np.ndarray, errors: np.ndarray, combination: np.ndarray) -> np.ndarray:
         """Return the standard deviations (k,) of k linear combinations of the fitted parameters.
 
         The sandwich estimator is valid even if the weights are not the inverse standard deviations of the errors
         (White, Econometrica 48:817, 1980).
 
         Args:
-            triangles: triangular factors of the samples.
+            products: (n, K + 1, K + 1) Gram matrices of the regressor and the torque, per joint.
             errors: (n,) s_j w_j^2, with the standard deviation s_j of the torque error and the weight w_j of joint j;
                 the middle factor of the sandwich is the sum of (s_j w_j^2)^2 Y_j^T Y_j, with the regressor Y_j.
             combination: (k, r) coefficients of the fitted parameters in each combination.
         """
-        rows = triangles.factors[..., self.columns]
-        effects = (combination @ self.covariance) @ rows.swapaxes(1, 2)
-        return np.asarray(np.sqrt(np.tensordot(np.square(errors), np.square(effects).sum(axis=2), 1)))
+        effects = combination @ self.covariance
+        middle = np.tensordot(np.square(errors), products, 1)[np.ix_(self.columns, self.columns)]
+        return np.asarray(np.sqrt((effects @ middle * effects).sum(axis=1)))
 
 
-def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Solution:
+def solve(product: np.ndarray, columns: np.ndarray) -> Solution:
     """Return the parameters that minimize the weighted squared residual; the minimum-norm solution if it is singular.
 
     Args:
-        triangles: triangular factors of the samples.
-        weights: (n,) weight of each joint's torque residual.
+        product: (K + 1, K + 1) Gram matrix of the weighted regressor and torque.
         columns: (r,) indices of the fitted parameters; the others are zero.
     """
-    weighted = triangles.factors * weights[:, None, None]
-    weighted = weighted.reshape(-1, weighted.shape[2])
-    rows, target = weighted[:, columns], weighted[:, -1]
-    length = np.linalg.norm(rows, axis=0)
+    normal = product[np.ix_(columns, columns)]
+    length = np.sqrt(normal.diagonal())
     length[length == 0] = 1.0
-    inverse, rank = pinv(rows / length, rtol=TUNING.negligible, return_rank=True)
-    inverse = inverse / length[:, None]
-    parameters = np.zeros(weighted.shape[1] - 1)
-    parameters[columns] = inverse @ target
-    condition = float(np.linalg.cond(rows / length)) if rank == len(columns) else float("inf")
-    return Solution(parameters, columns, inverse @ inverse.T, condition, int(rank))
+    scale = np.outer(length, length)
+    inverse, rank = pinvh(normal / scale, rtol=TUNING.negligible, return_rank=True)
+    inverse = inverse / scale
+    parameters = np.zeros(len(product) - 1)
+    parameters[columns] = inverse @ product[columns, -1]
+    condition = float(np.sqrt(np.linalg.cond(normal / scale))) if rank == len(columns) else float("inf")
+    return Solution(parameters, columns, inverse, condition, int(rank))
 
 
 def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:

@@ -19,8 +19,9 @@ from scipy.linalg import block_diag
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.identification.drive_hints import FRICTION, drive_rows
-from spelgen.identification.hypotheses import Hypothesis, HypothesisFit, MotionSamples, Vector3
+from spelgen.identification.hypotheses import Hypothesis, HypothesisFit, Vector3
 from spelgen.identification.least_squares import block_products, varying
+from spelgen.identification.motion_samples import MotionSamples
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.runtime.body_chain import BodyChain
 
@@ -85,6 +86,13 @@ class GeometryProblem:
         extended.prior_mean = np.append(self.prior_mean, np.zeros(added))
         extended._precision = block_diag(self._precision, np.zeros((added, added)))
         return extended
+
+    def with_signs(self, signs: np.ndarray) -> GeometryProblem:
+        """Return the problem with torques that are multiplied by signs, (S, n)."""
+        other, values = copy(self), self.samples.values.copy()
+        values[:, :, 3] *= signs[..., None]
+        other.samples = self.samples._replace(values=values)
+        return other
 
     def without_gravity(self, joint: int) -> GeometryProblem:
         """Return the problem of the unchanged log with a model in which one joint's torque contains no gravity."""

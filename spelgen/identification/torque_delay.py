@@ -4,28 +4,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.errors import Diagnostic
-from spelgen.identification.drive_hints import (
-    SHIFTS,
-    Coupling,
-    DriveLog,
-    DriveProblem,
-    drive_problem,
-    find_coupling,
-)
+from spelgen.identification.drive_hints import Coupling, DriveProblem, drive_problem, find_coupling
 from spelgen.identification.least_squares import block_products, normal_solution, varying
+from spelgen.identification.motion_samples import OFFSETS, DriveLog, interpolation
 from spelgen.identification.tuning import HINTS, TUNING
+from spelgen.logs.dynamics_samples import FREQUENCY
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.body_chain import BodyChain
 
 FRICTION = FrictionModel(memory=True)
+# [s] Longest delay of the torques of all joints. It covers the delays of loggers and field buses; a longer apparent
+# delay may be due to friction.
+MAX_DELAY = 0.02
 
 
 @dataclass(frozen=True)
@@ -98,15 +95,13 @@ def find_torque_delay(
 
 def delay_of(problem: DriveProblem) -> TorqueDelay:
     """Return the delay of the torques or, if a coupling of motors explains the logs better, the coupling instead."""
-    late, coupling = _likely_delay(problem), find_coupling(problem)
-    if coupling is None:
-        return late
-    # A delay may look like a coupling. If no coupling is found after removal of the delay, the delay is the
-    # explanation.
-    moved = problem.of_torques(problem.samples.torques @ _spline(late.delay))
-    if late.delay and find_coupling(moved) is None:
-        return late
-    return TorqueDelay(coupling=coupling)
+    late, samples = _likely_delay(problem), problem.samples
+    if late.delay:
+        # a delay may look like a coupling, which is not found after removal of the delay
+        delays = np.full((len(problem.size), 4), late.delay)
+        problem = problem.of_torques(samples.at(delays)[..., 3])
+    coupling = find_coupling(problem)
+    return late if coupling is None else TorqueDelay(coupling=coupling)
 
 
 def _likely_delay(problem: DriveProblem) -> TorqueDelay:
@@ -116,7 +111,7 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     state that fits badly is ignored. The returned value is from the model with the smaller residual.
     """
     samples = problem.samples
-    tau = samples.torques
+    tau = samples.values[:, :, 3]
     if not varying(problem.rows[..., -1]).any():
         return NO_DELAY
     estimates = []
@@ -146,10 +141,10 @@ def _estimate(rows: np.ndarray) -> _Estimate:
     """Return the delay with the smallest torque residual, with its standard error.
 
     The standard error is from a jackknife over blocks of time, since model errors are correlated over seconds. rows:
-    (S, n, K + D) regressor, and torques shifted in time by each of the D `SHIFTS`.
+    (S, n, K + D) regressor, and torques at each of the D times `OFFSETS` after the samples.
     """
     products = block_products(rows, HINTS.blocks)
-    deviation = rows[..., -len(SHIFTS) :].std(axis=(0, 2))
+    deviation = rows[..., -len(OFFSETS) :].std(axis=(0, 2))
     least = np.maximum(deviation, 1e-3 * deviation.max())
     noise = least
     for _ in range(TUNING.rounds):
@@ -161,7 +156,7 @@ def _estimate(rows: np.ndarray) -> _Estimate:
     spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
     # The delay is unknown if it is near the largest shift, where the minimum may be outside. If the
     # jackknife estimates of all blocks are equal, there are too few samples.
-    unknown = abs(delay) > SHIFTS[-2] or spread == 0
+    unknown = abs(delay) > MAX_DELAY or spread == 0
     standard_error = np.inf if unknown else float(np.sqrt(spread))
     return _Estimate(delay, standard_error, float((squares / least**2).sum()))
 
@@ -170,27 +165,23 @@ def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the delay [s] with the smallest residual, and the coefficients (K + D,) of the residual.
 
     products: (K + D, K + D) Gram matrix of the regressor and of the D shifted torques. The residual is the sum of these
-    columns times the coefficients. A torque with a shift between two of `SHIFTS` is interpolated by a cubic spline,
-    since filtered torques are smooth over one step.
+    columns times the coefficients. A torque between two of the `OFFSETS` is interpolated by a cubic spline, since
+    filtered torques are smooth over one step.
     """
-    moved = len(SHIFTS)
+    moved = len(OFFSETS)
     parameters = normal_solution(products, moved)
     left = products[-moved:, -moved:] - products[-moved:, :-moved] @ parameters
 
     def squares(delay: float) -> float:
-        shape = _spline(delay)
+        shape = interpolation()(delay)
         return float(shape @ left @ shape)
 
-    nearest = int(np.argmin(np.diag(left)))
-    low, high = SHIFTS[max(nearest - 1, 0)], SHIFTS[min(nearest + 1, moved - 1)]
-    best = minimize_scalar(squares, bounds=(low, high), method="bounded", options={"xatol": 1e-6})
-    shape = _spline(best.x)
+    times = OFFSETS / FREQUENCY
+    near = times[np.abs(times) <= 2 * MAX_DELAY]
+    nearest = min(near, key=squares)
+    step = near[1] - near[0]
+    best = minimize_scalar(
+        squares, bounds=(nearest - step, nearest + step), method="bounded", options={"xatol": 1e-6}
+    )
+    shape = interpolation()(best.x)
     return float(best.x), np.append(parameters @ shape, -shape)
-
-
-_cardinal = CubicSpline(SHIFTS, np.eye(len(SHIFTS)))
-
-
-def _spline(delay: float) -> np.ndarray:
-    """Return weights (D,): the weighted sum of the D shifted torques is the torque shifted by `delay` [s]."""
-    return np.asarray(_cardinal(delay))

@@ -32,9 +32,6 @@ class DriveHintTuning:
     # coupling and, in each block, of the squared torque. For the
     # coupled wrist joints of a Staubli TX40 these fractions are 0.05 and 0.03.
     coupling_gain: float = 0.5
-    # [1] Time shifts of the torque, in samples of 10 ms. They cover the delays of loggers and field buses; an apparent
-    # delay of more than 30 ms may be due to friction.
-    shifts: tuple[int, ...] = (-3, -2, -1, 0, 1, 2, 3)
     # [samples] Largest time shift of the signals of one joint, 160 ms.
     longest_offset: int = 16
     # [1] Number of samples that are used, which is ample for the about 70 parameters of six joints.
@@ -71,8 +68,10 @@ class LogGeometryTuning:
     coarse_samples: int = 200
     # [1] Largest number of samples for the final comparison of the best hypotheses.
     confirming_samples: int = 800
-    # [rad] Zero offsets and tilts of the base below this bound are calibration errors.
+    # [rad] Zero offsets below this bound are calibration errors.
     min_angle: float = 0.09
+    # [rad] Tilts of the base below this bound are errors of the mounting.
+    min_tilt: float = 0.06
     # [m] Zero offsets of prismatic joints below this bound are calibration errors.
     min_shift: float = 0.01
     # [s] Delays of single joints below this bound are ascribed to friction, whose apparent delay is up to 30 ms.
@@ -84,6 +83,8 @@ class LogGeometryTuning:
     # [1] Largest ratio of a joint's squared residuals with and without a delay of its signals; wrong delays have
     # ratios from 0.78 on, on recordings of seven arms.
     delay_gain: float = 0.65
+    # [1] Largest ratio of a joint's squared residuals with restored signs of its torques and with logged magnitudes.
+    unsigned_gain: float = 0.4
     # Cost increase up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
     # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.

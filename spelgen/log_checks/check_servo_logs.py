@@ -234,7 +234,9 @@ class ServoLogs:
                     summary.errors.append(wrong)
                     continue
                 summary.notes.extend(_command_warning(k, report, following, self._logs))
-            for check, found in run_checks(POSITION_CHECKS, JointEvidence(coordinate, report)):
+            for check, found in run_checks(
+                POSITION_CHECKS, JointEvidence(coordinate, report, mapping.offset("q", coordinate.name))
+            ):
                 summary.add(check, found.message, f"joint {coordinate.name!r}")
         for log in self._logs:
             if log.sample_rate < 20.0:

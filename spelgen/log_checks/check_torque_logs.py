@@ -12,17 +12,18 @@ import numpy as np
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic
 from spelgen.identification.column_faults import UNITS
-from spelgen.identification.drive_hints import Coupling, DriveLog, DriveSamples, drive_problem
+from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
-from spelgen.identification.hypotheses import Hypothesis, HypothesisFit, MotionSamples, joined_samples
+from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
 from spelgen.identification.least_squares import varying
 from spelgen.identification.log_faults import Correction, Fault
 from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.motion_samples import DriveLog, MotionSamples, joined_samples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.listing import Listing, number
 from spelgen.log_checks.geometry_finding import geometry_finding
-from spelgen.log_checks.limits_in_logs import CLIPPED, FlatTops, find_limits
+from spelgen.log_checks.limits_in_logs import CLIPPED, UNSIGNED, FlatTops, find_limits, find_unsigned
 from spelgen.log_checks.report import JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import (
     CHECKS,
@@ -90,7 +91,8 @@ class TorqueLogs:
         fits = fit_gravity(chain, motion)
         for coordinate, report, gravity in zip(chain.coordinates, reports, fits, strict=True):
             completed.append(replace(report, gravity=gravity))
-            evidence.append(JointEvidence(coordinate, completed[-1]))
+            offset = self._mapping.offset("q", coordinate.name)
+            evidence.append(JointEvidence(coordinate, completed[-1], offset))
         # the model is fitted only to sound logs: wrong velocities give wrong friction, and other faults wrong hints
         is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
         unscaled = self._unscaled_currents()
@@ -98,7 +100,8 @@ class TorqueLogs:
         moving = self._moving.samples()
         if is_sound:
             # with unknown motor gains a wrong hypothesis about the log may have the lowest cost
-            problem = None if unscaled else self._problem(moving, motion)
+            # unfiltered samples of logs whose sample rate is too low for accelerations
+            problem = None if unscaled else self._problem(motion if moving is None else moving)
             is_right = problem is None or self._check_geometry(problem, evidence, accepted, summary)
             if problem is not None and is_right and WITHOUT_GRAVITY not in accepted:
                 summary.notes.extend(_without_gravity(problem, completed))
@@ -143,15 +146,8 @@ class TorqueLogs:
         """Return True if the mapping states the unit of a joint's torque."""
         return self._mapping.unit("tau", joint) is not None
 
-    def _problem(self, moving: DriveSamples | None, motion: MotionSamples) -> GeometryProblem | None:
-        """Return the least-squares problem of the logs; None if they have too few samples or only constant torques.
-
-        moving: filtered samples of the moving arm; None for logs whose sample rate is too low for accelerations.
-        motion: unfiltered samples, which are used instead in this case.
-        """
-        samples = motion
-        if moving is not None:
-            samples = MotionSamples(moving.around, moving.bent, moving.times)
+    def _problem(self, samples: MotionSamples) -> GeometryProblem | None:
+        """Return the least-squares problem of samples; None for too few samples or only constant torques."""
         if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
         return GeometryProblem(
@@ -177,27 +173,32 @@ class TorqueLogs:
         accepted: set[str],
         summary: Findings,
     ) -> bool:
-        """Return True if the torques are not clipped and no hypothesis about the log fits significantly better.
+        """Return True if the torques are neither cut off nor explained much better by a hypothesis about the log.
 
         Hypotheses are, for example, other signs, orders or zeros of the joints. Otherwise the finding is added, and
         False is returned. Warnings about mechanical stops and about inertials of the URDF are added, too.
         """
+        unsigned = find_unsigned(problem) if UNSIGNED not in accepted else []
+        if unsigned:
+            summary.errors.extend(unsigned)
+            return False
         limits = find_limits(problem, FlatTops.joined(self._flat))
         summary.notes.extend(limits.notes)
         if limits.errors and CLIPPED not in accepted:
             summary.errors.extend(limits.errors)
             return False
-        comparison = compare_hypotheses(problem, self._faults(evidence, problem))
-        if not comparison.better:
-            summary.notes.extend(_link_notes(problem, comparison.unchanged))
-        if not comparison.better or set(comparison.codes) <= accepted:
+        unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
+        if not better:
+            summary.notes.extend(_link_notes(problem, unchanged))
+            return True
+        if {fault.code for fault in better[0].hypothesis.faults} <= accepted:
             return True
         corrections = []
-        for fit in comparison.better:
+        for fit in better:
             corrections.append(
                 Correction(problem.arm, self._mapping, self._is_bag, problem.unchanged, fit.hypothesis)
             )
-        finding = geometry_finding(comparison.unchanged, comparison.better[0], corrections)
+        finding = geometry_finding(unchanged, better[0], corrections)
         if isinstance(finding, Diagnostic):
             summary.notes.append(finding)
         else:
@@ -229,7 +230,7 @@ class TorqueLogs:
         scale = problem.unchanged.scale[0] if units <= {(None, None), *stated} else None
         return kinds_of_faults(problem.arm, candidates, scale)
 
-    def _check_drives(self, moving: DriveSamples, summary: Findings) -> None:
+    def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning about a coupling of motors that the logs show, or else a note on a delay of the torques."""
         late = delay_of(drive_problem(body_chain(self._arm.chain), self._drives, moving))
         if late.coupling is not None:
@@ -264,31 +265,40 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
 
 
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
-    """Yield a warning for each link whose first moment (mass times centre of mass) differs much from the URDF's.
+    """Yield a warning for each link whose mass or first moment (mass times centre of mass) is far from the URDF's.
 
-    The component along the URDF's first moment is compared. A difference must be large enough to be visible in the
-    torques, since wrong parameters of small distal bodies can compensate each other.
+    Of the first moment, the component along the URDF's is compared. A difference must be large enough to be visible in
+    the torques, since wrong parameters of small distal bodies can compensate each other.
     """
     visible = 0.5 * float(problem.samples.tau.std(axis=0).max())
     gravity = float(np.linalg.norm(fit.hypothesis.gravity))
+    levers: list[float] = []  # [m] length of the chain from the first joint to each body
     for k, body in enumerate(problem.arm.bodies):
-        block = slice(10 * k + 1, 10 * k + 4)
-        stated, moment = problem.prior_mean[block], fit.parameters[block]
-        length = float(np.linalg.norm(stated))
-        if not length or float(np.linalg.norm(moment - stated)) * gravity < visible:
-            continue
-        axis = stated / length
-        ratio = float(axis @ moment) / length
-        deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / length
-        # CAD models are wrong by a factor of less than 2.5. Four standard deviations are required, since one of many
-        # bodies may exceed two by chance.
-        if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
-            continue
-        message = (
-            f"its first moment (mass times centre of mass) is {ratio:.2f} +- {deviation:.2f} times the URDF's by "
-            "least squares: check its mass and centre of mass in the URDF"
+        length = float(np.linalg.norm(np.array(body.translation, dtype=float)))
+        levers.append(0.0 if body.parent < 0 else levers[body.parent] + length)
+        first = 10 * k
+        quantities = (
+            ("first moment (mass times centre of mass)", slice(first + 1, first + 4), 1.0),
+            ("mass", slice(first, first + 1), levers[k]),
         )
-        yield Diagnostic("warning", WRONG_LINK, f"link {body.link!r}", None, message)
+        for name, block, lever in quantities:
+            stated, found = problem.prior_mean[block], fit.parameters[block]
+            size = float(np.linalg.norm(stated))
+            if not size or float(np.linalg.norm(found - stated)) * lever * gravity < visible:
+                continue
+            axis = stated / size
+            ratio = float(axis @ found) / size
+            deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / size
+            # CAD models are wrong by a factor of less than 2.5. Four standard deviations are required, since one of
+            # many bodies may exceed two by chance.
+            if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
+                continue
+            message = (
+                f"its {name} is {ratio:.2f} +- {deviation:.2f} times the URDF's by least squares: check its mass and "
+                "centre of mass in the URDF"
+            )
+            yield Diagnostic("warning", WRONG_LINK, f"link {body.link!r}", None, message)
+            break
 
 
 def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic:

@@ -1,4 +1,4 @@
-"""Detection of signals at a limit: clipped torques, and positions at a mechanical stop.
+"""Detection of signals that are cut off: clipped torques, torques without sign, positions at a mechanical stop.
 
 At a limit a signal is constant at its largest or smallest value: it has a flat top. But a flat top is no proof of a
 limit, since torques are also constant at rest and during uniform acceleration. It is a limit if, in addition, the
@@ -8,17 +8,20 @@ torque contradicts the least-squares model of all samples outside flat tops.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError
+from spelgen.identification.least_squares import varying
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.labels import UNITS
 from spelgen.logs.checks import Findings
+from spelgen.logs.unit_checks import is_one_sided
 
-CLIPPED, AT_A_STOP = "torque-clipped", "at-a-stop"
+CLIPPED, UNSIGNED, AT_A_STOP = "torque-clipped", "torque-without-sign", "at-a-stop"
 SIDES = np.array([-1.0, 1.0])
 
 
@@ -65,6 +68,41 @@ def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     below = (upright >= (tops - 4 * width)[:, None]).mean(axis=1) - shares
     is_flat = (shares > 0.01) & (shares > 2.0 * below) & (width > 0)
     return np.where(is_flat, SIDES[:, None] * tops, np.nan), np.where(is_flat, shares, 0.0)
+
+
+def find_unsigned(problem: GeometryProblem) -> list[LogError]:
+    """Return an error that names the joints whose torques were logged as magnitudes; [] if there are none.
+
+    The signs of the model's torques are assigned to the magnitudes, and the model is fitted again, in a few
+    alternations. A joint whose load always has the same direction keeps its torques, and is no finding.
+    """
+    problem = problem.thinned(GEOMETRY.confirming_samples)
+    signals = problem.unchanged.signals(problem.samples)
+    tau, qd = signals.tau, signals.motion[1]
+    suspects = varying(tau) & is_one_sided(tau)
+    if not suspects.any():
+        return []
+    fits = []
+    # initial signs: of the torques of the URDF or, for joints with little load, of the velocity (friction)
+    for torque in (problem.residual(problem.unchanged, problem.prior_mean) + tau, qd):
+        for _ in range(4):
+            signs = np.where(suspects, np.sign(torque * tau), 1.0)
+            fit = problem.with_signs(signs).fit(problem.unchanged)
+            torque = problem.residual(problem.unchanged, fit.parameters) + tau
+        fits.append((fit.cost, fit.errors * (signs * tau).var(axis=0), signs))
+    _, squares, signs = min(fits, key=itemgetter(0))
+    ratio = squares / np.maximum(problem.fit(problem.unchanged).errors * tau.var(axis=0), 1e-30)
+    both = np.minimum((signs > 0).mean(axis=0), (signs < 0).mean(axis=0)) > 0.05
+    joints = np.flatnonzero(suspects & both & (ratio < GEOMETRY.unsigned_gain))
+    if not len(joints):
+        return []
+    where = f"joint {', '.join(repr(problem.arm.joint_names[k]) for k in joints)}, tau"
+    got = (
+        "torques without sign: they keep one direction, although the motion needs both (with signs, the squared torque "
+        f"error of least squares falls to {ratio[joints].max():.1%})"
+    )
+    do = f"log torques or currents with their sign; --accept {UNSIGNED} if it is right"
+    return [LogError(got, element=where, expected="torques in both directions", do=do)]
 
 
 def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from math import inf
+from math import inf, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -11,11 +11,12 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Chain, Coordinate
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
-from spelgen.identification.hypotheses import MotionSamples
+from spelgen.identification.motion_samples import MotionSamples
 from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, GravityFit, JointReport
 from spelgen.log_checks.statistics import has_few_levels
 from spelgen.logs.checks import Check
+from spelgen.logs.joint_signals import mapping_line, plain_number
 from spelgen.logs.trajectory import QUANTITIES
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
@@ -98,10 +99,14 @@ def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 class JointEvidence(NamedTuple):
-    """Joint of the URDF and its report over all trajectories, which the checks against the robot compare."""
+    """Joint of the URDF and its report over all trajectories, which the checks against the robot compare.
+
+    offset: offset of the logged position in the mapping [rad, m].
+    """
 
     coordinate: Coordinate
     report: JointReport
+    offset: float = 0.0
 
     def limits(self) -> tuple[float, float]:
         """Return the lower and the upper position limit [rad, m]; infinite for a joint without this limit."""
@@ -115,12 +120,20 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
     """Return a message about measured or commanded positions beyond the position limits; None if there are none."""
     findings = []
     (lower, upper), unit = joint.limits(), UNITS[joint.coordinate.joint_type].position
+    lower, upper = lower - TUNING.limit_rounding, upper + TUNING.limit_rounding
+    turn = 2 * pi if joint.coordinate.joint_type == "revolute" and upper - lower < 2 * pi else 0.0
     for name in ("q", "u"):
         low, high = joint.report.low.get(name, inf), joint.report.high.get(name, -inf)
-        if low < lower - TUNING.limit_rounding:
-            findings.append(f"{name} down to {low:.4g} {unit}, the limit is {lower:z.4g}")
-        if high > upper + TUNING.limit_rounding:
-            findings.append(f"{name} up to {high:.4g} {unit}, the limit is {upper:z.4g}")
+        if low < lower:
+            findings.append(f"{name} down to {low:.4g} {unit}, the limit is {joint.limits()[0]:z.4g}")
+        if high > upper:
+            findings.append(f"{name} up to {high:.4g} {unit}, the limit is {joint.limits()[1]:z.4g}")
+        # drivers that log 0 to 360 degrees are a turn above the negative half of a joint's range
+        for shift in (-turn, turn):
+            if findings and turn and lower <= low + shift and high + shift <= upper:
+                offset = plain_number(joint.offset + shift, 8)
+                line = mapping_line({"joints": {joint.coordinate.name: {"offset": offset}}})
+                return f"{findings[0]}: another turn; {line}"
     return "; ".join(findings) or None
 
 

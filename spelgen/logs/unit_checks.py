@@ -298,14 +298,20 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
     return Advice(message, keys={"velocity": "differentiated"}) if is_mended else message
 
 
+def is_one_sided(values: np.ndarray, share: float = 0.05) -> np.ndarray:
+    """Return True for each signal (T, ...) that is nearly always positive or nearly always negative.
+
+    share: bound of the largest magnitude in one direction, divided by the largest magnitude in the other direction.
+    """
+    below, above = np.maximum(-values.min(axis=0), 0.0), np.maximum(values.max(axis=0), 0.0)
+    return np.asarray(np.minimum(below, above) <= share * np.maximum(below, above))
+
+
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Return a message if the velocities of the joint have no sign: qd is |dq/dt|."""
-    # qd has no sign if its largest magnitude in one direction is below 5 % (`share`) of its largest magnitude in the
-    # other direction.
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
-    lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
     # Velocities in both directions have a sign, and so do velocities computed from positions.
-    if "qd" not in trajectory.mapping.quantities or lowest > share * highest or len(qd) < 3:
+    if "qd" not in trajectory.mapping.quantities or not is_one_sided(qd, share) or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)
     backward, forward = sorted((-np.quantile(speed, 0.02), np.quantile(speed, 0.98)))

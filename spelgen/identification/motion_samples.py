@@ -1,0 +1,191 @@
+"""Samples of the motion of an arm and its torques, at and around each sample, from successive trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.interpolate import CubicSpline
+
+from spelgen.arm.actuation import Drives
+from spelgen.dynamics.bristles import reach_of
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.identification.tuning import HINTS
+from spelgen.logs.dynamics_samples import (
+    FREQUENCY,
+    SHORTEST,
+    DynamicsSamples,
+    dynamics_samples,
+    is_moving,
+    long_pieces,
+)
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory
+
+# [samples] Times around a sample at which its signals are kept: signals of the filter's bandwidth are determined by
+# values every 20 ms.
+OFFSETS = np.arange(-HINTS.longest_offset, HINTS.longest_offset + 1, 2)
+# [samples] Samples at both ends of a recording that are omitted, because later or earlier signals are not known there.
+ENDS = 3
+
+
+class MotionSamples(NamedTuple):
+    """S samples of motion and joint torques of n joints.
+
+    Attributes:
+        values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at each of the E times `OFFSETS` after the
+            sample, beyond the ends of a recording its first or last value; E = 1 for samples without their neighbours.
+        bent: (S, n, K) bristle deflections of the unchanged log, divided by the break-away displacements; K = 0 for
+            samples without a history of motion.
+        direction: (S, n) direction of dry friction, see `DynamicsSamples`.
+        times: (S,) times of the samples since the start of their recording [s]; 0 for samples without their neighbours.
+    """
+
+    values: np.ndarray
+    bent: np.ndarray
+    direction: np.ndarray
+    times: np.ndarray
+
+    @classmethod
+    def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
+        """Return the samples of signals, (S, n) each, without their neighbours."""
+        values = np.stack([q, qd, qdd, tau], axis=2)[..., None]
+        return cls(values, np.zeros((*q.shape, 0)), np.sign(qd), np.zeros(len(q)))
+
+    @property
+    def motion(self) -> np.ndarray:
+        """Positions, velocities and accelerations, (3, S, n)."""
+        return np.moveaxis(self.central[..., :3], 2, 0)
+
+    @property
+    def tau(self) -> np.ndarray:
+        """Joint torques, (S, n)."""
+        return self.central[..., 3]
+
+    @property
+    def central(self) -> np.ndarray:
+        """Signals (S, n, 4) at the times of the samples."""
+        return self.values[..., self.values.shape[3] // 2]
+
+    def at(self, delays: np.ndarray) -> np.ndarray:
+        """Return the signals (S, n, 4) at the times `delays`, (n, 4) or (S, n, 4) [s], after the samples.
+
+        Signals at a longer delay than `longest_delay` are those around the sample that is nearest in time.
+        """
+        if not delays.any():
+            return self.central
+        spline = interpolation()
+        if delays.ndim == 2:
+            return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
+        # times of later recordings are larger, so that the nearest sample is of the same recording
+        recording = np.cumsum(np.diff(self.times, prepend=self.times[:1]) < 0)
+        present = self.times + 1e6 * recording
+        times = present[:, None, None] + delays
+        nearest = np.searchsorted((present[1:] + present[:-1]) / 2, times)
+        rest = np.clip(times - present[nearest], -self.longest_delay, self.longest_delay)
+        joint, signal = np.ogrid[: delays.shape[1], :4]
+        return np.asarray(np.einsum("snie,snie->sni", self.values[nearest, joint, signal], spline(rest)))
+
+    @property
+    def longest_delay(self) -> float:
+        """Longest delay [s] at which the signals are known; 0 for samples without their neighbours."""
+        return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
+
+    def every(self, stride: int) -> MotionSamples:
+        """Return a subset that contains every `stride`-th sample."""
+        return MotionSamples(*(column[::stride] for column in self))
+
+    def thinned(self, count: int) -> MotionSamples:
+        """Return at most `count` samples, evenly spaced."""
+        return self.every(-(-len(self.values) // count) or 1)
+
+
+def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
+    """Return the concatenation of several sets of samples."""
+    return MotionSamples(*map(np.concatenate, zip(*samples, strict=True)))
+
+
+@cache
+def interpolation() -> CubicSpline:
+    """Return the weights (E,) of the signals around a sample for their values at a time [s] after the sample."""
+    return CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
+
+
+class DriveLog:
+    """Collector of the samples of successive trajectories.
+
+    Whenever it has more than twice `DriveHintTuning.samples` samples, every second one is removed. If there are many
+    trajectories, only every second, fourth, ... trajectory is used, since filtering all of a long log takes minutes.
+    """
+
+    def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
+        """Create a collector without samples.
+
+        Args:
+            joint_types: "revolute" or "prismatic" for each of the n joints.
+            drives: input matrix and speeds of the drives.
+            preprocessing: filter and gap of the samples; its torque delay is ignored.
+        """
+        self._inputs, self._preprocessing = drives.inputs, replace(preprocessing, torque_delay=0.0)
+        smoothing = np.full(len(joint_types), FrictionModel().coulomb_smoothing_velocity)
+        self._reach = replace(reach_of(joint_types, drives.speeds), smoothing_velocity=smoothing)
+        self._samples: list[MotionSamples] = []
+        self._every = self._step = 1
+        self._number = 0
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Add the samples of a trajectory; nothing is added if it is too short, or its sample rate is too low."""
+        # tested before filtering, which would take too long for a log of ten thousand short motions
+        if trajectory.duration < SHORTEST:
+            return
+        self._number += 1
+        if self._number % self._step:
+            return
+        for piece in long_pieces(trajectory, self._preprocessing.gap):
+            # with pauses, so that the samples are evenly spaced, and a time shift is a shift by whole samples
+            samples = dynamics_samples(
+                [piece], pauses=True, preprocessing=self._preprocessing, reach=self._reach
+            )
+            start = float(piece.t[0] - trajectory.t[0])
+            self._samples += [self._shifted(x, start) for x in samples if len(x.q) > 2 * ENDS]
+        while self._count > 2 * HINTS.samples:
+            if len(self._samples) > HINTS.trajectories:
+                self._samples = self._samples[1::2]
+                self._step *= 2
+            else:
+                self._thin()
+
+    def _thin(self) -> None:
+        self._samples = [x.every(2) for x in self._samples]
+        self._every *= 2
+
+    def _shifted(self, samples: DynamicsSamples, start: float) -> MotionSamples:
+        """Return every `_every`-th sample at which the arm moves, with the signals around it.
+
+        start: time of the first sample since the start of the recording [s].
+        """
+        inner = samples[ENDS:-ENDS]
+        assert inner.z is not None and inner.direction is not None
+        moving = np.flatnonzero(is_moving(inner.qd))
+        while (
+            len(moving[:: self._every]) > 2 * HINTS.samples
+        ):  # windows of all samples of hours would need gigabytes
+            self._thin()
+        signals = np.stack([samples.q, samples.qd, samples.qdd, samples.tau @ self._inputs.T], axis=2)
+        signals = np.pad(signals, ((OFFSETS[-1], OFFSETS[-1]), (0, 0), (0, 0)), mode="edge")
+        around = sliding_window_view(signals, 2 * OFFSETS[-1] + 1, axis=0)[ENDS:-ENDS, ..., ::2]
+        times = start + np.arange(len(samples.q)) / FREQUENCY
+        columns = (around, inner.z / self._reach.values, inner.direction, times[ENDS:-ENDS])
+        return MotionSamples(*(column[moving[:: self._every]] for column in columns))
+
+    @property
+    def _count(self) -> int:
+        return sum(len(x.values) for x in self._samples)
+
+    def samples(self) -> MotionSamples | None:
+        """Return the collected samples, at most `DriveHintTuning.samples`; None if there are none."""
+        return joined_samples(self._samples).thinned(HINTS.samples) if self._count else None
