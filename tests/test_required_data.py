@@ -1,10 +1,14 @@
 """A command refuses missing or wrong data only if it needs them."""
 
+from pathlib import Path
+
 import pytest
 
 from spelgen.arm.configured_arm import load_arm
+from spelgen.comparison.arms import ComparedArm, arm_inputs
 from spelgen.emission.specify import generate
-from spelgen.errors import SpelgenError
+from spelgen.errors import SettingsError, SpelgenError
+from spelgen.simulation.as_built import as_built
 
 TRANSMISSION = """<transmission name="drive"><type>transmission_interface/SimpleTransmission</type>
 <joint name="joint1"><mechanicalReduction>{} </mechanicalReduction></joint>
@@ -50,6 +54,18 @@ def test_unneeded_defects_are_warnings_at_most(odd, more, sidecar, codes):
     arm = load_arm(odd(more, sidecar))
     assert [each.code for each in arm.diagnostics if each.severity == "warning"] == codes
     assert body(generate(arm)) == body(plain)
+
+
+@pytest.mark.parametrize("group", ["simulation", "tracking"])
+def test_settings_with_errors_are_not_copied(odd, tmp_path, group):
+    """The settings are written for a random robot, and enter the digest of a comparison."""
+    urdf = odd(sidecar=f"{group}: {{lenght: 1}}")
+    expected = f"{group}: unknown key 'lenght'"
+    with pytest.raises(SettingsError, match=expected):
+        as_built(load_arm(urdf), 1, tmp_path / "built.urdf")
+    with pytest.raises(SettingsError, match=expected):
+        arm_inputs(ComparedArm(urdf=Path(urdf)), tmp_path)
+    assert not (tmp_path / "built.urdf").exists()
 
 
 def test_couplings_of_locked_joints_are_not_needed(odd):

@@ -192,8 +192,8 @@ def arm_inputs(
     collect(errors)
     # The digest omits keys of the settings that do not affect the result of a run.
     apart: dict[str, bool | set[str]] = {"about": True, "comparison": {"seeds", "published"}}
-    settings = [loaded.settings.model_dump_json(exclude_unset=True, exclude=apart)]
-    settings.append(mapping.model_dump_json(exclude_unset=True))
+    settings = [loaded.settings.model_dump(mode="json", exclude_unset=True, exclude=apart)]
+    settings.append(mapping.model_dump(mode="json", exclude_unset=True))
     # The digest uses size and modification time instead of the content, since logs may have gigabytes.
     versions = [(file, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     sources = json.dumps((loaded.robot.digest, arm.joints, arm.tip, settings, versions), default=str)

@@ -95,8 +95,9 @@ class Unusable:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> NoReturn:
-        # copy and pickle read attributes with double underscores, for which the errors must not be raised.
-        if not name.startswith("__"):
+        # copy and pickle read attributes with double underscores, for which the errors must not be raised. Pydantic
+        # reads the values of the group.
+        if not name.startswith("__") or name.startswith("__pydantic"):
             collect(self.errors)
         raise AttributeError(name)
 
