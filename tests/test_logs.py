@@ -401,6 +401,16 @@ def test_what_never_changes_in_any_trajectory_is_said():
     assert check([resting, swing()], JOINTS, ("revolute", "revolute")) == []
 
 
+def test_noise_of_a_joint_at_rest_is_no_motion():
+    """The encoder and the velocities of the joint have noise, which no derivative of the positions explains."""
+    rng, length = np.random.default_rng(0), len(swing().t)
+    noisy = changed(q={1: 0.5 + 1e-6 * rng.normal(size=length)}, qd={1: 1e-4 * rng.normal(size=length)})
+    notes = check([noisy], JOINTS, ("revolute", "revolute"))
+    assert [(x.severity, x.code, x.where) for x in notes] == [
+        ("info", "joint-at-rest", "trajectory x, joint 'b'")
+    ]
+
+
 @pytest.mark.parametrize(
     ("trajectory", "got", "line"),
     [

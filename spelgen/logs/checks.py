@@ -135,8 +135,8 @@ def find_constant_torque(signals: JointSignals) -> str | None:
 
 
 def find_rest(signals: JointSignals) -> str | None:
-    """Return a message if the position of the joint is constant throughout the trajectory."""
-    if np.ptp(signals.q) > 0:
+    """Return a message if the joint does not move in the trajectory."""
+    if not signals.is_at_rest:
         return None
     return "does not move: the logs do not excite its dynamics"
 

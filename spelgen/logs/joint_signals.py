@@ -93,6 +93,11 @@ class JointSignals(NamedTuple):
         return self.trajectory.qd[:, self.number]
 
     @property
+    def is_at_rest(self) -> bool:
+        """True if the joint does not move in the trajectory; its q may have noise."""
+        return bool(np.ptp(self.q) <= SIGNALS.rest_range)
+
+    @property
     def turns(self) -> bool:
         """True if the joint can rotate without limit."""
         return self.kind == "continuous" or bool(self.trajectory.mapping.word("period", "q", self.joint))

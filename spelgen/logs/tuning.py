@@ -49,6 +49,8 @@ class SignalCheckTuning:
     # [1] Two signals count as proportional if their correlation is at least this number. A factor between signals
     # counts as 1 if it differs from 1 by at most 1 minus this number.
     agreement: float = 0.9
+    # [rad, m] A joint is at rest if the range of its positions is at most this: noise of an encoder is smaller.
+    rest_range: float = 1e-3
     # [1] Number of samples over which the changes of q and of the integral of qd are compared. Between neighbouring
     # samples the quantisation step of q may be larger than the change of q.
     increments: int = 10

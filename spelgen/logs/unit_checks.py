@@ -183,7 +183,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     # Times with a median step above 0.5 s are in another unit, so dq/dt is wrong. The check of times reports it.
     if signals.step > SIGNALS.slowest_step:
         return None
-    if np.isnan(correlation):
+    if np.isnan(correlation) or signals.is_at_rest:
         return None
     if correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance:
         lag = _velocity_lag(signals)
