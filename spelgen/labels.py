@@ -1,6 +1,6 @@
 """Names of joints, units, entries of M and predictors in charts, tables and sentences."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 
@@ -60,6 +60,11 @@ class NamedJoint:
 def named_joints(names: Sequence[str], joint_types: Sequence[str]) -> list[NamedJoint]:
     """Return the named joints, each with the units of its joint type."""
     return [NamedJoint(name, UNITS[x]) for name, x in zip(names, joint_types, strict=True)]
+
+
+def torque_units(joint_types: Iterable[str]) -> str:
+    """Return the units of the torques of joints: "Nm", "N", or "Nm, N" for both types of joints."""
+    return ", ".join(dict.fromkeys(UNITS[joint_type].torque for joint_type in joint_types))
 
 
 def joint_ranges(joints: tuple[int, ...]) -> str:

@@ -14,6 +14,7 @@ from spelgen.cli.console import FAILED, answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
 from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
+from spelgen.labels import torque_units
 from spelgen.listing import WIDTH
 
 if TYPE_CHECKING:
@@ -144,8 +145,8 @@ def estimate(
         f"{joint} {moving:.3g}; {resting:.3g}" for joint, (moving, resting) in thresholds.items()
     )
     supported = (
-        f"contact thresholds in motion; at rest: {smallest} Nm, N, for a rate of false alarms of {alarm_rate:g} per "
-        f"minute (training logs support >= {rate:.2g})"
+        f"contact thresholds in motion; at rest: {smallest} {torque_units(fit.model.joint_types)}, for a rate "
+        f"of false alarms of {alarm_rate:g} per minute (training logs support >= {rate:.2g})"
     )
     if alarm_rate < rate:
         supported += ": the training logs are too short for this rate, train with longer logs"

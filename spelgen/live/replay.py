@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from spelgen.fitting.fitted import Fit
+from spelgen.labels import torque_units
 from spelgen.listing import WIDTH
 from spelgen.live.estimator import Estimator, EstimatorState
 from spelgen.live.payload import Payload
@@ -38,6 +39,7 @@ class LogEstimate:
     Attributes:
         log: The log.
         joints: Names of the joints.
+        unit: Unit of the joint torques.
         states: Estimates after each sample.
         payload: Estimated payload at the end of the log.
         since: Time at which a payload was first reported [s]; None without a payload.
@@ -49,6 +51,7 @@ class LogEstimate:
 
     log: Trajectory
     joints: tuple[str, ...]
+    unit: str
     states: list[EstimatorState]
     payload: Payload
     since: float | None
@@ -80,7 +83,7 @@ class LogEstimate:
             pairs = zip(contact.joints, contact.torques, strict=True)
             torques = ", ".join(f"{joint} {torque:+.3g}" for joint, torque in pairs)
             lines.append(
-                f"  contact at {contact.begin:.2f} to {contact.end:.2f} s: {torques} Nm, N; "
+                f"  contact at {contact.begin:.2f} to {contact.end:.2f} s: {torques} {self.unit}; "
                 f"{contact.force:.3g} N at the tip"
             )
         if not self.contacts:
@@ -144,6 +147,7 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
         results.append(LogEstimate(
             log=log,
             joints=joints,
+            unit=torque_units(fit.model.joint_types),
             states=states,
             payload=states[-1].payload,
             since=float(times[reported][0]) if any(reported) else None,
