@@ -118,8 +118,9 @@ def _few_data(
     nmse: (n,), nMSE of held-out blocks from `_likely_nmse`.
     """
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
-    # The recommended duration assumes that the nMSE is inversely proportional to the duration of the motion.
-    enough = math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported)
+    # The recommended duration assumes that the nMSE is inversely proportional to the duration of the motion, up to a
+    # minute, which is enough for the recorded arms.
+    enough = min(math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported), 60)
     ridge = "" if comparison is None else f" (nMSE {comparison.regression:.2g}, mean over joints)"
     return _warning(
         "few-data",
