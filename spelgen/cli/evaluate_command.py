@@ -14,7 +14,6 @@ from spelgen.cli.console import FAILED, answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
 from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
-from spelgen.labels import torque_units
 from spelgen.listing import WIDTH
 
 if TYPE_CHECKING:
@@ -117,6 +116,7 @@ def estimate(
     """
     paths = options.logs(data, extra_logs)
     from spelgen.fitting.fitted import load_run
+    from spelgen.labels import torque_units
     from spelgen.live.estimator import torque_model
     from spelgen.live.levels import noise_levels
     from spelgen.live.replay import replay
