@@ -18,12 +18,13 @@ import pinocchio as pin
 from lxml import etree
 
 from spelgen.arm.arm import Chain, make_arm
+from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import Settings
 from spelgen.structure.nominal import parameters_of
 from spelgen.urdf.document import read_document
-from spelgen.urdf.robot import Robot, mimic_constraint
+from spelgen.urdf.robot import Robot
 
 ENGINE = f"Pinocchio {pin.__version__}"
 TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")

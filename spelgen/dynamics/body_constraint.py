@@ -3,7 +3,7 @@
 import numpy as np
 
 from spelgen.arm.arm import Chain
-from spelgen.urdf.robot import Constraint
+from spelgen.dynamics.constraint import Constraint
 
 
 def body_constraint(arm: Chain) -> Constraint:

@@ -17,11 +17,11 @@ import numpy as np
 import pinocchio as pin
 
 from spelgen.arm.actuation import derive_actuation
+from spelgen.dynamics.constraint import Constraint, mimic_constraint
 from spelgen.dynamics.friction import joint_friction
 from spelgen.settings.settings import load_settings
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf
-from spelgen.urdf.robot import Constraint, mimic_constraint
 
 
 def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from scipy.spatial.transform import Rotation
 
+from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.urdf.read import read_urdf
-from spelgen.urdf.robot import Robot, UrdfJoint, mimic_constraint
+from spelgen.urdf.robot import Robot, UrdfJoint
 
 if TYPE_CHECKING:
     from pytorch_kinematics import SerialChain

@@ -15,11 +15,12 @@ import numpy as np
 from pydantic import PlainSerializer, PlainValidator
 from scipy.spatial.transform import Rotation
 
+from spelgen.dynamics.constraint import Constraint, mimic_constraint
 from spelgen.evaluation.plain import Curve
 from spelgen.render.charts import TUNING
 from spelgen.urdf.geometry import LinkShape, link_shapes
 from spelgen.urdf.read import read_urdf
-from spelgen.urdf.robot import Constraint, Robot, UrdfJoint, mimic_constraint
+from spelgen.urdf.robot import Robot, UrdfJoint
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

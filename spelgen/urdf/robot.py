@@ -1,12 +1,10 @@
-"""Data classes for the content of a URDF: robot, links, joints, transmissions, and the constraint of mimic joints."""
+"""Data classes for the content of a URDF: robot, links, joints and transmissions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
-
-import numpy as np
 
 from spelgen.errors import Diagnostic, UrdfError
 
@@ -177,39 +175,3 @@ class Robot:
             if len(fixed) != 1:
                 return link
             link = fixed[0]
-
-
-@dataclass(frozen=True, eq=False)
-class Constraint:
-    """Positions of b joints as a function of n coordinates: jacobian @ q + offset.
-
-    Attributes:
-        names: names of the b joints.
-        jacobian: matrix K, (b, n).
-        offset: joint positions at q = 0, (b,) [rad, m].
-    """
-
-    names: tuple[str, ...]
-    jacobian: np.ndarray
-    offset: np.ndarray
-
-
-def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
-    """Return the constraint of all joints of ``robot``; each mimic joint is a linear function of a coordinate.
-
-    coordinates: names of the joints that are coordinates. All other joints are mimic joints, or locked at zero.
-    """
-    columns = {name: k for k, name in enumerate(coordinates)}
-    moving = [joint.name for joint in robot.joints if joint.moves]
-    jacobian, offset = np.zeros((len(moving), len(columns))), np.zeros(len(moving))
-    for row, name in enumerate(moving):
-        # A mimic joint may follow another mimic joint: find the coordinate at the end of the chain.
-        multiplier, leader = 1.0, name
-        while (mimic := robot.joint[leader].mimic) is not None:
-            offset[row] += multiplier * mimic.offset
-            multiplier *= mimic.multiplier
-            leader = mimic.joint
-        # The row of a locked joint is zero, so its position is zero.
-        if leader in columns:
-            jacobian[row, columns[leader]] = multiplier
-    return Constraint(tuple(moving), jacobian, offset)
