@@ -113,6 +113,18 @@ def test_offset_of_angles_of_another_turn(arm, turn):
     assert message_of(obeyed(arm, message), path) == ""
 
 
+@pytest.mark.parametrize("arm", ["rpr"], indirect=True)
+def test_angles_beyond_both_limits_are_of_no_other_turn(arm):
+    """The joint moves by more than its range, which no offset corrects."""
+
+    def wide(arm, rng):
+        t, q = pick_and_place(arm, rng)
+        return t, q * [1.0, 0.3, 8.0 / np.ptp(q[:, 2])] + [0.0, 0.8, 0.0]
+
+    message = message_of(arm, logged(arm, recorded(arm, 5, wide)))
+    assert "the limit is" in message and "another turn" not in message and "offset" not in message
+
+
 def test_joints_that_were_not_logged(arm):
     last = arm.chain.joint_names[-1]
     path = logged(arm, recorded(arm, 7), lambda names: [x for x in names if not x.endswith(f"_{last}")])
