@@ -20,9 +20,6 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.body_chain import BodyChain
 
 FRICTION = FrictionModel(memory=True)
-# [s] Longest delay of the torques of all joints. It covers the delays of loggers and field buses; a longer apparent
-# delay may be due to friction.
-MAX_DELAY = 0.02
 
 
 @dataclass(frozen=True)
@@ -154,9 +151,9 @@ def _estimate(rows: np.ndarray) -> _Estimate:
         squares = unexplained @ products.sum(axis=1) @ unexplained
         noise = np.sqrt(np.maximum(squares / len(rows), np.square(TUNING.least_noise * least)))
     spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
-    # The delay is unknown if it is near the largest shift, where the minimum may be outside. If the
-    # jackknife estimates of all blocks are equal, there are too few samples.
-    unknown = abs(delay) > MAX_DELAY or spread == 0
+    # The delay is unknown above the limit, where friction may look like a delay. If the jackknife estimates of all
+    # blocks are equal, there are too few samples.
+    unknown = abs(delay) > HINTS.longest_delay or spread == 0
     standard_error = np.inf if unknown else float(np.sqrt(spread))
     return _Estimate(delay, standard_error, float((squares / least**2).sum()))
 
@@ -177,7 +174,7 @@ def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
         return float(shape @ left @ shape)
 
     times = OFFSETS / FREQUENCY
-    near = times[np.abs(times) <= 2 * MAX_DELAY]
+    near = times[np.abs(times) <= 2 * HINTS.longest_delay]
     nearest = min(near, key=squares)
     step = near[1] - near[0]
     best = minimize_scalar(

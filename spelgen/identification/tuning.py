@@ -32,6 +32,9 @@ class DriveHintTuning:
     # coupling and, in each block, of the squared torque. For the
     # coupled wrist joints of a Staubli TX40 these fractions are 0.05 and 0.03.
     coupling_gain: float = 0.5
+    # [s] Longest delay of the torques of all joints. It covers the delays of loggers and field buses; a longer apparent
+    # delay may be due to friction.
+    longest_delay: float = 0.02
     # [samples] Largest time shift of the signals of one joint, 160 ms.
     longest_offset: int = 16
     # [1] Number of samples that are used, which is ample for the about 70 parameters of six joints.

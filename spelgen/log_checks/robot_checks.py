@@ -121,7 +121,6 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
     findings = []
     (lower, upper), unit = joint.limits(), UNITS[joint.coordinate.joint_type].position
     lower, upper = lower - TUNING.limit_rounding, upper + TUNING.limit_rounding
-    turn = 2 * pi if joint.coordinate.joint_type == "revolute" and upper - lower < 2 * pi else 0.0
     ranges = {
         name: (joint.report.low[name], joint.report.high[name])
         for name in ("q", "u")
@@ -132,13 +131,10 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
             findings.append(f"{name} down to {low:.4g} {unit}, the limit is {joint.limits()[0]:z.4g}")
         if high > upper:
             findings.append(f"{name} up to {high:.4g} {unit}, the limit is {joint.limits()[1]:z.4g}")
+    is_limited = joint.coordinate.joint_type == "revolute" and upper - lower < 2 * pi
     # drivers that log 0 to 360 degrees are a turn above the negative half of a joint's range
-    for shift in (-turn, turn):
-        if (
-            findings
-            and turn
-            and all(lower <= low + shift and high + shift <= upper for low, high in ranges.values())
-        ):
+    for shift in (-2 * pi, 2 * pi) if findings and is_limited else ():
+        if all(lower <= low + shift and high + shift <= upper for low, high in ranges.values()):
             offset = plain_number(joint.offset + shift, 8)
             line = mapping_line({"joints": {joint.coordinate.name: {"offset": offset}}})
             return f"{findings[0]}: another turn; {line}"
