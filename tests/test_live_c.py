@@ -71,12 +71,11 @@ def test_c_equals_python_along_recordings(name, tmp_path):
         pytest.skip(f"no logs of {name}: the folder of recordings is not here")
     model, arm = randomised(urdf), load_arm(urdf)
     log = segments(files, arm)
-    # The log odds of airbot amplify rounding errors most: without a delay, as in most fits.
-    levels = levels_of(model, log, 0.02, delay=0.0 if name == "airbot" else 0.015)
+    levels = levels_of(model, log, 0.02, delay=0.015)
     estimator = Estimator(load_run(saved_run(model, urdf, tmp_path).path), levels=levels)
     compiled = CompiledEstimator(model, arm, levels, *([PLAIN] if name != "ur10e" else []))
     found = compiled.run(log.t, log.q, log.qd, log.tau)
-    require_equal(found, estimator.replay(log), 1e-9)
+    require_equal(found, estimator.replay(log), 1e-11)
     at = log.q[-1], log.qd[-1], 0.5 * log.qd[-1]
     for ahead in (0.0, 0.1, 1.0):
         expected = estimator.torque(*at, ahead)
@@ -94,7 +93,7 @@ def test_c_equals_python_with_couplings_and_hostile_samples(tmp_path):
     found = compiled.run(*log)
     fit = load_run(saved_run(model, tmp_path / "arm.urdf", tmp_path / "run").path)
     estimator = Estimator(fit, levels=levels)
-    require_equal(found, list(estimator.steps(*log)), 1e-9)
+    require_equal(found, list(estimator.steps(*log)), 1e-10)
     assert compiled.refused() == estimator.intake.counts
     assert min(estimator.intake.counts.values()) > 0
 
@@ -108,7 +107,7 @@ def test_c_equals_python_for_friction_without_a_state(tmp_path):
     levels = levels_of(model, log, 0.02)
     found = CompiledEstimator(model, load_arm(urdf), levels, PLAIN).run(log.t, log.q, log.qd, log.tau)
     estimator = Estimator(load_run(saved_run(model, urdf, tmp_path / "run").path), levels=levels)
-    require_equal(found, estimator.replay(log), 1e-9)
+    require_equal(found, estimator.replay(log), 1e-11)
 
 
 def motion_of(model, seconds: float) -> Trajectory:

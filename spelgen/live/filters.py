@@ -139,7 +139,8 @@ class LoadFilter:
         if block.moving[joint]:
             self.surprise += residual**2 / expected
             self.x += gain * residual
-            self.P -= np.outer(gain, covariance)
+            # The product is exactly symmetric. An asymmetry of P from rounding errors would grow with each update.
+            self.P -= np.outer(covariance, covariance) / variance
         else:
             # The gains of all states except d are set to zero. This gain is not optimal, so the covariance is updated
             # by Joseph's form, which is valid for any gain.
@@ -212,8 +213,8 @@ class JointFilters:
         self.x = self.x + gain * residual[..., None]
         # The gain is optimal for the states in `used` and zero for the other states. For such a gain, Joseph's form of
         # the covariance update is equal to this expression.
-        product = gain[..., None] * covariance[..., None, :]
-        self.P = self.P - np.where(used[..., None], product, product.swapaxes(-1, -2))
+        product = covariance[..., None] * covariance[..., None, :] / variance[..., None, None]
+        self.P = self.P - np.where(used[..., None] | used[..., None, :], product, 0.0)
         return residual, expected
 
 
