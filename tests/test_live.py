@@ -169,6 +169,14 @@ def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
     # beyond 0.3 s without the disturbance
     later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
     np.testing.assert_allclose(found - later, estimator.drift.x[:, 1], atol=1e-9)
+    # Before its first report, the payload is an external torque, to be compensated if the user wants it.
+    part, k = dataclasses.replace(log, tau=tau)[:180], 179
+    for compensated in (False, True):
+        early = Estimator(load_run(run), levels=levels, compensate_external=compensated)
+        assert early.replay(part)[-1].payload.status == "not yet"
+        error = np.abs(early.torque(log.q[k], log.qd[k], qdd[k]) - tau[k]).max()
+        weight = np.abs(tau[k] - log.tau[k]).max()
+        assert error < 0.2 * weight if compensated else error > 0.8 * weight
 
 
 def test_a_changed_load_is_found_and_a_contact_is_none(arm, levels, run):

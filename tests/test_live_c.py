@@ -77,7 +77,9 @@ def test_c_equals_python_along_recordings(name, tmp_path):
     found = compiled.run(log.t, log.q, log.qd, log.tau)
     require_equal(found, estimator.replay(log), 1e-11)
     at = log.q[-1], log.qd[-1], 0.5 * log.qd[-1]
-    for ahead in (0.0, 0.1, 1.0):
+    for ahead, external in ((0.0, False), (0.1, False), (0.1, True), (1.0, True)):
+        estimator.compensate_external = external
+        compiled.compensate_external(external)
         expected = estimator.torque(*at, ahead)
         np.testing.assert_allclose(compiled.torque(*at, ahead), expected, atol=1e-9 * np.abs(expected).max())
 

@@ -41,7 +41,8 @@ class ContactObserver:
         """Discard the filter states; the next sample initialises them."""
         self.t: float | None = None
         self.inputs = self.low = np.zeros((15, len(self.levels.speed)))
-        self.touched = np.zeros(len(self.levels.speed), dtype=bool)
+        self.baseline = np.zeros_like(self.levels.speed)
+        self.touched = self.baseline > 0
 
     def step(self, t: float, at: Balance, payload: Payload, drift: np.ndarray) -> ContactState:
         """Return the external torques after a sample.
