@@ -186,7 +186,9 @@ class Estimator:
                 decay = np.exp(-ahead / self.levels.drift.time_constant)
             a, d = self.drift.x.T
             if self.compensate_external:
-                d = self.observer.baseline - self.contact.external_torque
+                # The bound is for measured torques with errors: commands are not larger than torques of the arm.
+                limit, d = self.levels.effort, self.observer.baseline - self.contact.external_torque
+                d = np.clip(d, -limit, limit)
             drift = torch.from_numpy(a) * friction + torch.from_numpy(d * decay)
             return (torque + self.model.input_torque(cache, load + drift)).numpy()
 
