@@ -190,6 +190,9 @@ def test_a_changed_load_is_found_and_a_contact_is_none(arm, levels, run):
     touched = log.tau + np.outer((log.t > 6.0) & (log.t < 8.0), 0.1 * EFFORT * (np.arange(6) == 1))
     _, states = estimates(run, levels, log, touched)
     assert not any(state.load_changed or state.payload.status == "payload" for state in states)
+    # both at once: the load is found after the end of the contact
+    _, states = estimates(run, levels, log, picked + touched - log.tau)
+    assert abs(states[-1].payload.mass - 2.0) < 0.2
 
 
 def test_contacts_are_found_at_their_joint_with_their_force(arm, levels, run):

@@ -182,19 +182,25 @@ def test_float_is_close_to_double():
     np.testing.assert_array_equal(double.status, single.status)
 
 
-def test_a_saved_state_is_restored_and_a_damaged_one_is_not():
+def test_a_state_saved_during_a_contact_is_restored_and_a_damaged_one_is_not():
     model = moved_model("six_dof", "closed-form", 0.1).double()
     log = motion_of(model, 10.0)
     from exported_runs import arm_of
 
     compiled = CompiledEstimator(model, arm_of("six_dof"), levels_of(model, log), PLAIN)
-    before = compiled.run(log.t, log.q, log.qd, log.tau)
+    push = 0.5 * np.abs(log.tau).max(axis=0) * (np.arange(model.n) == 1)
+    tau = log.tau - push * (log.t > log.t[-1] - 0.5)[:, None]
+    before = compiled.run(log.t, log.q, log.qd, tau)
+    assert (np.abs(before.external_torque) > before.threshold)[-40:, 1].all()
     state = compiled.saved()
     compiled.start()
     assert compiled.restore(state)
-    # a clock that starts again, with all that was found
-    after = compiled.run(log.t[:50], log.q[:50], log.qd[:50], log.tau[:50])
+    # a clock that starts again, with all that was found; the contact lasts for another second
+    tau = log.tau - push * (log.t < log.t[0] + 1.0)[:, None]
+    after = compiled.run(log.t[:300], log.q[:300], log.qd[:300], tau[:300])
     assert (after.refusal == 0).all()
+    touched = np.abs(after.external_torque) > after.threshold
+    assert touched[50:100, 1].all() and not touched[:, [0, 2, 3, 4, 5]].any() and not touched[120:].any()
     np.testing.assert_array_equal(after.status[0], before.status[-1])
     np.testing.assert_array_equal(after.friction_scale[0], before.friction_scale[-1])
     for position in (0, 9, 200, len(state) - 1):
