@@ -21,7 +21,7 @@ from spelgen.emission.build import build
 from spelgen.errors import LogError, RunError
 from spelgen.fitting.fitted import load_run
 from spelgen.live.estimator import Estimator
-from spelgen.live.filters import Block
+from spelgen.live.filters import Block, LoadFilter
 from spelgen.live.levels import block_noise, held_out_tail
 from spelgen.live.momentum import balance, load_terms
 from spelgen.live.payload import find_payload
@@ -407,6 +407,21 @@ def test_noise_levels_are_those_of_the_residuals():
     assert abs(found.disturbance[0] - 0.6) < 0.12
     assert found.disturbance[1] < 0.3
     assert 0.4 <= found.time_constant[0] <= 1.6
+
+
+def test_errors_that_recur_with_the_motion_do_not_become_a_payload(levels):
+    """Ten seconds of motion, repeated for seven minutes, with the same torque errors."""
+    random, load, ones = np.random.default_rng(0), LoadFilter(levels.load, levels.effort), np.ones(6)
+    blocks = []
+    for _ in range(50):
+        errors, regressor = levels.load.white * random.standard_normal(6), random.standard_normal((6, 10))
+        blocks.append(Block(0.2, errors, regressor, 0 * ones, 0 * ones, ones > 0))
+    for block in 40 * blocks:
+        load.predict(block.duration)
+        for joint in range(load.n):
+            load.update(block, joint)
+    assert load.x[:10] @ np.linalg.solve(load.P[:10, :10], load.x[:10]) / 10 < 3.0
+    np.testing.assert_array_equal(load.P, load.P.T)
 
 
 @pytest.mark.parametrize("minutes", [0.2, 2.0])

@@ -140,7 +140,11 @@ class LoadFilter:
             self.surprise += residual**2 / expected
             self.x += gain * residual
             # The product is exactly symmetric. An asymmetry of P from rounding errors would grow with each update.
-            self.P -= np.outer(covariance, covariance) / variance
+            product = np.outer(covariance, covariance) / variance
+            recurring = TUNING.recurring * (noise + self.disturbance[joint])
+            kept = recurring / max(float(row[:10] @ self.P[:10, :10] @ row[:10]), recurring)
+            self.P -= product
+            self.P[:10, :10] += kept * product[:10, :10]
         else:
             # The gains of all states except d are set to zero. This gain is not optimal, so the covariance is updated
             # by Joseph's form, which is valid for any gain.
