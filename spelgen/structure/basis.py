@@ -86,7 +86,7 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     constant_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
     # The entry of M at each pivot of the row reduction defines a constant c_k. Row reduction places pivots in the first
-    # possible columns, so the entries of M are ordered: those that depend on the smallest number of joints are first.
+    # possible columns, so the entries of M are sorted: entries that depend on the smallest number of joints are first.
     order = sorted(range(entries), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(constant[:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
