@@ -229,7 +229,7 @@ class JointFilters:
         gain = np.where(used, covariance / variance[..., None], 0.0)
         self.x = self.x + gain * residual[..., None]
         # The Kalman gain K is optimal for the states in `used` and zero for the other states. For such a gain, Joseph's
-        # form of the covariance update is P_ij - K_i c_j if state i is used, else P_ij - c_i K_j, with c = `covariance`.
+        # form of the covariance update is P_ij - K_i c_j if state i is used, else P_ij - c_i K_j, with c = P row.
         product = gain[..., None] * covariance[..., None, :]
         self.P = self.P - np.where(used[..., None], product, product.swapaxes(-1, -2))
         return residual, expected
