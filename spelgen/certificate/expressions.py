@@ -130,7 +130,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
         for quarter in [1] * sines + [0] * cosines:
             products: dict[tuple[Expr, int], fmpq] = {}
             for (total, quarters), value in waves.items():
-                # Each product becomes a sum: cos a cos b = (cos(a + b) + cos(a - b)) / 2.
+                # Each product of cosines becomes a sum: cos a cos b = (cos(a + b) + cos(a - b)) / 2.
                 for sign in (1, -1):
                     wave = (total + sign * angle, (quarters + sign * quarter) % 4)
                     products[wave] = products.get(wave, fmpq(0)) + value / 2
@@ -147,7 +147,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
 
 
 def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
-    """Return the sum of parameter * function over all pairs (parameter, function).
+    """Return a closed form, the sum of parameter * function over all pairs (parameter, function), as an expression.
 
     Parameters a and b with proportional functions f and 2 f are combined: (a + 2 b) f in place of a f + b (2 f).
     """
@@ -196,7 +196,7 @@ def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
     A line may be longer if it has no blank at which a break is permitted.
     """
     indent = " " * (len(start) - len(start.lstrip()) + 4)
-    # Lines are not broken after a sign, within an argument of cos or sin, or within short brackets.
+    # Lines of a formula are not broken after a sign, within an argument of cos or sin, or within short brackets.
     formula = re.sub(r"([+-]) ", rf"\1{_FIXED}", formula)
     brackets = re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula)
     angles = re.findall(r"(?:cos|sin)\b.*?\)", formula)

@@ -84,7 +84,7 @@ def _parameters(formulas: Formulas, width: int) -> list[str]:
     lines = ["Base parameters, and the URDF's values" if values else "Base parameters"]
     for symbol, definition in formulas.base_parameters.items():
         value = f" [{float(values[symbol]):.6g}]" if symbol in values else ""
-        # A base parameter that equals a single inertial parameter has its name, so no equation is printed.
+        # A base parameter that is a single inertial parameter has the same name as it, so no equation is printed.
         name = "" if definition.is_Symbol else f"{symbol.name} = "
         lines += expressions.lines(expressions.text(definition), f"  {name}", width, value)
     return lines
@@ -104,7 +104,7 @@ def _legend(formulas: Formulas) -> str:
 def latex(formulas: Formulas) -> str:
     """Return closed forms in LaTeX: formulas, and definitions of base parameters, in two ``align*`` environments."""
     rows = {Symbol(row.name): row.expression for row in formulas.written}
-    # A base parameter that equals a single inertial parameter has its name, so no definition is printed.
+    # A base parameter that is a single inertial parameter has the same name as it, so no definition is printed.
     definitions = {name: x for name, x in formulas.base_parameters.items() if not x.is_Symbol}
     result = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
     result += _comments(formulas, "%")
@@ -124,7 +124,7 @@ def sympy_source(formulas: Formulas) -> str:
     """Return the source of a Python file that defines closed forms as SymPy expressions."""
     n = len(formulas.q)
     body = _table("entries", formulas.entries)
-    # M is omitted if one of its entries has no expression.
+    # The file has no matrix M if one entry of M has no expression.
     if formulas.mass_matrix is not None:
         body.append(f"M = Matrix({n}, {n}, lambda i, j: entries[max(i, j) + 1, min(i, j) + 1])")
     body.append("")

@@ -199,7 +199,7 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
 
 
 def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield two facts: which entries of M are zero, and on which joints each entry depends."""
+    """Yield two facts, with sampled numbers: which entries of M are zero, and on which joints each entry depends."""
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     # `largest_changes`, (entries, n): largest change of each entry of M when only one joint moves.
     largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()

@@ -77,7 +77,7 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
 
 def chain_regressor(chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
     """Return ``regressor_of`` for NumPy arrays q, qd, qdd (T, n): the regressor Y of B bodies, (T, n, 10 B)."""
-    # Filters return arrays with negative strides, which torch does not accept: copy them.
+    # The arrays are copied, since filters return arrays with negative strides, which torch does not accept.
     states = [torch.from_numpy(np.array(x, dtype=float)) for x in (q, qd, qdd)]
     with torch.no_grad():
         return np.asarray(regressor_of(chain, *states))

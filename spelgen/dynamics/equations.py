@@ -61,11 +61,11 @@ def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEqua
     pose = model.configuration(q, prepared)
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
-        """Return the friction torque of W rollouts, (W, n) [Nm, N]."""
+        """Return the friction torque of W rollouts, (W, n) [Nm, N], at velocities qd and friction state z."""
         return model.friction_torque(pose, qd, *known_past(model, z))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        """Return the force M qdd of W rollouts, (W, n) [Nm, N]."""
+        """Return the force M qdd of W rollouts, (W, n) [Nm, N], at velocities qd, inputs tau and friction state z."""
         return model.input_force(pose, qd, tau) - model.nonlinear_effects(pose, qd) - friction(qd, z)
 
     return MotionEquations(pose.mass, force, friction)
@@ -79,11 +79,11 @@ def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
-        """Return the friction torque of W rollouts, (W, n) [Nm, N]."""
+        """Return the friction torque of W rollouts, (W, n) [Nm, N], at velocities qd and friction state z."""
         return torch.as_tensor(dynamics.friction_torque(q, qd, *known_past(dynamics, z)))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        """Return the force M qdd of W rollouts, (W, n) [Nm, N]."""
+        """Return the force M qdd of W rollouts, (W, n) [Nm, N], at velocities qd, inputs tau and friction state z."""
         # `RigidDynamics` has no method that returns the force M qdd, so the acceleration qdd is multiplied by M.
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
@@ -146,7 +146,7 @@ def mass_as_learned(model: nn.Module) -> Iterator[None]:
     if not isinstance(mass, DerivedMass):
         yield
         return
-    # An attribute of the instance hides the method of its class, so that only this model is changed.
+    # The attribute `fraction` of the instance hides the method of `DerivedMass`, so that only this model is changed.
     vars(mass)["fraction"] = unbounded
     try:
         yield

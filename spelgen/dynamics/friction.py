@@ -153,9 +153,14 @@ class FrictionModel:
     def torque(
         self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None, motors: np.ndarray
     ) -> np.ndarray:
-        """Return the joint torque of all effects except for the armature, (..., n) [Nm, N].
+        """Return the joint torque of friction and offset: all effects except for the armature, (..., n) [Nm, N].
 
-        constants: coefficients of E effects, (E, n), in the order of `effects`. qd, bent, motors: see `columns`.
+        Args:
+            constants: coefficients of the E effects in `effects`, (E, n).
+            qd: joint velocities, (..., n) [rad/s, m/s].
+            bent: deflections of K bristles per drive, divided by the break-away displacements, (..., n, K); None:
+                unknown.
+            motors: matrix C, (n, n): the velocities of the drives are C qd.
         """
         speed = qd @ motors.T
         torque: np.ndarray = (self._effects(speed, np.zeros_like(speed), bent) * constants).sum(
@@ -164,9 +169,13 @@ class FrictionModel:
         return torque
 
     def _effects(self, speed: np.ndarray, rise: np.ndarray, bent: np.ndarray | None) -> np.ndarray:
-        """Return the torque of each effect per unit of its coefficient, (..., effects, n), at the drives.
+        """Return the torque at the drives of each effect in `effects` per unit of its coefficient, (..., effects, n).
 
-        speed, rise: velocities and accelerations of the drives, (..., n). bent: see `columns`.
+        Args:
+            speed: velocities of the drives, (..., n) [rad/s, m/s].
+            rise: accelerations of the drives, (..., n) [rad/s^2, m/s^2].
+            bent: deflections of K bristles per drive, divided by the break-away displacements, (..., n, K); None:
+                unknown.
         """
         sign = np.tanh(speed / self.coulomb_smoothing_velocity)
         dry = [sign]

@@ -103,7 +103,7 @@ class PinocchioDynamics:
     def forward_dynamics(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n)."""
         force = tau @ self.inputs.T - self.friction(qd)
-        if self._same:  # The result is copied, because Pinocchio overwrites it in the next call.
+        if self._same:  # The result of `aba` is copied, because Pinocchio overwrites it in the next call.
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
         # `aba` cannot solve the equations with mimic joints, K^T M_joints K qdd = force, so M is computed.
         force = force - self.nonlinear_effects(q, qd)
@@ -183,6 +183,6 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
 
 
 def drives_known(urdf: Path, joints: Sequence[str]) -> bool:
-    """Return True if the settings of a URDF specify the rotors or the friction of the given joints."""
+    """Return True if the settings file of a URDF specifies rotor inertia or friction of one of the given joints."""
     drives = load_settings(urdf).joints
     return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in drives.items() if k in joints)

@@ -123,7 +123,7 @@ class PreparedModel:
         z = self.memory(qd) if z is None else z
 
         def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-            """Return qd and qdd, (..., n) each."""
+            """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each."""
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
@@ -202,7 +202,7 @@ class PreparedModel:
         """Return a copy whose forward and inverse dynamics are compiled by ``torch.compile`` at their first calls."""
         result = copy.copy(self)
         for method in (self.forward_dynamics, self.inverse_dynamics):
-            # The option disables assertions between the compiled kernels, which would take a tenth of the time.
+            # size_asserts=False disables assertions between compiled kernels, which would take a tenth of the time.
             compiled = torch.compile(method, fullgraph=True, options={"size_asserts": False})
             vars(result)[method.__name__] = compiled
         return result

@@ -131,8 +131,8 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     velocity = slipped(inertia * qd + impulse, inertia + damping, bristle_stiffness, bent, reach)
     if load.coupled:
         momentum = applied(load.inertia, qd) + impulse
-        # Which bristles slide depends on the displacements of all joints, which the inertia couples. The solution is
-        # found by fixed-point iteration; two iterations suffice.
+        # Which bristles slide depends on the displacements of all joints, which the inertia couples. The mean velocity
+        # of the step is found by fixed-point iteration; two iterations suffice.
         for _ in range(2):
             rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
             secant = rise / torch.where(velocity == 0, 1.0, velocity)

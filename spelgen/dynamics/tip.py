@@ -73,7 +73,7 @@ def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> S
     The frames are built from spelgen's values of the URDF, since the URDF parser of pytorch-kinematics rounds to
     float32.
     """
-    import pytorch_kinematics as pk  # The import is here, because it imports matplotlib, which takes long.
+    import pytorch_kinematics as pk  # pytorch_kinematics is imported here: it imports matplotlib, which takes long.
     from pytorch_kinematics.frame import Frame, Joint, Link
 
     first = last = Frame(root, Link(root), Joint())

@@ -132,12 +132,12 @@ def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
 @cache
 def _model_class(base: str) -> Callable[..., ArmModel]:
     """Return a class ``Model`` that derives from ``ArmModel`` and from ``base``, a class of ``spelgen.runtime``."""
-    # The function is cached, so that all models with the same base class have the same type.
+    # `_model_class` is cached, so that all models with the same base class have the same type.
     return cast("Callable[..., ArmModel]", type("Model", (ArmModel, vars(runtime)[base]), {}))
 
 
 def _without_state(base: str) -> ArmModel:
-    """Return a model without attributes, to which pickle adds the attributes; base: name of the base class."""
+    """Return a new model without attributes, for unpickling: pickle then sets the attributes; base: its base class."""
     model_class = cast("type[ArmModel]", _model_class(base))
     return model_class.__new__(model_class)
 

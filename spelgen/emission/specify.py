@@ -43,7 +43,11 @@ def make_spec(
     assume: Assume = "kinematics",
     module: Path | None = None,
 ) -> ModelSpec:
-    """Return the specification of the model of an arm; arguments and errors as for ``generate``."""
+    """Return the specification of the model of an arm, from which a model or a module is made.
+
+    module: path of the module, to which the path of the URDF in the specification is relative; None: its file name.
+    Other arguments and errors as for ``build``.
+    """
     # `derive_spec` is imported here, because commands that have a specification do not need it.
     from spelgen.emission.plan import derive_spec
 

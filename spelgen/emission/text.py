@@ -80,7 +80,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
 @cache
 def _public_names() -> frozenset[str]:
     """Return the names that a module can import from ``spelgen.runtime``."""
-    # The source is read, because the import of the package would import torch.
+    # The source of ``spelgen.runtime`` is parsed, because an import of the package would import torch.
     source = (files("spelgen") / "runtime" / "__init__.py").read_text(encoding="utf-8")
     imports = [node for node in ast.parse(source).body if isinstance(node, ast.ImportFrom)]
     return frozenset(alias.name for node in imports for alias in node.names)
@@ -192,7 +192,7 @@ def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
     for name, basis in zip(parts.term_names(spec), bases, strict=True):
         entries = [entry_name(row, column) for row, column, _ in basis]
         row, column, _ = basis[0]
-        # The unit of an entry is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
+        # The unit of an entry of M is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
         slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
         suffix = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
         descriptions[name] = f"{', '.join(entries[:2])}{suffix} [{('kg m^2', 'kg m', 'kg')[slides]}]"
@@ -283,7 +283,7 @@ def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
 
 
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
-    """Return the specification in a module's text. Raises ModuleError if the text differs from `spelgen build`'s."""
+    """Return the specification in a module's text; raise ModuleError if the text was edited since `spelgen build`."""
     spec = parse_spec(text, file)
     # The whole text is compared with the text that the specification gives. A model is assembled from the specification
     # only: an edit of any other text would be ignored.

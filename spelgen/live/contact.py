@@ -104,8 +104,8 @@ class ContactObserver:
             # indicates how fast dp/dt changes.
             gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
-            # The baseline of a joint in contact is not updated, because its estimated disturbance contains the contact
-            # torque.
+            # The baseline (slow disturbance) of a joint in contact is not updated, because the estimated disturbance
+            # then contains the contact torque.
             adapted = np.where(self.touched, 0.0, 1 - np.exp(-step / TUNING.baseline))
             self.baseline = self.baseline + adapted * (disturbance - self.baseline)
         self.t, self.inputs = t, inputs

@@ -48,7 +48,7 @@ class Block(NamedTuple):
     moving: np.ndarray
 
     def joined(self, later: Block) -> Block:
-        """Return this block and the block after it, `later`, as one block."""
+        """Return the means over this block and the next block, `later`, as one block of both durations."""
         duration = self.duration + later.duration
         # The terms of a block are means over time: the means over both blocks are weighted by their durations.
         weight = later.duration / duration
@@ -182,12 +182,12 @@ class JointFilters:
     def __init__(
         self, deviations: np.ndarray, white: np.ndarray, time_constant: np.ndarray, *, drifts: bool = False
     ) -> None:
-        """Initialize all states to zero: friction as in the model, no offset and no disturbance.
+        """Initialize all states to zero: friction as in the model, no torque offset and no disturbance.
 
         Args:
-            deviations: prior standard deviations of the states, (..., n, K). The value for d is also the stationary
-                standard deviation of d.
-            white: standard deviations of the white noise of the torque residual y, (..., n) [Nm, N].
+            deviations: prior standard deviations of the K states (friction change a, torque offset b if K = 3,
+                disturbance d), (..., n, K). The value for d is also the stationary standard deviation of d.
+            white: standard deviations of the white noise of the torque residual, (..., n) [Nm, N].
             time_constant: time constant of d, (..., n) [s].
             drifts: True: a is a random walk, and joints at rest update d. False: a is constant, and joints at rest
                 update no state.
@@ -229,7 +229,8 @@ class JointFilters:
         gain = np.where(used, covariance / variance[..., None], 0.0)
         self.x = self.x + gain * residual[..., None]
         # The Kalman gain K is optimal for the states in `used` and zero for the other states. For such a gain, Joseph's
-        # form of the covariance update is P_ij - K_i c_j if state i is used, else P_ij - c_i K_j, with c = P row.
+        # form of the update of the covariance P is P_ij - K_i c_j if state i is used, else P_ij - c_i K_j, with c the
+        # covariance of state and measurement.
         product = gain[..., None] * covariance[..., None, :]
         self.P = self.P - np.where(used[..., None], product, product.swapaxes(-1, -2))
         return residual, expected

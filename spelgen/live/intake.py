@@ -18,7 +18,10 @@ IGNORED: tuple[Refusal, ...] = ("not finite", "repeated", "reversed", "jump")
 
 
 class DelayLine:
-    """Delay of signals by a constant time, with linear interpolation between samples."""
+    """Delay of measured signals by a constant time, with linear interpolation between samples.
+
+    It aligns motion and torques, of which one is measured later than the other. delay: time [s].
+    """
 
     def __init__(self, delay: float) -> None:
         self.delay = delay

@@ -106,7 +106,7 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive definite matrix whose entries may differ by orders of magnitude."""
+    """Return the inverse of a positive definite matrix, (k, k), whose entries may differ by orders of magnitude."""
     root = solve_triangular(np.linalg.cholesky(matrix), np.eye(len(matrix)), lower=True)
     return np.asarray(root.T @ root)
 

@@ -129,7 +129,7 @@ def payload_sentence(payload: Payload) -> str:
 
 
 def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None = None) -> list[LogEstimate]:
-    """Return the estimates along each log; the estimator is reset at the start of a log.
+    """Return the estimates of payload, contacts and friction drift along each log; each log starts a new estimate.
 
     Args:
         fit: fit of an arm's model to torques.

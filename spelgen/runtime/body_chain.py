@@ -83,7 +83,7 @@ class BodyChain(nn.Module):
         self.carriers = nn.Buffer(carriers)
         # `carried`, (bodies, 12 bodies): `carriers` with a column for each coordinate of each point mass.
         self.carried = nn.Buffer(carriers.repeat_interleave(4, dim=1).repeat(1, 3))
-        # Minus the acceleration of gravity, in the base frame, (3, 1, 1) [m/s^2].
+        # `base`: minus the acceleration of gravity, in the base frame, (3, 1, 1) [m/s^2].
         self.base = nn.Buffer(-vector(gravity)[:, None, None])
 
     def forward(self, q: Tensor, points: Tensor) -> ChainConfiguration:
@@ -109,8 +109,8 @@ class BodyChain(nn.Module):
         # The twist of a unit rate is (z, origin x z) for a rotation, (0, z) for a translation.
         axes = torch.cat([angular, torch.linalg.cross(origin, angular, dim=-2) + (z - angular)], dim=-2)
         points = frames @ points
-        # Velocity of every point per unit rate of every joint. The mask `carried` sets it to zero for the
-        # points that the joint does not carry.
+        # Velocity of every point mass per unit rate of every joint. The mask `carried` sets the velocity to
+        # zero for points that the joint does not carry.
         motions = torch.unflatten(axes.mT @ self.motions, -1, (3, 4)).flatten(-3, -2) @ points
         jacobian = torch.unflatten(motions, -2, (-1, 3)).flatten(-2) * self.carried
         place, mass = torch.unflatten(points, -1, (-1, 4)).tensor_split((3,), dim=-3)

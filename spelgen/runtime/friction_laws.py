@@ -27,7 +27,7 @@ class FrictionConstants(NamedTuple):
     stribeck: Tensor  # additional dry friction at low velocity [Nm, N]
     stribeck_velocity: Tensor  # velocity scale of the Stribeck curve [rad/s, m/s]
     load_dependence: Tensor  # dry friction per magnitude of the gravity torque [1]
-    stribeck_rounding: Tensor  # speed of the rounding of the Stribeck curve, in Stribeck velocities [1]
+    stribeck_rounding: Tensor  # r of ``FrictionLaws``: the Stribeck curve is rounded below r v_stribeck [1]
     coulomb_smoothing_velocity: Tensor  # speed at which the smooth sign of velocity is 0.7 [rad/s, m/s]
     min_load: Tensor  # gravity torque below which |gravity torque| is smoothed [Nm, N]
     bristle_fractions: Tensor  # fraction of dry friction per bristle, (n, K); sum 1, or 0 without bristles
@@ -113,7 +113,7 @@ class FrictionLaws(nn.Module):
     """
 
     # (name, group, unit of the constant, initial value of the constant) of each trained parameter. Initial
-    # values are in units of the joint's typical friction and typical speed. At them the parameter is zero.
+    # values are in units of the joint's typical friction and typical speed. A parameter of zero gives them.
     parameter_groups: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "effects", "Nm, N", 1.0),
@@ -155,7 +155,7 @@ class FrictionLaws(nn.Module):
             "Nm s/rad, N s/m": friction / speed, "Nm, N": friction, "rad/s, m/s": speed, "1": friction.sign()
         }  # fmt: skip
         for name, _, unit, initial in FrictionLaws.parameter_groups[:-1]:
-            # exp keeps the constants positive. Parameters of zero give the initial values.
+            # exp keeps the friction constants positive. Parameters of zero give their initial values.
             constants.append(initial * units[unit] * getattr(self, name).exp())
         # |gravity torque| has no derivative at zero: `load` smooths it below 1 % of typical friction.
         load = 0.01 * torch.where(friction > 0, friction, 1.0)

@@ -145,9 +145,10 @@ class DenseInputDynamics(NetworkDynamics):
 
 
 class NetworkFriction(nn.Module):
-    """Base class of dissipation matrices D(q, qd) that a network computes.
+    """Base class of dissipation matrices D(q, qd), (..., n, n), that are computed by a network.
 
-    The network's outputs are in units of the joint's typical friction and typical speed.
+    D is in units of typical friction / typical speed of the joints: the network's outputs are of the order of
+    one.
     """
 
     prepare: Callable[[], Parameters]  # returns the parameter cache (quantities independent of q and qd)

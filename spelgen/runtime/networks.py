@@ -135,8 +135,8 @@ class MaskedNetwork(nn.Module):
     # ``forward`` returns the outputs, (..., rows), of the layers that ``prepare`` returned, and the
     # intermediate values that ``vjp`` and ``jvp`` need.
     forward: Callable[[Tensor, Layers], tuple[Tensor, Intermediates]]
-    vjp: Callable[[Intermediates, Tensor], Tensor]  # see ``MaskedMLP.vjp``
-    jvp: Callable[[Intermediates, Tensor], Tensor]  # see ``MaskedMLP.jvp``
+    vjp: Callable[[Intermediates, Tensor], Tensor]  # returns cotangent^T J, with J = d outputs / d inputs
+    jvp: Callable[[Intermediates, Tensor], Tensor]  # returns J tangent, with J = d outputs / d inputs
 
     def __init__(
         self,

@@ -33,7 +33,7 @@ class ResidualParameters(NamedTuple):
     splines: Tensor  # spline coefficients of torque [Nm, N] and of log friction factor, (n, SPLINES, 2)
     ripple: Tensor  # amplitudes of the torque ripple: cosines, then sines [Nm], (n, 2 HARMONICS + 4)
     constant: Tensor  # constant part of the residual R of M, flattened, (n n,)
-    functions: Tensor  # matrix in R of each tanh output of the network, flattened, (functions, n n)
+    functions: Tensor  # matrices by which R's network outputs (after tanh) are multiplied, (functions, n n)
     mass: Layers | None
     potential: Layers | None
 
@@ -118,7 +118,7 @@ class ResidualTerms(nn.Module):
         # `inverse`: 1 / |coefficient| of each function and constant in each entry of M, (functions +
         # constants, n, n). It is 1e30 for a zero coefficient, so that the minimum in `bounds` ignores it.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
-        # R may reduce the armature by at most 90 %. The bound of each term is an equal share of this: 0.9
+        # R may reduce the armature by at most 90 %. `part` is the share of each function and constant: 0.9
         # divided by the largest number of functions and constants in one row of M.
         self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))

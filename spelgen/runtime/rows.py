@@ -57,13 +57,13 @@ class Link(NamedTuple):
     parent: str | None  # name of the link that carries the joint; None: the base
     joint: str  # name of the joint whose coordinate q displaces the link by ratio * q + offset
     position: Triple  # origin of the joint frame in the frame of the parent, at displacement 0 [m]
-    mass: float  # [kg]
+    mass: float  # mass of the link [kg]
     center_of_mass: Triple  # center of mass in the joint frame [m]
     inertia: Tensor6  # inertia tensor about the center of mass, in the joint frame [kg m^2]
     rotation: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     ratio: float = 1.0
     offset: float = 0.0  # displacement of the link at q = 0 [rad, m]
-    joint_type: Literal["revolute", "prismatic"] | None = None  # None: the joint type of `joint`
+    joint_type: Literal["revolute", "prismatic"] | None = None  # motion of the link; None: type of `joint`
 
 
 class Function(NamedTuple):

@@ -136,7 +136,10 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
-    """Yield sets of the joints on which M depends: sets close to the tip first, small sets before large ones."""
+    """Yield the sets of joints on which a functional of M may depend, in the order of the greedy selection.
+
+    Sets close to the tip are first, small sets before large ones.
+    """
     # An arm of more than eight joints has too many subsets of joints: only sets of consecutive joints are tried.
     all_subsets_up_to = 8
     active = [k for k in range(spans.n) if len(spans.change_bases[k])]

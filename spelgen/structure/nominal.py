@@ -56,7 +56,7 @@ class Nominal:
 
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
-    """Return the nominal values of ``arm`` for the outputs and constants of its ``structure``."""
+    """Return typical values of M, V and torques of ``arm``, for the terms of M in its ``structure``."""
     # The seed is constant, because nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = [x.working_range for x in arm.coordinates]
@@ -98,7 +98,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
 
 
 def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
-    """Return, for each of m terms, the coefficients of its linear functional of M, (m, n(n+1)/2).
+    """Return the coefficients with which the functions of m terms are computed from M, (m, n(n+1)/2).
 
     The columns are the entries of the lower triangle of M, row after row.
     """
@@ -139,7 +139,7 @@ def _default_inertia(arm: Chain, index: int) -> list[float]:
     They are about the origin of the body's joint frame. The centre of the sphere is half-way to the next joint. For the
     last body, or if the next joint is closer than 0.2 m, the centre is at (0.1, 0, 0.1) m in the joint frame.
     """
-    gyration = 0.1  # [m] radius of gyration
+    gyration = 0.1  # [m] radius of gyration of a default body
     center = np.zeros(3)
     for body in reversed(arm.bodies):
         if body.parent == index:

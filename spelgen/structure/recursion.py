@@ -201,7 +201,7 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
     # 1. This takes fewer products than repeated addition: factors are as large as 20.
     for bit in bin(abs(factor))[2:]:
         x, y = result
-        # (x + i y)^2 has twice the angle of x + i y.
+        # The complex number (x + i y)^2 has twice the angle of x + i y.
         result = (x * x - y * y, 2 * (x * y))
         if bit == "1":
             x, y = result

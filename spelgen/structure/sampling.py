@@ -23,7 +23,8 @@ Ten = Sequence[Element]
 def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return lower triangles of M, (1 + n, samples, n(n+1)/2), and V, (1 + n, samples), in the prime field.
 
-    The first axis has the 1 + n blocks of this module.
+    Index 0 of the first axis has random positions; the positions of index 1 + k differ from index 0 in coordinate k
+    only (see the module's docstring).
 
     Args:
         arm: the arm, with n coordinates.
@@ -80,9 +81,10 @@ def regressor_rows(arm: Chain, points: int) -> np.ndarray:
 
 
 def float_samples(arm: Chain, assume: Assume, samples: int, seed: int = 2) -> np.ndarray:
-    """Return lower triangles of M in double precision, (1 + n, samples, n(n+1)/2), in the blocks of this module.
+    """Return lower triangles of M in double precision, (1 + n, samples, n(n+1)/2).
 
-    arm, assume, samples: as for ``field_samples``. seed: seed of the random positions and inertial parameters.
+    The first axis and the arguments arm, assume and samples are as for ``field_samples``. seed: seed of the random
+    positions and inertial parameters.
     """
     rng = np.random.default_rng(seed)
     n = len(arm.coordinates)
@@ -164,7 +166,9 @@ class Spans:
         self.mass = mass[0]
         self.potential_changes = (potential[1:] != potential[0]).any(axis=1).tolist()
         changes = [difference(block, mass[0]) for block in mass[1:]]
-        depends = np.array([change.any(axis=0) for change in changes])  # (n, entries)
+        depends = np.array(
+            [change.any(axis=0) for change in changes]
+        )  # True: entry varies with joint, (n, entries)
         self.entry_joints = [frozenset(np.flatnonzero(column).tolist()) for column in depends.T]
         self.order = sorted(range(len(self.keys)), key=lambda index: (-len(self.entry_joints[index]), index))
         self.change_bases = [field.row_basis(change[:, self.order]) for change in changes]
@@ -186,7 +190,7 @@ class Spans:
     def outside(self, joints: frozenset[int]) -> np.ndarray:
         """Return an echelon basis of the changes of M caused by all joints except ``joints``, (dimension, entries).
 
-        The entries of M are in the order ``order``.
+        The columns are the entries of M in the order of the attribute ``order``.
         """
         first, last = min(joints), max(joints)
         between = [self.change_bases[k] for k in range(first, last) if k not in joints]
