@@ -50,7 +50,7 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
     tensors = (model.friction.reach, motors_of(model), width)
-    # Measured positions are NumPy arrays in double precision: the tensors are converted, also from a GPU.
+    # The model's tensors are converted to NumPy arrays in double precision, the type of measured positions.
     arrays = [x.detach().cpu().double().numpy() for x in tensors]
     return BristleReach(*arrays)
 

@@ -101,7 +101,7 @@ class LoadFilter:
     The measurement equation and its symbols are in the docstring of the module.
 
     Args:
-        noise: standard deviations of w and d, and time constant of d.
+        noise: standard deviations of the white noise w and of d, and time constant of d.
         effort: torque limits, which scale the prior of b, (n,) [Nm, N].
 
     Attributes:

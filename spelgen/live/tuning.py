@@ -122,8 +122,8 @@ class LiveTuning:
     folds: int = 3
     min_samples: int = 300
     max_samples: int = 2**11
-    # The grid of the noise of blocks: time constants of the disturbance [s], and standard deviations of the disturbance
-    # divided by the standard deviation of white noise [1].
+    # The grid for the estimation of `BlockNoise`: time constants of the disturbance [s], and standard deviations of the
+    # disturbance divided by the standard deviation of white noise [1].
     time_constants: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
     disturbance_ratios: tuple[float, ...] = (0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5)
     # [1] Lengths of trial estimates of the payload, as numbers of blocks of the payload filter: 5 and 10 s.

@@ -269,7 +269,10 @@ class ResidualDynamics(RigidBodyDynamics):
         self.residuals = residuals
 
     def prepare(self) -> RigidParameters:
-        """Return the parameter cache, which is valid until a parameter changes."""
+        """Return the parameter cache of rigid bodies, friction and residual terms.
+
+        It depends on the trained parameters only, and is valid until a parameter changes.
+        """
         prepared = super().prepare()
         if self.residuals is None:
             return prepared

@@ -166,9 +166,8 @@ class Spans:
         self.mass = mass[0]
         self.potential_changes = (potential[1:] != potential[0]).any(axis=1).tolist()
         changes = [difference(block, mass[0]) for block in mass[1:]]
-        depends = np.array(
-            [change.any(axis=0) for change in changes]
-        )  # True: entry varies with joint, (n, entries)
+        # `depends`, (n, entries): True if an entry of M varies with a coordinate.
+        depends = np.array([change.any(axis=0) for change in changes])
         self.entry_joints = [frozenset(np.flatnonzero(column).tolist()) for column in depends.T]
         self.order = sorted(range(len(self.keys)), key=lambda index: (-len(self.entry_joints[index]), index))
         self.change_bases = [field.row_basis(change[:, self.order]) for change in changes]

@@ -81,16 +81,18 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
         qdd: accelerations (S, n) [rad/s^2, m/s^2].
 
     Derivatives are complex-step derivatives (Squire and Trapp, SIAM Review 40:110, 1998), which have no cancellation.
-    `dynamics.regressor` is not used, because it imports torch, and the derivation of the structure does not.
+    `dynamics.body_regressor` is not used, because it imports torch, and the derivation of the structure does not.
     """
     samples, n = q.shape
     step = 1e-30
-    # q is shifted in n + 1 directions for derivatives: the n coordinate axes, for d/dq, and last qd, for d/dt.
-    directions = np.concatenate([np.tile(np.eye(n), (samples, 1, 1)), qd[:, None]], axis=1)  # (S, n + 1, n)
+    # q is shifted in n + 1 `directions`, (S, n + 1, n), for derivatives: the n coordinate axes, for d/dq, and last qd,
+    # for d/dt.
+    directions = np.concatenate([np.tile(np.eye(n), (samples, 1, 1)), qd[:, None]], axis=1)
     inertias = np.split(np.eye(10 * len(arm.bodies)), len(arm.bodies))
     shifted = q[:, None, None] + 1j * step * directions[:, :, None]
     triangles, potential = float_energies(arm, shifted, [list(ten) for ten in inertias])
-    mass = np.zeros((*potential.shape, n, n), dtype=complex)  # (S, n + 1, 10 B, n, n)
+    # `mass`: M per unit inertial parameter at the shifted positions, (S, n + 1, 10 B, n, n).
+    mass = np.zeros((*potential.shape, n, n), dtype=complex)
     for entry, (row, column) in enumerate(triangle(n)):
         mass[..., row, column] = mass[..., column, row] = triangles[..., entry]
     # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq. In time `step`, q changes by step qd (the last direction) and qd

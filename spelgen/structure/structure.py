@@ -67,7 +67,7 @@ class Structure:
 
 @lru_cache(maxsize=16)  # The structure is cached, because an arm is used with several settings or logs.
 def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
-    """Return the structure of ``arm``.
+    """Return the structure of M and V of ``arm``: zero, constant and varying entries, minimal form of M, joints of V.
 
     assume: ``kinematics`` for a structure that is valid for all values of the inertial parameters, ``inertials`` for
     the values in the URDF. Raises ArmError if ``assume`` is ``inertials`` and a body has no inertial with mass.
