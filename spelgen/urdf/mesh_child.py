@@ -53,7 +53,8 @@ def main(faces: int, meshes: list[tuple[str, list[float]]], output: IO[bytes]) -
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (2**30,) * 2)
-        # [s] Processor time. Most of it is spent on imports and on the simplification of fine meshes.
+        # [s] Largest processor time of this process, most of which is spent on imports and on the simplification of
+        # fine meshes.
         resource.setrlimit(resource.RLIMIT_CPU, (30,) * 2)
     arrays: dict[str, np.ndarray] = {}
     for index, (path, scale) in enumerate(meshes):

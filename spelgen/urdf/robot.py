@@ -137,7 +137,7 @@ class Robot:
     @cached_property
     def joints_below(self) -> dict[str, tuple[UrdfJoint, ...]]:
         """{name of a link: the joints whose parent it is}, for all links."""
-        # Links without such joints have an empty entry, so that no caller needs a default.
+        # Links without child joints have an empty entry, so that no caller needs a default.
         below: dict[str, tuple[UrdfJoint, ...]] = {link.name: () for link in self.links}
         for joint in self.joints:
             below[joint.parent] += (joint,)
