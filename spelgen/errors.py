@@ -58,7 +58,7 @@ class SettingsError(SpelgenError):
 
 
 class OptionError(SettingsError):
-    """An option that has no effect here; ``belongs`` names the command or setting that the option belongs to."""
+    """An option that the chosen command, objective or model does not have; ``belongs`` states where it applies."""
 
     def __init__(self, option: str, belongs: str) -> None:
         super().__init__(belongs, element=option)
@@ -98,7 +98,7 @@ class SpelgenErrors(SpelgenError):
 
 
 def _once(errors: Sequence[SpelgenError]) -> str:
-    """Return a text for errors that differ only in their files: the first error, then the other files."""
+    """Return one text for equal errors in several files: the first error, followed by the names of the other files."""
     first = errors[0]
     files = dict.fromkeys(error.file for error in errors if error.file and error.file != first.file)
     return f"{first}\n  the same: {shortened(list(map(str, files)), 5)}" if files else str(first)
@@ -113,7 +113,7 @@ def _in_short(text: str) -> str:
 
 
 def in_one_line(error: BaseException) -> str:
-    """Return the type of an exception and its message."""
+    """Return the type and message of an exception as one line, for an error message."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 

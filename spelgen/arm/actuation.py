@@ -47,7 +47,7 @@ class Drives(NamedTuple):
 
 @dataclass(frozen=True)
 class Actuation:
-    """The nonzero entries of the input matrix G, (n, n), and diagnostics; ``joints`` is the number n of joints.
+    """Nonzero entries of the input matrix G (n, n) of an arm, and diagnostics; ``joints`` is the number n of joints.
 
     couplings: nonzero entries of the matrix of joint torques per motor torque, for motors that drive several joints, if
     the logs contain joint torques. G is then the identity for these joints, and only the motor speeds depend on the
@@ -72,7 +72,7 @@ class Actuation:
         return result
 
     def drives(self) -> Drives:
-        """Return the input matrix G and the matrix C of motor speeds per joint velocity, (n, n) each."""
+        """Return G (n, n), joint torques per logged torque, and C (n, n), motor speeds per joint velocity."""
         torques = self.matrix()
         # With logged joint torques, G is the identity for coupled joints. To compute the motor speeds, its rows are
         # replaced by the couplings.
@@ -103,7 +103,7 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
 
 
 def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) -> Actuation:
-    """Return the input matrix of the arm whose coordinates are the joints named ``joints``.
+    """Return the input matrix G of the arm whose coordinates are the joints named ``joints``.
 
     Raises SettingsError for a coupling of a moving and a locked joint, and UrdfError if a transmission that is needed
     has unusable numbers.
@@ -116,7 +116,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # The entries of coupled joints are in `couplings`, and include the gears.
+    # Entries of G for joints that are driven by several motors are in `couplings`, whose matrices include the gears.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)
@@ -142,7 +142,7 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
 
 
 def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEntry:
-    """Return the entry of G of a motor that moves only the joint ``name``, with the index ``index``.
+    """Return the entry of G of a motor that moves only the joint ``name``; row and column are ``index``.
 
     Its value is the gear in the settings, otherwise the reduction in the URDF; without both, the entry is a trained
     gain with the initial value 1.
@@ -168,7 +168,7 @@ def _reduction(robot: Robot, name: str) -> float | None:
 
 
 def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[InputEntry]:
-    """Return the entries of G of motors that drive several joints.
+    """Return the entries of G of motors that drive several of the moving joints ``joints``.
 
     Couplings in the settings take precedence over differential transmissions in the URDF.
     """
@@ -213,9 +213,9 @@ def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]
 def _block(
     joints: Sequence[str], names: Sequence[str], matrix: Sequence[Sequence[float]]
 ) -> Iterator[InputEntry]:
-    """Yield the nonzero entries of G for ``matrix``, the block of G in the rows and columns of the joints ``names``.
+    """Yield the nonzero entries of a block of G: ``matrix`` (k, k) couples the k joints ``names``.
 
-    Row and column of an entry are positions in ``joints``.
+    Row and column of an entry are positions in ``joints``, the names of all n joints.
     """
     for row, values in zip(names, matrix, strict=True):
         for column, value in zip(names, values, strict=True):
