@@ -113,7 +113,7 @@ def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
     # The span of the polynomials, 0.18 s, was chosen on logs of an SO-101: with shorter spans the derivative is
     # noisier, longer spans smooth the motion.
     width = 2 * round(0.18 * rate / 2) + 1
-    # The Savitzky-Golay filter needs an odd width of at least five samples for a cubic, and at most the number of
+    # The Savitzky-Golay filter needs a width of 2 k + 1 samples: at least five for a cubic, and at most the number of
     # samples.
     width = min(max(5, width), samples - 1 + samples % 2)
     return np.asarray(savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2))
