@@ -147,7 +147,7 @@ def shortened(names: Sequence[str], limit: int) -> str:
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """A remark or warning for users; ``code`` is kebab-case and stable."""
+    """A remark or warning for users about a file, a robot or a log; ``code``, such as ``gap``, names its kind."""
 
     severity: Severity
     code: str
@@ -159,5 +159,5 @@ class Diagnostic:
         return f"{self.severity}: {self.where}: {self.message}"
 
     def to_dict(self) -> dict[str, object]:
-        """Return the five fields as a JSON object; their order is part of the public interface."""
+        """Return the five fields of the diagnostic as a JSON object; their order is part of the public interface."""
         return asdict(self)

@@ -74,7 +74,7 @@ def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
 
 @contextmanager
 def limited_memory(size: int) -> Iterator[None]:
-    """Limit the additional memory of the process to ``size`` bytes; a larger allocation raises MemoryError.
+    """Context manager that limits the additional memory of the process to ``size`` bytes (else MemoryError).
 
     File readers of third-party packages allocate the size that a file states, without checking it. The limit has an
     effect on Linux only.
@@ -100,7 +100,7 @@ def limited_memory(size: int) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path | str) -> Iterator[Path]:
-    """Yield a hidden file in the folder of `path`; at the end it replaces `path` atomically, even if power fails.
+    """Context manager that yields a hidden file, which at the end replaces `path` atomically, even if power fails.
 
     An absent folder is created. If `path` is in the local copy of an address, the file is also uploaded. An interrupted
     or failed write does not change `path`. Raises OSError with the path if the file cannot be written, for instance on
@@ -110,7 +110,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
     with naming(path):
         # An absent output folder is created: otherwise a command would fail after minutes of work.
         path.parent.mkdir(parents=True, exist_ok=True)
-        # The hidden file is in the same folder, because renaming is atomic only within one file system.
+        # The hidden file is in the folder of `path`, because renaming is atomic only within one file system.
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
             yield unfinished

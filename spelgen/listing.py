@@ -75,7 +75,7 @@ def _fitted(columns: Sequence[Sequence[str]]) -> list[Sequence[str]]:
     """Return the columns of a table, each a list of its head and cells; heads are wrapped if the table is too wide."""
     if sum(2 + _width(column) for column in columns) <= WIDTH:
         return list(columns)
-    # Heads are wrapped to at least 14 characters: in narrower heads most words would be cut.
+    # Heads of columns are wrapped to at least 14 characters: in narrower heads most words would be cut.
     return [columns[0], *([_folded(head, max(14, _width(cells))), *cells] for head, *cells in columns[1:])]
 
 

@@ -202,18 +202,18 @@ class ModelSpec:
 
     @property
     def joint_types(self) -> tuple[JointType, ...]:
-        """``revolute`` or ``prismatic``, for each joint."""
+        """Type of each joint, ``revolute`` or ``prismatic``."""
         return tuple(joint.joint_type for joint in self.joints)
 
     def to_json(self) -> str:
-        """Return the canonical JSON, in one line of ASCII."""
+        """Return the canonical JSON of the specification, in one line of ASCII."""
         # Keys are sorted and blanks omitted, so that equal specifications have equal digests.
         plain = {"format": SPEC_FORMAT, **asdict(self)}
         return json.dumps(plain, sort_keys=True, ensure_ascii=True, separators=(",", ":"))
 
     @cached_property
     def sha256(self) -> str:
-        """Digest of the canonical JSON."""
+        """SHA-256 digest of the canonical JSON in hexadecimal, which identifies the specification."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
 

@@ -69,13 +69,13 @@ def _ray(jobs: int, address: str | None) -> Iterator[ModuleType]:
         raise RunError("several runs at a time without Ray", expected="the extra parallel", do=do)
     # Ray must not send usage statistics.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # The value "0" avoids a warning of Ray about a changed default of this variable.
+    # RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO=0 avoids a warning of Ray about a changed default of this variable.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     import ray
 
     cluster: dict[str, Any] = {"address": address}
     if address is None:
-        # The dashboard would open a port. Tasks exchange only paths and a few numbers, for which 100 MB suffice.
+        # Ray's dashboard would open a port. The object store needs at most 100 MB: tasks exchange paths and numbers.
         cluster = {"num_cpus": jobs, "include_dashboard": False, "object_store_memory": 100_000_000}
     try:
         ray.init(**cluster, log_to_driver=False, logging_level=logging.ERROR)

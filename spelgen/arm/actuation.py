@@ -20,7 +20,7 @@ _SIMPLE, _DIFFERENTIAL = "SimpleTransmission", "DifferentialTransmission"
 
 @dataclass(frozen=True)
 class InputEntry:
-    """A nonzero entry of G, with 0-based row and column.
+    """A nonzero entry of the input matrix G, joint torques per logged torque; row and column are 0-based.
 
     ``kind``: ``fixed`` for the known gear of a motor of one joint; ``coupled`` for a known entry of a motor that moves
     several joints; ``gain`` for an entry that is trained, with the initial value ``value``.
@@ -61,11 +61,11 @@ class Actuation:
 
     @property
     def direct(self) -> bool:
-        """Whether G is the identity, except for zero rows of passive joints."""
+        """Whether the input matrix G is the identity, except for zero rows of passive joints."""
         return all(entry == InputEntry(entry.row, entry.row, "fixed", 1.0) for entry in self.entries)
 
     def matrix(self) -> np.ndarray:
-        """Return G (n, n), with trained gains at their initial values."""
+        """Return the input matrix G (n, n), joint torques per logged torque, with initial values of trained gains."""
         result = np.zeros((self.joints, self.joints))
         for entry in self.entries:
             result[entry.row, entry.column] = entry.value
@@ -132,7 +132,7 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
     driven: names of the joints that are not passive in the settings.
     """
     transmitted = {name for transmission in robot.transmissions for name in transmission.joint_names}
-    # No remarks for a URDF without transmissions: most URDFs have none.
+    # A URDF without transmissions causes no remarks: most URDFs have none.
     if transmitted.isdisjoint(driven):
         return
     for name in driven:
@@ -149,7 +149,7 @@ def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEnt
     """
     joint = settings.joint(name)
     gear = joint.gear if "gear" in joint.model_fields_set else _reduction(robot, name)
-    # An unknown gear is trained: a gear of 1 is not assumed.
+    # An unknown gear ratio is trained: a ratio of 1 is not assumed.
     if gear is None:
         return InputEntry(index, index, "gain", 1.0)
     return InputEntry(index, index, "gain" if joint.gain == "trained" else "fixed", gear)

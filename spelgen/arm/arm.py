@@ -100,12 +100,12 @@ class Chain:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the coordinates, as in the URDF."""
+        """Names of the joints that are the n coordinates, as in the URDF."""
         return tuple(coordinate.name for coordinate in self.coordinates)
 
     @property
     def joint_types(self) -> tuple[JointType, ...]:
-        """Types of the coordinates."""
+        """Types of the joints that are the n coordinates, "revolute" or "prismatic"."""
         return tuple(coordinate.joint_type for coordinate in self.coordinates)
 
     @property
@@ -115,7 +115,7 @@ class Chain:
 
 
 class MovingJoint(NamedTuple):
-    """A moving joint, its body, and the links of this body that have an inertial."""
+    """A moving joint of the URDF, its body in the chain, and the links of this body that have an inertial."""
 
     joint: UrdfJoint
     links: tuple[UrdfLink, ...]
@@ -179,7 +179,7 @@ def make_arm(
 
 def _require_small(robot: Robot, chain: ChainChoice) -> None:
     """Raise ArmError for an arm whose structure would take more than some seconds to derive."""
-    # The time of the derivation increases with about the fifth power of the number of joints.
+    # The time to derive the structure of an arm increases with about the fifth power of the number of joints.
     moving, largest, most_followers = len(chain.joints), 16, 48
     if moving > largest:
         do = "choose fewer with --joints or --tip"

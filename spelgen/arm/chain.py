@@ -29,7 +29,7 @@ class ChainChoice(NamedTuple):
 
 
 class Leader(NamedTuple):
-    """The leader of a joint: q = multiplier * q_leader + offset [rad, m]. The leader itself is not a mimic joint."""
+    """Joint that a mimic joint follows by q = multiplier * q_leader + offset [rad, m]; it is no mimic joint itself."""
 
     leader: UrdfJoint
     multiplier: Fraction
@@ -110,7 +110,8 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
             raise ArmError(f"the joint {name!r} twice", file=robot.source, expected="each joint once")
     if not chosen:
         return ()
-    # The path to the joint that is farthest from the root contains all others, unless they are on another branch.
+    # The path to the chosen joint that is farthest from the root contains all other chosen joints, unless they are on
+    # another branch.
     deepest = max(chosen, key=lambda joint: len(robot.path_to(joint.child)))
     ordered = tuple(joint for joint in robot.path_to(deepest.child) if joint in chosen)
     for joint in chosen:
@@ -119,7 +120,8 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
             raise ArmError(
                 got, file=robot.source, line=joint.line, expected="joints on one path from the root"
             )
-    # A wrong order is an error and is not corrected, because users expect columns of logs in the order of `names`.
+    # A wrong order of the chosen joints is an error and is not corrected, because users expect columns of logs in the
+    # order of `names`.
     if list(ordered) != chosen:
         got, do = f"the joints in the order {','.join(names)}", f"use {','.join(x.name for x in ordered)}"
         raise ArmError(got, file=robot.source, expected="the order from the root to the tip", do=do)

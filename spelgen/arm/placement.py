@@ -93,7 +93,7 @@ class AngleRounding:
         unit: np.ndarray = np.array(joint.axis) / np.linalg.norm(joint.axis)
         if self.tolerance == 0.0:
             return unit
-        # Components below 1e-3 are set to 0, because some CAD exporters print three digits.
+        # Components of an axis below 1e-3 are set to 0, because some CAD exporters print three digits.
         rounded = np.where(np.abs(unit) < 1e-3, 0.0, unit)
         # The axis is normalised again, because components were set to 0.
         rounded /= np.linalg.norm(rounded)
@@ -160,7 +160,7 @@ class Placement:
         self._segments: list[tuple[_Rotation, ...]] = [((np.eye(3), IDENTITY),)]
 
     def lock(self, joint: UrdfJoint, value: float) -> None:
-        """Add the child link of a joint that is locked at the position ``value`` [rad, m]."""
+        """Add the pose of the child link of a joint that is locked at the position ``value`` [rad, m]."""
         frame = self._joint_origin(joint)
         if value:
             axis = self._rounding.axis(joint)
@@ -174,7 +174,9 @@ class Placement:
         self.frames[joint.child] = frame
 
     def move(self, joint: UrdfJoint) -> tuple[int, np.ndarray, np.ndarray]:
-        """Add a moving joint and its child link, which start a body; bodies are numbered in the order of the calls.
+        """Add a moving joint and the pose of its child link, which start a body.
+
+        Bodies are numbered in the order of the calls.
 
         Returns:
             The index of the parent body, and the rotation (3, 3) and position (3,) [m] of the joint's frame in the
@@ -239,7 +241,8 @@ class Placement:
             position: exact position (3,) [m] in the frame of the parent body, whose tiny components are 0 already.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
-        # Tiny components are set to 0 in both frames: a rounding error would make a zero entry of M nonzero.
+        # Tiny components of a position are set to 0 in both frames: a rounding error would make a zero entry of M
+        # nonzero.
         moved = self._rounding.position(rotation @ in_own_frame)
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 

@@ -235,7 +235,7 @@ def compare(
         with progress_bar("simulating") as progress:
             study = prepare_study(comparison, folder, progress)
         note(study.announcement(parallel))
-        # Inputs are written before the workers start, so that all workers read the same files.
+        # The inputs of all runs are written before the workers start, so that all workers read the same files.
         study = run_study(study, note, parallel, address)
         sections = arm_sections(study)
         # Tables are printed in addition to the page, which cannot be shown in a terminal.

@@ -158,7 +158,7 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
 
         record["payload"] = payload_content(payload)
         outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
-    # The outcome of a servo fit already has a table of its drives.
+    # For a servo fit only the first table of the posterior is printed: its outcome already contains a table of drives.
     listings = () if posterior is None else posterior.listings[: 1 if fit.record.servo else None]
     outcome += [table.text() for table in listings]
     answer(format, record, *outcome, f"run folder: {folder}")
@@ -174,7 +174,7 @@ def _outcome(fit: Fit) -> tuple[str, str]:
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
-    # Only fits with the rollout objective have epochs, which the sentences below state.
+    # The number of epochs is printed only for fits with the rollout objective: other fits have no epochs.
     if not isinstance(config, Rollout):
         summary = None
         if fit.record.servo is not None:

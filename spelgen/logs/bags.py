@@ -23,7 +23,7 @@ from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
 MESSAGE = "sensor_msgs/msg/JointState"
-MEMORY = 2**29  # [B] memory that the reader may use in addition to 20 times the bag's size
+MEMORY = 2**29  # [B] memory for reading a bag, in addition to 20 times its size
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
 MAGIC = b"\x89MCAP0\r\n"  # bytes at the beginning and at the end of a complete MCAP file
 SCHEMA, CHANNEL, MESSAGE_RECORD, CHUNK = 3, 4, 5, 6  # operation codes of records in an MCAP file
@@ -125,7 +125,7 @@ def _joint_states(
             if len(array) not in (0, len(state.name)):
                 got, element = f"{len(array)} values for {len(state.name)} joints", f"message {row + 1}"
                 raise LogError(got, file=path, element=f"{element}, {field}", expected="one of each")
-            # ROS allows empty fields in a joint state, such as a missing effort
+            # Empty fields of a joint state are skipped: ROS allows them, for example without efforts.
             if len(array):
                 values[logged, row] = array[indices]
     columns: dict[str, np.ndarray] = {}

@@ -294,10 +294,10 @@ class LogChecks:
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
         """Return the settings of the group `logs` that correct one fault of several joints.
 
-        entries: settings that correct each faulty joint, by its name.
-
         If most joints of the same type (revolute or prismatic) need the same units, the units are also set for the
         other joints of this type, unless the motion of a joint contradicts them.
+
+        entries: settings that correct each faulty joint, by its name.
         """
         first, *_ = entries
         units, kinds = entries[first].get("units", {}), dict(zip(self._joints, self._kinds, strict=True))

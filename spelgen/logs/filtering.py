@@ -92,7 +92,7 @@ def resampled(t: np.ndarray, signals: np.ndarray, times: np.ndarray, rate: float
 
     # Signals below 50 Hz are interpolated by cubic functions: linear ones would cut off the peaks of the motion.
     kind = "linear" if is_dense(rate) else "cubic"
-    # Extrapolation is allowed, because by rounding errors the last time may be after the last sample.
+    # The interpolation may extrapolate, because by rounding errors the last time may be after the last sample.
     return np.asarray(interp1d(t, signals, kind, axis=0, fill_value="extrapolate")(times))
 
 

@@ -143,13 +143,13 @@ class JointSignals(NamedTuple):
 
 def is_factor(value: float, unit: float) -> bool:
     """Return True if a measured ratio of dq/dt to qd equals the conversion factor `unit` between units within 25 %."""
-    # The tolerance is 25 %, because noisy velocities make the measured factor inexact. Conversion factors of different
-    # units differ by more than 25 %.
+    # Ratio of dq/dt to qd and conversion factor may differ by 25 %: noisy velocities make the ratio inexact, and
+    # conversion factors of different units differ by more than 25 %.
     return 0.8 < value / unit < 1.25
 
 
 def find_frozen(signals: JointSignals) -> str | Advice | None:
-    """Return a finding if a signal of the joint is frozen while it moves: constant q or qd, or repeated old values."""
+    """Return a finding if a signal is frozen while the joint moves: constant q or qd, or repeated old values."""
     from scipy.integrate import cumulative_trapezoid
 
     # `motion` [rad, m]: a constant qd is frozen if q changes by more than `motion`; a constant q is frozen if the
@@ -223,7 +223,8 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
     if signals.kind != "prismatic" and name in ("q", "u"):
         # `turns`: candidates for one revolution in the unit of the log; angles without a stated unit may be in degrees.
         turns = [2 * np.pi / abs(scale), *([360.0] if unit is None else [])]
-    # Lost samples and outliers are removed first, because their jumps have other causes than register words.
+    # Lost samples and outliers are removed before the search for register words, because their jumps have other causes
+    # than register words.
     values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
     for turn in turns:
         word = read_as_words((values - offset) / scale, turn)
@@ -250,8 +251,8 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
         what = (
             "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
         )
-        # The first samples of a sign-magnitude word may be 0 like lost ones: jumps are counted between all samples that
-        # are no outliers of the decoded signal.
+        # Jumps are counted between all samples that are no outliers of the decoded signal: the first sign-magnitude
+        # words of a signal may be 0, and would be removed as lost samples.
         raw = (signals.signal(name) - offset) / scale
         decoded = signed(raw, word.value) if word.key == "sign_bit" else unwrapped(raw, word.value)
         count = jump_count(raw[~is_outlier(decoded, smooth=name == "q")], word.value)

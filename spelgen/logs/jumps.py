@@ -216,7 +216,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
     values: (T,) in the unit of the log. turn: one revolution in this unit; None for a joint that does not rotate.
     """
-    # With fewer than four values, the median step might itself be a jump.
+    # A signal with fewer than four values is not decoded: its median step might itself be a jump.
     if len(values) < 4:
         return None
     steps = np.diff(values)

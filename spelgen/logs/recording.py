@@ -109,7 +109,7 @@ def make_trajectory(data: np.ndarray, numbers: np.ndarray, layout: Layout, name:
 
 
 def _unwrap(rows: Rows) -> None:
-    """Unwrap the signals for which the mapping states a period, with remarks about the wraps."""
+    """Unwrap the signals for which the column mapping states a period, and add remarks about the wraps."""
     mapping, columns = rows.layout.mapping, rows.columns
     for (quantity, joint), column in columns.items():
         period = mapping.period(quantity, joint)
@@ -179,7 +179,7 @@ def _leave_out_outliers(rows: Rows) -> None:
 
 
 def _remove_delays(rows: Rows) -> None:
-    """Shift signals back by their delays in the mapping.
+    """Shift each signal back by its delay in the column mapping.
 
     Rows near the ends of a gap-free piece, for which a delayed signal was not logged, are removed.
     """
@@ -232,7 +232,7 @@ def listed_times(t: np.ndarray) -> str:
 
 
 def _order_in_time(rows: Rows) -> None:
-    """Give the rows increasing times, with messages about the repairs.
+    """Sort the rows by time and remove or correct equal times; a message is added about each repair.
 
     Rows are sorted by time, unless positions are then less smooth. Of several rows with equal times only the first is
     kept. If many of them differ, the resolution of the clock is too low, and evenly spaced times are reconstructed.

@@ -125,7 +125,8 @@ def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]
     # repeat a label of a megabyte in a million rows.
     labels = table[layout.labels].dictionary_encode("encode").combine_chunks()
     numbers = labels.indices.to_numpy()
-    # Rows are sorted by label once, which avoids a search of all rows for each recording.
+    # Rows of a table are sorted by the name of their recording once, which avoids a search of all rows for each
+    # recording.
     rows = np.argsort(numbers, kind="stable")
     ends = np.cumsum(np.bincount(numbers))
     return list(zip(map(str, labels.dictionary.to_pylist()), np.split(rows, ends[:-1]), strict=True))

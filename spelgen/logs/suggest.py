@@ -135,7 +135,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
             lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
     used = {column.name for named in by_joint.values() for column in named.values()}
     unused = [x.name for quantity in by_joint for x in columns_of[quantity] if x.name not in used]
-    # Unused columns are, for example, columns of a gripper, or of another arm with similar names.
+    # A comment of the draft lists unused columns, for example of a gripper, or of another arm with similar names.
     if unused:
         lines.append(f"# not used: {shortened(unused, TUNING.listed)}")
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]

@@ -75,7 +75,8 @@ class SampleTuning:
 
 TUNING, SIGNALS, SAMPLES = LogTuning(), SignalCheckTuning(), SampleTuning()
 
-SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff  # [Hz] lowest rate for accelerations
+# [Hz] Lowest sample rate of logs from which accelerations are computed.
+SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff
 # [1] Tolerance of comparisons with a sample rate: loggers with a nominal rate of 50 Hz have measured rates between
 # 49.95 Hz and 50.1 Hz.
 FAST = 1.002

@@ -73,7 +73,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
         if signals.is_whole:
             message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
-    # Of readings with distances that differ by rounding only, the first is used, whose unit is the most frequent.
+    # Of combinations of units whose distances differ by rounding only, the first is used: its units are most frequent.
     readings = _unit_readings(signals, is_far)
     distance, keys = min(readings, key=lambda reading: round(reading[0], 3), default=(np.inf, {}))
     if distance > log(1.25):
@@ -87,7 +87,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
 
 
 def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float, dict[str, Any]]]:
-    """Yield (distance, settings of the joint) for all combinations of units of q and qd that the mapping permits.
+    """Yield (distance, settings of the joint) for all units of q and qd that the column mapping permits.
 
     The settings with the smallest distance are the most plausible ones. The distance is |log r|, with r the ratio of
     dq/dt to qd in these units, plus a penalty for units other than SI.
@@ -95,8 +95,8 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     is_far: True if the range of q is more than two turns; combinations in which q exceeds two turns are then omitted.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
-    # The ratio r is known only if velocities were logged and are proportional to dq/dt. If it is unknown, only the
-    # range of q indicates a unit.
+    # The ratio r of dq/dt to qd is known only if velocities were logged and are proportional to dq/dt. If it is
+    # unknown, only the range of q indicates a unit.
     is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
     is_known &= "qd" in mapping.quantities
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
@@ -111,7 +111,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     if stated:
         positions = positions[:1]
     elif is_far and (signals.is_whole or not is_known):
-        positions = positions[:3]  # not mrad: counts of an encoder have similar ranges
+        positions = positions[:3]  # mrad is omitted: encoder counts have similar ranges
     if not is_known or mapping.unit("qd", joint):
         speeds = speeds[:1]
     for q, qd in product(positions, speeds):
@@ -176,7 +176,7 @@ def _rate_by_velocities(signals: JointSignals) -> float | None:
 
 
 def time_unit(step: float) -> str | None:
-    """Return the unit in which a time step of a robot's log is plausible; None if there is no such unit."""
+    """Return the unit of time in which a step of a robot's log is plausible (0.1 ms to 0.5 s); None without one."""
     # Several units of time may be plausible, since they differ by factors of 1000, and the plausible steps range over a
     # factor of 5000. The largest plausible unit is returned.
     slowest, fastest = SIGNALS.slowest_step, SIGNALS.fastest_step
@@ -206,7 +206,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         # advice.
         return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
-        # Only the sign of qd is wrong: q is correct, and its derivative can replace qd.
+        # If only the sign of qd is wrong, q is correct, and its derivative can replace qd.
         return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
     trajectory, mapping, k = signals.trajectory, signals.trajectory.mapping, signals.number
     for joint, fit in zip(signals.joints, signals.correlations.tolist(), strict=True):

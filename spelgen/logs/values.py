@@ -36,8 +36,8 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
     """
     times, unit = _clock(table, layout)
     if start is not None:
-        # The start is subtracted from the integers, before the conversion to doubles: doubles near 1.7e18 ns are 256 ns
-        # apart.
+        # The start time is subtracted from integer times, before the conversion to doubles: doubles near 1.7e18 ns are
+        # 256 ns apart.
         times = pa.compute.subtract(times, start)
     logged = [_floats(times, layout.columns[0], layout, rows)]
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
@@ -52,7 +52,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
     largest = np.array([TUNING.latest, *[TUNING.largest_value] * len(signals)])
     foreign = foreign_rows(data, len(layout.joints))
-    bad = ~(np.abs(data) < largest)  # NaN is bad, too: comparisons with NaN are False
+    bad = ~(np.abs(data) < largest)  # NaN is a bad value, too: comparisons with NaN are False
     if is_split(data):
         bad[:, 1:] &= ~np.isnan(data[:, 1:])
     elif not foreign.all():
@@ -223,7 +223,7 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
 
 
 def is_number(text: str) -> bool:
-    """Return True if a text is a number in Python's notation."""
+    """Return True if a text, such as a cell of a CSV file, is a number in Python's notation."""
     try:
         float(text)
     except ValueError:

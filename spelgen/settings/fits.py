@@ -33,7 +33,7 @@ class WindowFitDefaults:
     lbfgs_decay: float = 2e-5
     # [1] Weight decay of AdamW (Loshchilov and Hutter, ICLR 2019).
     adamw_decay: float = 0.2
-    # [1] Windows per step of AdamW.
+    # [1] Number of windows per step of AdamW.
     batch: int = 256
     # [1] Largest learning rate of AdamW: the default value of the authors of this optimizer.
     learning_rate: float = 1e-3

@@ -167,7 +167,7 @@ class MotorCalibration(Group):
 
     @model_validator(mode="after")
     def _has_range(self) -> MotorCalibration:
-        # An empty range is an error, because normalised positions are fractions of the range.
+        # An empty calibrated range of a motor is an error, because normalised positions are fractions of the range.
         if not self.range_min < self.range_max:
             raise ValueError("a range_max above range_min")
         return self
@@ -285,7 +285,7 @@ class LogMapping(Group):
 
         The placeholder `{trajectory}` in names of columns is replaced by `text`.
         """
-        # A name without `{trajectory}` is unchanged: its column belongs to all recordings.
+        # A column name without `{trajectory}` is unchanged: its column belongs to all recordings.
         named = {key: name.replace("{trajectory}", text) for key, name in self.columns}
         return self.model_copy(update={"columns": LogColumns(**named)})
 
@@ -323,7 +323,10 @@ class LogMapping(Group):
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
     def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
-        """Return the period or the sign bit of a quantity of a joint, in logged units; None if it is not set."""
+        """Return the period, at which logged values wrap, or the sign bit of a quantity of a joint; None if not set.
+
+        Both are in the unit of the log. quantity: "q", "qd", "tau" or "u".
+        """
         size: float | None = getattr(getattr(self.joint(joint), key), quantity)
         return size
 
@@ -332,7 +335,7 @@ class LogMapping(Group):
         return abs(self.scale(quantity, joint)) * (self.word("period", quantity, joint) or 0.0)
 
     def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit of "q", "qd", "tau" or "u" of a joint; None if it is not set."""
+        """Return the unit of the logged "q", "qd", "tau" or "u" of a joint; None if the settings contain none."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         # The default unit of commanded positions is the unit of measured positions, because one controller logs both.
         if unit is None and quantity == "u":
@@ -340,7 +343,7 @@ class LogMapping(Group):
         return unit
 
     def scale(self, quantity: str, joint: str) -> float:
-        """Return the factor by which a logged value is multiplied to get SI units; the factor includes `sign`."""
+        """Return the factor that converts logged values of a quantity of a joint to SI units, with the `sign`."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:

@@ -59,7 +59,7 @@ class JointSettings(Group):
     @field_validator("coulomb")
     @classmethod
     def _resists(cls, value: tuple[float, float]) -> tuple[float, float]:
-        # A coefficient of the wrong sign is an error, because such friction would drive the joint.
+        # A friction coefficient of the wrong sign is an error, because such friction would drive the joint.
         if value[0] < 0 or value[1] > 0:
             raise ValueError("the torque for qd > 0 (not negative), then for qd < 0 (not positive)")
         return value
@@ -81,7 +81,8 @@ class MotorCoupling(Group):
         if {len(self.matrix), *map(len, self.matrix)} != {len(self.joints)}:
             raise ValueError("as many rows, and as many numbers in each, as joints")
         rows = np.array(self.matrix)
-        # Each row is scaled before the rank is tested, because joint torques (rows) may have different units.
+        # Each row of the matrix is scaled before its rank is tested, because joint torques (rows) may have different
+        # units.
         largest = np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
         if np.linalg.matrix_rank(rows / np.where(largest > 0, largest, 1.0)) < len(self.joints):
             raise ValueError("a matrix with an inverse: as many independent motors as joints")
@@ -95,8 +96,8 @@ class Unusable:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> NoReturn:
-        # The errors must not be raised for attributes with double underscores, which copy and pickle read, except for
-        # those with which pydantic reads the values of the group.
+        # The errors of the group must not be raised for attributes with double underscores, which copy and pickle read,
+        # except for those with which pydantic reads the values of the group.
         if not name.startswith("__") or name.startswith("__pydantic"):
             collect(self.errors)
         raise AttributeError(name)

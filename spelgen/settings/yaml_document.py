@@ -45,7 +45,7 @@ class YamlDocument:
             return yaml.SafeLoader("").construct_document(self.root)
         except yaml.YAMLError as error:
             raise _yaml_error(error, self.path) from error
-        # The loader raises ValueError for some values, for example for the date 2025-99-99.
+        # The loader of PyYAML raises ValueError for some values, for example for the date 2025-99-99.
         except ValueError as error:
             raise SettingsError(f"not plain YAML: {error}", file=self.path) from error
 

@@ -130,8 +130,8 @@ def _read_origin(parent: Element) -> tuple[Vector, Vector]:
 
 def _read_axis(joint: Element, kind: str | None) -> Vector:
     axis, error_count = joint.child("axis"), len(joint.notes.errors)
-    xyz = axis.triple("xyz", (1.0, 0.0, 0.0))  # URDF defines (1, 0, 0) as the default axis.
-    # An axis of length zero is an error, because it cannot be normalised.
+    xyz = axis.triple("xyz", (1.0, 0.0, 0.0))  # URDF defines (1, 0, 0) as the default of the joint axis.
+    # A joint axis of length zero is an error, because it cannot be normalised.
     if kind in MOVING and len(joint.notes.errors) == error_count and max(map(abs, xyz)) < 1e-9:
         do = f'give the {kind} joint an axis such as "0 0 1"'
         joint.notes.error(axis.line, joint.where, f"the axis {axis.text('xyz')!r}", "a direction", do)
@@ -157,13 +157,13 @@ def _read_mimic(mimic: Element) -> Mimic | None:
     if not leader:
         mimic.error("no joint", 'joint="..." naming the joint to follow')
         return None
-    # An absent multiplier is 1. A multiplier of 0 is kept: it locks the joint at its offset.
+    # An absent multiplier of a mimic joint is 1. A multiplier of 0 is kept: it locks the joint at its offset.
     multiplier = mimic.number("multiplier")
     if multiplier is None:
         multiplier = 1.0
     offset = mimic.number("offset") or 0.0
-    # A tiny multiplier is an error like a huge one: its inverse, too, must be within the bound of all numbers in a
-    # URDF.
+    # A tiny multiplier of a mimic joint is an error like a huge one: its inverse, too, must be within the bound of all
+    # numbers in a URDF.
     if multiplier and abs(multiplier) < 1 / MAX_MAGNITUDE:
         expected = f"0, or {1 / MAX_MAGNITUDE:g} at least"
         mimic.error(repr(mimic.text("multiplier")), expected, key="multiplier")

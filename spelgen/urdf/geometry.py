@@ -73,7 +73,7 @@ def link_shapes(
 
     Args:
         urdf: Path of the URDF; its folder and all parent folders are searched for meshes.
-        element: Name of the elements to read.
+        element: Elements to read, "visual" or "collision".
         links: Names of the links whose shapes are returned.
         faces: Largest number of triangles of all meshes together; meshes with more triangles are simplified.
     """

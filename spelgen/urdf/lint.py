@@ -146,8 +146,8 @@ def _lint_groups(robot: Robot, moving: Sequence[UrdfJoint]) -> Iterator[Finding]
         yield "missing-inertial", "robot", 1, "no link has an <inertial>: masses and inertias are unknown"
         return
     for joint in moving:
-        # Groups are tested and not links: single links without mass are common, but M is singular if a whole rigid
-        # group has no mass.
+        # The mass of rigid groups is tested and not the mass of links: single links without mass are common, but M is
+        # singular if a whole rigid group has no mass.
         group = [joint.child]
         for name in group:
             group += [below.child for below in robot.joints_below[name] if below.type == "fixed"]

@@ -132,7 +132,7 @@ def _check_ends(notes: Notes, links: Sequence[UrdfLink], joints: Sequence[UrdfJo
 
 
 def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
-    """Report leaders that do not exist or do not move, and cycles of mimic joints."""
+    """Report mimic joints whose leader does not exist or does not move, and cycles of mimic joints."""
     by_name = {joint.name: joint for joint in joints}
     for joint in joints:
         if joint.mimic is None:

@@ -97,7 +97,7 @@ class Transmission(NamedTuple):
 
     @property
     def joint_names(self) -> list[str]:
-        """Names of the driven joints."""
+        """Names of the joints that the transmission drives."""
         return [name for name, _, _ in self.joints]
 
 
@@ -147,7 +147,8 @@ class Robot:
     def joints_from_root(self) -> tuple[UrdfJoint, ...]:
         """All joints, parents before their children, depth first in the order of the file."""
         ordered: list[UrdfJoint] = []
-        # A stack in place of recursion, because the depth of the tree may exceed the recursion limit of Python.
+        # Joints are visited with a stack and not by recursion, because the depth of the tree may exceed the recursion
+        # limit of Python.
         pending = list(reversed(self.joints_below[self.root]))
         while pending:
             joint = pending.pop()

@@ -155,8 +155,8 @@ class Element:
         """
         if text is None or self._is_unexpanded(text, key):
             return []
-        # The text is checked before `float`, which accepts nan, inf, 1_000 and Arabic digits: other readers of URDF
-        # reject these.
+        # The text of a number is checked before `float`, which accepts nan, inf, 1_000 and Arabic digits: other readers
+        # of URDF reject these.
         words, longest = text.split(), 64
         expected = "one number" if count == 1 else "three numbers"
         if len(words) != count:
@@ -164,7 +164,7 @@ class Element:
             self.error(f"{len(words)} numbers ({excerpt!r})", expected, key=key)
             return []
         for word in words:
-            # A longer word is a sign of a damaged file: no exporter writes such long numbers.
+            # A number with too many characters is a sign of a damaged file: no exporter writes such numbers.
             if len(word) > longest:
                 self.error(f"a number of {len(word)} characters", f"at most {longest}", key=key)
                 return []

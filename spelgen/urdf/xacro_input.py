@@ -28,9 +28,9 @@ def expand(path: Path, max_bytes: int) -> tuple[bytes, tuple[str, ...]]:
     Raises UrdfError if the package xacro is not installed or fails, runs for more than 8 s, or writes more than
     ``max_bytes``.
     """
-    # With -P, modules in the current folder cannot shadow the package.
+    # With the option -P of Python, modules in the current folder cannot shadow the package.
     command = [sys.executable, "-P", "-X", "utf8", "-m", "spelgen.urdf.xacro_input", str(path)]
-    # The output is a file and not a pipe, because output of any size would fill the memory of this process.
+    # The output of xacro is a file and not a pipe, because output of any size would fill the memory of this process.
     with tempfile.TemporaryFile() as output:
         try:
             run = subprocess.run(
@@ -80,7 +80,7 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
                         return str(candidate)
         # A package without package.xml is recognised by the name of its folder.
         named = [folder for folder in path.parents if folder.name == package]
-        with suppress(Exception):  # ROS is not installed, or does not know the package
+        with suppress(Exception):  # the package is unknown to ROS, or ROS is absent
             return str(named[0]) if named else installed(package)
         raise ValueError(
             f"the package {package!r} of $(find {package}) is neither above the file nor known to ROS"
