@@ -137,7 +137,7 @@ def suggestion(name: str, names: Iterable[str]) -> str:
 
 
 def shortened(names: Sequence[str], limit: int) -> str:
-    """Return the names, or the first ``limit`` of them and the number of the others."""
+    """Return names as text for a message: all of them, or the first ``limit`` of them and the number of the others."""
     omitted = len(names) - limit
     # If only one name would be omitted, it is printed: most names are shorter than `and 1 more`.
     if omitted <= 1:

@@ -74,10 +74,10 @@ def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
 
 @contextmanager
 def limited_memory(size: int) -> Iterator[None]:
-    """Context manager that limits the additional memory of the process to ``size`` bytes (else MemoryError).
+    """Context manager that limits the additional memory of the process to ``size`` bytes.
 
-    File readers of third-party packages allocate the size that a file states, without checking it. The limit has an
-    effect on Linux only.
+    A larger allocation raises MemoryError. File readers of third-party packages allocate the size that a file states,
+    without checking it. The limit has an effect on Linux only.
     """
     try:
         import resource
@@ -131,7 +131,7 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager for writing `path`: every OSError names `path`, also if it has no file name (a full disk)."""
+    """Context manager for writing `path`: an OSError without a file name (full disk), or of a hidden file, names it."""
     try:
         yield
     except OSError as error:

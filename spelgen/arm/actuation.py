@@ -36,7 +36,7 @@ class Drives(NamedTuple):
     """Matrices (n, n) of the motors of n joints.
 
     Attributes:
-        inputs: the matrix G; the joint torques are G times the logged torques.
+        inputs: the input matrix G; the joint torques are G times the logged torques.
         speeds: the matrix C; the motor speeds, measured on the output side of the gears, are C qd (see `motor_speeds`).
             Friction and rotor inertia act at the motor speeds.
     """
@@ -74,8 +74,8 @@ class Actuation:
     def drives(self) -> Drives:
         """Return G (n, n), joint torques per logged torque, and C (n, n), motor speeds per joint velocity."""
         torques = self.matrix()
-        # With logged joint torques, G is the identity for coupled joints. To compute the motor speeds, its rows are
-        # replaced by the couplings.
+        # With logged joint torques, the input matrix G is the identity for coupled joints. To compute the motor speeds,
+        # the rows of these joints are replaced by the couplings.
         for coupling in self.couplings:
             torques[coupling.row] = 0.0
         for coupling in self.couplings:
@@ -108,7 +108,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
     Raises SettingsError for a coupling of a moving and a locked joint, and UrdfError if a transmission that is needed
     has unusable numbers.
     """
-    # Only driven joints have entries of G: the row of a passive joint is zero.
+    # Only driven joints have entries of the input matrix G: the row of a passive joint is zero.
     driven = [name for name in joints if settings.joint(name).actuated]
     remarks = tuple(_undriven(robot, settings, driven))
     couplings = tuple(_couplings(robot, settings, joints))
@@ -116,7 +116,8 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # Entries of G for joints that are driven by several motors are in `couplings`, whose matrices include the gears.
+    # Entries of the input matrix G for joints that are driven by several motors are in `couplings`, whose matrices
+    # include the gears.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)
@@ -142,7 +143,7 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
 
 
 def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEntry:
-    """Return the entry of G of a motor that moves only the joint ``name``; row and column are ``index``.
+    """Return the entry of the input matrix G of a motor that moves only the joint ``name``, with the index ``index``.
 
     Its value is the gear in the settings, otherwise the reduction in the URDF; without both, the entry is a trained
     gain with the initial value 1.
@@ -168,7 +169,7 @@ def _reduction(robot: Robot, name: str) -> float | None:
 
 
 def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[InputEntry]:
-    """Return the entries of G of motors that drive several of the moving joints ``joints``.
+    """Return the entries of the input matrix G of motors that drive several of the moving joints ``joints``.
 
     Couplings in the settings take precedence over differential transmissions in the URDF.
     """
@@ -213,7 +214,7 @@ def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]
 def _block(
     joints: Sequence[str], names: Sequence[str], matrix: Sequence[Sequence[float]]
 ) -> Iterator[InputEntry]:
-    """Yield the nonzero entries of a block of G: ``matrix`` (k, k) couples the k joints ``names``.
+    """Yield the nonzero entries of a block of the input matrix G: ``matrix`` (k, k) couples the k joints ``names``.
 
     Row and column of an entry are positions in ``joints``, the names of all n joints.
     """

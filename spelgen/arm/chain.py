@@ -103,7 +103,7 @@ def _independent(joints: Iterable[UrdfJoint]) -> tuple[UrdfJoint, ...]:
 
 
 def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
-    """Return the joints of these names. Raises ArmError unless all are on one path, in the order from the root."""
+    """Return the joints that the user has chosen. Raises ArmError unless they are on one path, in the path's order."""
     chosen = [_usable(robot, name) for name in names]
     for name in names:
         if list(names).count(name) > 1:
@@ -129,7 +129,7 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
 
 
 def _usable(robot: Robot, name: str) -> UrdfJoint:
-    """Return the joint of this name. Raises ArmError if it is unknown, or a mimic, fixed, floating or planar joint."""
+    """Return a joint that the user has chosen. Raises ArmError if it is unknown, mimic, fixed, floating or planar."""
     joint = robot.joint.get(name)
     if joint is None:
         names = [joint.name for joint in _independent(robot.joints)]

@@ -46,7 +46,7 @@ class AngleRounding:
 
     @property
     def rotation_error(self) -> float:
-        """Largest error of the rational approximation of a rotation [rad]."""
+        """Largest permitted error of the rational approximation of a rotation [rad]."""
         # If rounding is disabled, the rational approximation must not round either: with an error of 1e-11, an angle of
         # 1.57079632679 would become pi/2, from which it differs by 5e-12.
         return TUNING.rotation_error if self.tolerance else 1e-15

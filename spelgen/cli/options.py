@@ -153,7 +153,7 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
 
 
 def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
-    """Return the paths of logs that all options --data name. Raises a usage error if there are none."""
+    """Return the paths of all logs on the command line. Raises a usage error if there is no option --data."""
     # Logs are given by an option and not by an argument, so that they cannot be confused with a module.
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")

@@ -85,7 +85,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         return outliers
     rows = np.flatnonzero(is_jump)
     first, last, window = rows[0], rows[-1], TUNING.jump_window
-    # An outlier of one or two samples at an end of the recording has only one jump: no sample follows or precedes it.
+    # An outlier of one or two samples at an end of the recording has only one jump: the signal begins or ends with it.
     if first < 2 and sizes[first] > 4.0 * sizes[first + 1 : first + 1 + window].max():
         outliers[: first + 1] = True
     if last > len(sizes) - 3 and sizes[last] > 4.0 * sizes[last - window : last].max():

@@ -136,7 +136,7 @@ def _equally_long(
 
 
 def _longest(arrays: NpzArrays) -> pa.Table:
-    """Return a table of all arrays that have the largest number of rows, T; matrices (T, n) become columns of lists."""
+    """Return a table of all arrays with the largest number of rows, T, to draft a mapping; matrices become lists."""
     names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
     vectors = set(filter(arrays.is_vector, names))
     rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
@@ -145,11 +145,11 @@ def _longest(arrays: NpzArrays) -> pa.Table:
 
 
 def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Columns:
-    """Return the columns of a matrix (T, n) by names such as `q_<joint>`; {} if the archive has no such matrix.
+    """Return {`q_<joint>`: ("q", index)} for each column of the matrix q (T, n) of an archive; {} without this matrix.
 
     The array `joints` of the archive states the order of the columns; without it the order is the arm's.
 
-    pattern: name of the columns, with a placeholder. names: names of the arm's joints in the log.
+    pattern: name of the columns, such as `q_{joint}`. names: names of the arm's joints in the log.
     """
     matrix = pattern.replace("{joint}", "").rstrip("_")
     if matrix not in arrays.names or arrays[matrix].ndim < 2:

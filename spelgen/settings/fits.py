@@ -209,7 +209,7 @@ class OnWindows(FitConfig):
     max_minutes: NonNegative | None = None
 
     def resolved(self, windows: int) -> Self:
-        """Return the configuration with values of optimizer, batch, learning rate and weight decay in place of None.
+        """Return the configuration with an optimizer, and with the batch, learning rate and weight decay for it.
 
         windows: number of training windows, on which the default optimizer depends.
         """
