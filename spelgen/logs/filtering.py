@@ -57,7 +57,7 @@ def _mean_rate(t: np.ndarray) -> float:
 
 
 def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
-    """Return evenly sampled signals (T, ...), filtered by the zero-phase low-pass. rate, cutoff: frequencies [Hz]."""
+    """Return signals (T, ...) with a sample rate [Hz], filtered by the zero-phase low-pass with a cutoff [Hz]."""
     from scipy.signal import sosfiltfilt
 
     # Signals are extended at both ends by three periods of the cutoff frequency, to reduce the filter's transients.

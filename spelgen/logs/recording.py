@@ -209,10 +209,15 @@ def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
 def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of the samples of a signal that repeat an old value although the joint moves.
 
-    quantity, values: the signal (T,), "q", "qd" or "tau". t, q, qd: times and motion of the joint, (T,) each.
-
     A torque that remains at the largest or smallest torque of the recording is not stale, since the drive limits the
     torque. A torque that is constant until the end of the recording is not stale, since the motor may be at rest.
+
+    Args:
+        quantity: name of the signal, "q", "qd" or "tau".
+        values: (T,) the signal of one joint.
+        t: (T,) times [s].
+        q: (T,) positions of the joint [rad, m].
+        qd: (T,) velocities of the joint [rad/s, m/s].
     """
     if quantity == "tau":
         stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
@@ -245,7 +250,7 @@ def _order_in_time(rows: Rows) -> None:
     late = int(np.count_nonzero(np.diff(rows.t) < 0))
     if late:
         order = np.argsort(rows.t, kind="stable")
-        # If sorted positions are rougher, the clock restarted between two recordings in the file, and sorting would
+        # If positions are rougher after sorting, the clock restarted between two recordings in the file, and sorting would
         # interleave the recordings.
         if _roughness(rows.positions[order]) > _roughness(rows.positions):
             raise _backward_times(rows)

@@ -283,7 +283,8 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
     # The first of the `held_rows` contains the command that acts at the earliest delayed time.
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
-    previous = np.concatenate([u[:1], u[:-1]])  # command until each sample
+    # `previous`: command that acts in the interval before each sample, (H, n) [rad, m] for H held rows.
+    previous = np.concatenate([u[:1], u[:-1]])
     # [s] Before the recording, the first command is assumed to have been constant for 1,000 s.
     corners = np.concatenate([t[:1] - 1e3, t])
     integral = np.zeros((len(t) + 1, u.shape[1]))

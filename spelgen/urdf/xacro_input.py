@@ -18,7 +18,7 @@ from spelgen.errors import UrdfError
 
 MAX_SECONDS = 8
 MEMORY = 2**30  # largest memory of the process that runs xacro [bytes]
-MISSING = 3  # exit code of this process if the package xacro is not installed
+MISSING = 3  # exit code of the process if it cannot import the package xacro
 _BY_HAND = "expand it where that works: xacro FILE name:=value ... > ROBOT.urdf"
 
 
@@ -80,7 +80,8 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
                         return str(candidate)
         # A package without package.xml is recognised by the name of its folder.
         named = [folder for folder in path.parents if folder.name == package]
-        with suppress(Exception):  # the package is unknown to ROS, or ROS is absent
+        # The search of xacro raises errors of any type if ROS is absent or does not know the package.
+        with suppress(Exception):
             return str(named[0]) if named else installed(package)
         raise ValueError(
             f"the package {package!r} of $(find {package}) is neither above the file nor known to ROS"
