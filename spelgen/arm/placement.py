@@ -73,7 +73,7 @@ class AngleRounding:
         return offset, rotation_from_rpy(angles) if any(angles) else None
 
     def tensor(self, link: UrdfLink, inertial: Inertial) -> np.ndarray:
-        """Return the exact inertia tensor (3, 3) [kg m2] in the inertial frame; tiny products of inertia are set to 0."""
+        """Return the exact inertia tensor (3, 3) [kg m2] in the inertial frame; tiny products of inertia become 0."""
         xx, xy, xz, yy, yz, zz = inertial.tensor
         if self.tolerance:
             # CAD programs export products of inertia such as 1e-18 in place of 0 for symmetric parts.

@@ -250,8 +250,8 @@ def _order_in_time(rows: Rows) -> None:
     late = int(np.count_nonzero(np.diff(rows.t) < 0))
     if late:
         order = np.argsort(rows.t, kind="stable")
-        # If positions are rougher after sorting, the clock restarted between two recordings in the file, and sorting would
-        # interleave the recordings.
+        # If positions are rougher after sorting, the clock restarted between two recordings in the file, and sorting
+        # would interleave the recordings.
         if _roughness(rows.positions[order]) > _roughness(rows.positions):
             raise _backward_times(rows)
         rows.keep(order)
