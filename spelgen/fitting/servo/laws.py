@@ -1,4 +1,4 @@
-"""Selection of the joints that have a dead zone: the posterior maxima with and without one are compared.
+"""Selection of the joints that have a dead zone: fits with and without a dead zone are compared.
 
 Each joint is fitted twice, from initial parameters with and without a dead zone. The dead zone is kept if it lowers the
 joint's negative log posterior by more than significance^2 / 2. Load, delay and likelihood are fixed at their values in
@@ -23,9 +23,10 @@ from spelgen.runtime.friction_laws import FrictionLaws
 
 
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return the parameters with dead zones only at joints where a dead zone lowers the cost significantly.
+    """Fit each joint with and without a dead zone from x; return the better parameters of each joint.
 
-    The cost is the joint's negative log posterior. It must decrease by more than significance^2 / 2.
+    A dead zone is kept only if it lowers the joint's cost, its negative log posterior, by more than significance^2 / 2
+    (`ServoTuning.significance`).
     """
     problem = problem.reweighted(x)
     without, costs_without = _joint_minima(problem, x)
@@ -38,7 +39,10 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
 
 
 def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return the parameters without dead zones below `TUNING.min_dead_zone`, about the resolution of encoders."""
+    """Return parameters x, in which dead zones below `TUNING.min_dead_zone` are set to zero and no longer fitted.
+
+    The resolution of encoders is similar to this bound, so that smaller dead zones cannot be measured.
+    """
     row, joints, active = problem.parameters.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
     active[row] &= joints[row] > TUNING.min_dead_zone
     joints[row] *= active[row]

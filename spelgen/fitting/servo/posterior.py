@@ -22,8 +22,10 @@ SERVO_UNITS = {
     "static error": "{0.position}",
     "offset/kp": "{0.position}",
 }
-"""Unit of each quantity of position servos. lag: kd/kp plus the delay of the commands; static error: coulomb/kp plus
-half the dead zone, which is `dead zone`."""
+"""Unit of each quantity of position servos.
+
+lag: kd/kp plus the delay of the commands. dead zone: half its width. static error: coulomb/kp plus half the dead zone.
+"""
 SUMS = {"lag": ("kd/kp", "delay"), "static error": ("coulomb/kp", "dead zone")}
 """Sums of two quantities that logs of servos may determine better than either of the two."""
 
@@ -54,7 +56,7 @@ class ServoPosterior(Posterior):
 
     @property
     def base_units(self) -> str:
-        """Units of the base parameters, for the title of a table."""
+        """Units of the base parameters, with the name of the joint whose kp divides them, for the title of a table."""
         units = super().base_units
         return units if self.scale_joint is None else f"{units}; ratios to kp of {self.scale_joint}"
 
@@ -97,7 +99,7 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _scale_index(self) -> int | None:
-        """Index of `scale_joint`."""
+        """Index of the joint `scale_joint`; None if a kp is known."""
         if not self.model.servo.trained.all():
             return None
         ratios = map(self._ratios, range(self.model.n))
@@ -109,7 +111,7 @@ class ServoPosterior(Posterior):
         return self.propagate(lambda model: model.servo.kp())
 
     def _ratios(self, joint: int) -> Propagated:
-        """Return the ratios of the base parameters to kp of a joint, (r,), with a square root of their covariance."""
+        """Return the r base parameters / kp of a joint, (r,), with a square root of the covariance of these ratios."""
         values, (kp, kp_root) = self._base_values, self._stiffness
         ratio = values.value / kp[joint]
         return Propagated(ratio, (values.root - ratio.outer(kp_root[joint])) / kp[joint])

@@ -68,7 +68,10 @@ class JointFunction:
     visit_length: float
 
     def read(self, terms: ResidualTerms) -> torch.Tensor:
-        """Return the weights (P,) of the term's current parameter; the weights of trends are zero."""
+        """Return the weights (P,) of the linear model that represent the term's current parameter in `terms`.
+
+        The weights of trends are zero: the weights of single entries suffice.
+        """
         if self.friction is not None:
             entries = terms.friction_logarithms()[self.joint]
         else:
@@ -76,7 +79,7 @@ class JointFunction:
         return F.pad(entries.detach(), (self.trends.shape[1], 0))
 
     def write(self, terms: ResidualTerms, weights: torch.Tensor) -> None:
-        """Set the term's parameter to the values for weights (P,)."""
+        """Set the term's parameter in `terms` to the entries that weights (P,) of the linear model represent."""
         count = self.trends.shape[1]
         # Trends have a separate prior in the fit but no parameter in the model, so they are added to the entries.
         entries = self.trends @ weights[:count] + weights[count:]
@@ -122,8 +125,8 @@ class JointFunction:
 class ProjectedTerms(NamedTuple):
     """Position-dependent residual torques whose weights a fit eliminates by variable projection.
 
-    candidates: the residual terms. terms: {joint: linear terms}; their columns are the columns of all residual terms of
-    the joint, concatenated in the order of the candidates.
+    candidates: the residual terms, each of one joint. terms: {joint: `LinearTerms`}; the features of a joint are the
+    columns of all its residual terms, concatenated in the order of the candidates.
     """
 
     terms: dict[int, LinearTerms]
@@ -208,7 +211,7 @@ def joint_functions(
     # The number of visits of a joint is 1 + path length / knot spacing of the splines.
     visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
     one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
-    # At least two periods: width >= 2 * 2 pi / frequency.
+    # Ripple of a frequency needs a range of positions of at least two periods: width >= 2 * 2 pi / frequency.
     width = (samples.q.amax(dim=0) - samples.q.amin(dim=0)).unsqueeze(-1)
     ripple = ripple * (terms.frequencies * width >= 4 * torch.pi).repeat(1, 2)
     friction = splines * samples.friction.unsqueeze(-1)

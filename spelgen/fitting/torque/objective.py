@@ -1,4 +1,4 @@
-"""Objective torque: fit inverse dynamics to the torques of all logs, then validate the model on windows."""
+"""Objective `torque`: fit inverse dynamics to the torques of all logs, then validate the model on windows."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from spelgen.settings.fits import TorqueFit
 if TYPE_CHECKING:
     from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 
-SAMPLES = 5  # number of samples of a window for validation and loss scales
+SAMPLES = 5  # number of samples of a window, for validation and for the scales of the validation loss
 FITTED = {
     "load": "only a load at the tip fitted",
     "friction": "only friction and torque offsets fitted",
@@ -72,7 +72,7 @@ class TorqueObjective(Objective):
         return self.data
 
     def begin(self) -> list[Diagnostic]:
-        """Fit the model. Raises LogError if no log is sampled densely enough for accelerations."""
+        """Fit the model and validate it; return diagnostics. Raises LogError if no log is sampled densely enough."""
         model = self.model
         notes = [*self._coupling_notes, *self._delay.notes]
         samples = torque_samples(model, self.data)
@@ -160,7 +160,7 @@ def couple_motors(model: ArmModel, coupling: Coupling, remaining: float) -> Diag
 
 
 def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
-    """Return the samples of training and validation logs; None if no log has motion at a sufficient rate."""
+    """Return the samples of training and validation logs; None if no log has motion at a sufficient sample rate."""
     decimation, reach = 1, bristle_reach(model)
     if isinstance(model, RigidBodyDynamics):
         decimation = TUNING.decimation

@@ -36,9 +36,9 @@ RIGID_GROUPS = (
 """Groups of parameters (see `ParameterInfo`) of bodies, drives and friction; all others are of residual terms, or of
 position servos."""
 SERVO_GROUPS = ("stiffness", "damping", "dead_zone", "delay")
-"""Groups of position servos, which fits to torques do not have."""
+"""Groups of the parameters of position servos, which models fitted to torques do not have."""
 DAY_GROUPS = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
-"""Groups that differ from day to day."""
+"""Groups of friction parameters and torque offsets, whose values differ from day to day."""
 NEGLIGIBLE = -30.0  # logarithm of a negligible friction coefficient, relative to nominal friction
 
 
@@ -105,7 +105,7 @@ class ParameterVector:
 
 
 def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
-    """Return the joint torque that belongs to the logged torque, (T, n) [Nm, N]."""
+    """Return the measured joint torque, (T, n) [Nm, N]: the input matrix of the model times the logged torque."""
     with torch.no_grad():
         torque: torch.Tensor = samples.tau @ model.input_matrix(samples.q[:1])[0].mT
     return torque
@@ -127,7 +127,8 @@ def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float)
         # The inverse dynamics are logged torques, here converted to joint torques by the initial gains.
         joint = model.inverse_dynamics(q, qd, qdd) @ model.input_matrix(q[:1])[0].mT
         rigid = joint - model.friction_torque(q, qd)
-        # The columns of each trained joint, (joints, T, 4), of which the first is the rigid-body torque.
+        # columns: (joints, T, 4), the regressor of each joint whose gain is trained: rigid-body torque, velocity, sign
+        # of the velocity, and 1 for the offset.
         columns = torch.stack([rigid, qd, qd.sign(), torch.ones_like(qd)], dim=-1).transpose(0, 1)[
             inputs.gain_rows
         ]
@@ -193,7 +194,7 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
     factor, factor_change = perturbed.real, perturbed.imag / epsilon
     relative = torch.linalg.solve_triangular(factor, factor_change, upper=True)
     added = relative + relative.mT
-    if not added.isfinite().all():  # after an overflow, the solver rejects the step because of its cost
+    if not added.isfinite().all():  # an overflow: the solver rejects this step because of its cost
         return raw + step
     min_eigenvalue = torch.linalg.eigvalsh(added)[:, 0]
     fraction = (TUNING.body_step / (-min_eigenvalue).clamp(min=1e-12)).clamp(max=1.0)
@@ -226,7 +227,7 @@ SHARED = {
     "velocities": "shared_velocities",
     "fractions": "shared_fractions",
 }
-"""Options with the standard deviation common to all joints, by the option with the one of a single joint."""
+"""{option of `GaussianPrior`: option of the factor common to all joints}, both of them prior standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +254,7 @@ class ParameterPrior:
 
     @classmethod
     def of(cls, rigid: ParameterVector, widths: GaussianPrior) -> ParameterPrior:
-        """Return the prior whose mean is the vector of the model's current parameters."""
+        """Return the prior whose mean is the vector of the model's current parameters. widths: standard deviations."""
         body_widths = torch.full_like(rigid.initial[rigid.bodies][:, 0], widths.bodies)
         return cls(rigid, widths, widths, rigid.flatten(rigid.initial), body_widths)
 

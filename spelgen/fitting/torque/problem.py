@@ -39,7 +39,7 @@ from spelgen.identification.least_squares import correlation_time
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 State = SolverState[torch.Tensor]
-"""Parameters x (K,), and as residual the squared torque residual per joint (n,)."""
+"""State of the solver: parameters x (K,), and as `residual` the squared torque residual per joint, (n,) [Nm^2, N^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +82,8 @@ class NoiseEstimator:
             effective_parameters: (n,) number of parameters that each joint's torque determines. Each parameter reduces
                 the degrees of freedom of the residual by one independent error.
         """
-        # At least one independent error remains. Otherwise the difference could be negative, since `updated` assigns an
-        # equal share of the parameters to each joint.
+        # At least one independent error remains. Otherwise the difference could be negative, since
+        # `TorqueProblem.updated` assigns an equal share of the parameters to each joint.
         fraction = (self.errors - effective_parameters).clamp(min=1.0) / self.errors
         rms = (squared_residual / self.count / fraction).sqrt()
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
@@ -176,7 +176,7 @@ class TorqueProblem:
         return float(((residual / self.noise.square()).sum() + penalty) / 2)
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
-        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) for the k free parameters."""
+        """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters."""
         # The prior of common factors couples free and fixed parameters. Therefore all rows are computed first, and the
         # free ones are selected afterwards.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)

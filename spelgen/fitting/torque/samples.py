@@ -39,10 +39,10 @@ class SampleBlock(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TorqueSamples:
-    """Concatenated samples of all trajectories.
+    """Concatenated samples of all trajectories of a fit.
 
     Attributes:
-        columns: the samples.
+        columns: the T samples.
         original_count: number of samples before decimation and subsampling.
         interval: time between successive samples [s].
         recordings: (T,), index of the recording to which each sample belongs.

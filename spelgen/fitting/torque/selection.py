@@ -148,8 +148,8 @@ def _best(
         limits: result of `max_torques` for one or two recordings; None: no bounds.
     """
     significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
-    # The second test is on halves: of all divisions, they have the largest distance in time between fitted and held-out
-    # samples.
+    # The second test of a candidate, a fit to the first half and its error on the last half, uses halves, since of all
+    # divisions they have the largest distance in time between fitted and held-out samples.
     first, last = split_halves(len(torque_residual), correlation_length)
     best: list[SelectedTerm | None] = [None, None]
     for candidate in candidates:
@@ -180,7 +180,10 @@ def _best(
 
 
 def _better(first: SelectedTerm | None, other: SelectedTerm) -> SelectedTerm:
-    """Return the other term if its held-out error is clearly smaller (`preference_ratio`), otherwise the first one."""
+    """Return the better one of two candidates of a joint.
+
+    This is `other` if its held-out error is clearly smaller (`preference_ratio`), otherwise `first`.
+    """
     # Candidates are tested in the order splines, friction factor, ripple. At similar errors splines are preferred to
     # ripple: both fit the torque of a linear spring, but only splines extrapolate it.
     if first is None or 1 - other.error_reduction <= SELECTION.preference_ratio * (1 - first.error_reduction):
