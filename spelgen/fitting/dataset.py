@@ -114,14 +114,14 @@ class TrainingData(PreparedLogs):
 
 
 def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
-    """Check the logs, split them and cut windows. Raises LogError.
+    """Check the logs of a fit, split them into training and validation, and cut windows. Raises LogError.
 
     Args:
         request: arguments of the fit; the model, the logs and their preprocessing are used.
         window: number of samples per window.
         stride: number of samples between the starts of successive windows.
     """
-    # Whole trajectories are set aside: neighbouring windows of one motion are not independent.
+    # Whole trajectories are set aside for validation: neighbouring windows of one motion are not independent.
     if isinstance(request.validation, float):
         split = split_validation(request.logs, request.validation, request.seed)
     else:
@@ -162,7 +162,7 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
 
 
 def digest(trajectories: Iterable[Trajectory]) -> str:
-    """Return the SHA-256 digest of all numbers of the trajectories."""
+    """Return the SHA-256 digest of all numbers of the trajectories, by which a resumed fit recognizes its logs."""
     numbers = hashlib.sha256()
     for x in trajectories:
         for array in (x.t, x.q, x.qd, x.tau, x.u):

@@ -135,7 +135,7 @@ class Fit:
 
         Raises RunError unless rigid bodies were fitted to torques, or to positions under position servos.
         """
-        # Imported here, because evaluation needs no posterior.
+        # The posterior is imported here, since an evaluation does not need it.
         from spelgen.fitting.posterior import posterior_of
 
         delay = self.record.preprocessing.torque_delay or 0.0
@@ -269,7 +269,8 @@ def load_run(folder: Path | str) -> Fit:
     run = RunFolder(folder)
     # The record is read first, so that a missing run is reported before its model is assembled.
     record = run.read_record()
-    # A loaded model is used for predictions only. With gradients enabled, each prediction would store its graph.
+    # The gradients of a loaded model are disabled: the model is used for predictions only, and each prediction would
+    # store its graph.
     return Fit(
         model=fitted_model(run).requires_grad_(False).eval(),
         history=run.read_metrics(),

@@ -55,7 +55,9 @@ class SolverState(Generic[Parameters]):
     """Iterate of the solver.
 
     Attributes:
+        x: parameters.
         residual: residual of the problem at x, from which the normal equations are computed.
+        cost: cost at x.
         damping: damping of the next step.
         steps: number of accepted steps, including earlier calls of the solver.
     """
@@ -99,7 +101,7 @@ class LeastSquaresProblem(Protocol[Parameters]):
         """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) with respect to k free parameters."""
 
     def candidates(self, x: Parameters, step: Tensor) -> Iterable[Parameters]:
-        """Return one or more candidates for the parameters after a step (k,) of the k free parameters.
+        """Return one or more candidates x for the parameters that result from a step (k,) of the k free parameters.
 
         The solver evaluates the next candidate only if the gain ratio of the best candidate so far (decrease of the
         cost divided by the predicted decrease) is low.
@@ -195,7 +197,8 @@ def _best_candidate(
         candidate = initial_state(problem, x, state.damping, state.steps + 1)
         if candidate.cost < best.cost:
             best = candidate
-        # Here the quadratic model predicts the decrease of the cost well: further candidates would lower it little.
+        # At a high gain ratio, the quadratic model predicts the decrease of the cost well: further candidates would
+        # lower the cost little.
         if state.cost - best.cost >= TUNING.min_gain_ratio * predicted:
             break
     return best

@@ -48,11 +48,11 @@ class WindowOptimizer(ABC):
         return False
 
     def state_dict(self) -> Content:
-        """Return the state from which a run is resumed."""
+        """Return the state of the optimizer, from which a run is resumed."""
         return self._optimizer.state_dict()
 
     def load_state_dict(self, state: Content) -> None:
-        """Restore the state from the result of `state_dict`."""
+        """Restore the state of the optimizer from the result of `state_dict`."""
         self._optimizer.load_state_dict(state)
 
 
@@ -102,12 +102,13 @@ class MiniBatchAdamW(WindowOptimizer):
         self._optimizer.zero_grad()
         try:
             value = loss(windows)
-        except torch.linalg.LinAlgError:  # the rollout diverged
+        except torch.linalg.LinAlgError:  # LinAlgError: the rollout diverged
             return math.nan
         value.backward()
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, TUNING.gradient_norm)
         self._optimizer.step()
-        # The loss is NaN if the gradient is not finite (0 * NaN is NaN): a test on the CPU would wait for a GPU.
+        # A gradient that is not finite makes the returned loss NaN (0 * NaN is NaN): an explicit test would wait for a
+        # GPU.
         return value.detach() + 0.0 * norm
 
 

@@ -124,7 +124,7 @@ class Posterior:
         """
         if self.torque_std is None:
             raise RunError("intervals of torques", expected="a fit to logs with torques, not to commands")
-        # Imported here, because intervals of parameters need no samples.
+        # Jacobian and samples of torques are imported here, since intervals of parameters do not need them.
         from spelgen.fitting.torque.jacobian import TorqueJacobian
         from spelgen.fitting.torque.samples import TorqueSamples
         from spelgen.logs.dynamics_samples import DynamicsSamples
@@ -194,7 +194,7 @@ class Posterior:
 
     @property
     def drive_columns(self) -> dict[str, list[str]]:
-        """{quantity: column of the table of drives}.
+        """Columns of the table of the drives' constants, {quantity: column}.
 
         A column has one text per joint, the value with interval and unit; the text is empty if the joint has no value.
         """
@@ -317,19 +317,19 @@ def posterior_of(
     delay_interval = late if delay else None
     if not servos:
         return Posterior(model, covariance, std, delay_interval)
-    # Imported here, because the file of the derived class imports this one.
+    # `ServoPosterior` is imported here, since its file imports this file.
     from spelgen.fitting.servo.posterior import ServoPosterior
 
     return ServoPosterior(model, covariance, std, delay_interval)
 
 
 def _constants(model: ArmModel) -> Tensor:
-    """Return the inertial parameters of all B bodies, then the armatures, (10 B + n,)."""
+    """Return the inertial parameters of all B bodies of a model, then the n armatures, (10 B + n,)."""
     return torch.cat([model.inertial_parameters.flatten(), model.armature])
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
-    """Return the tensor ``name``; None unless it has this shape, is float64, finite and not zero."""
+    """Return the tensor ``name`` of a posterior's content; None unless it is float64, finite, nonzero, of this shape."""
     tensor = content.get(name)
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
         return tensor if tensor.any() and tensor.isfinite().all() else None

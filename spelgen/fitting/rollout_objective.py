@@ -1,4 +1,4 @@
-"""The objective rollout: minimize the error of predicted windows in epochs, and repeat epochs that diverged."""
+"""Objective `rollout`: minimize the error of predicted windows in epochs, and repeat epochs that diverged."""
 
 import copy
 import math
@@ -98,7 +98,7 @@ class RolloutObjective(MomentumObjective):
         return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.penalty()
 
     def _end(self) -> Status | None:
-        """Return the status with which the current stage ends; None if it continues."""
+        """Return the status with which the current stage of epochs ends; None if the stage continues."""
         if self.epoch >= self.config.epochs or self.optimizer.stalled:
             return "finished"
         patience = self.config.patience
@@ -113,7 +113,7 @@ class RolloutObjective(MomentumObjective):
     def _run_epoch(self) -> Content:
         """Run one epoch and return its line of metrics.jsonl; repeat it at half the learning rate if it diverges."""
         while True:
-            # This is the state before the epoch, from which a diverged epoch is repeated.
+            # `state` is the state of the fit before the epoch: a diverged epoch is repeated from it.
             state = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             steps, start = self._steps_in_time(), self.seconds_now()
             # the mean loss is NaN if the loss or the gradient of any step is not finite
@@ -140,14 +140,14 @@ class RolloutObjective(MomentumObjective):
         """Return the number of steps of the next epoch, limited by the remaining time."""
         if math.isinf(self.allowed):
             return self.epoch_steps
-        # The time per step is still unknown: a short epoch measures it.
+        # In the first epoch, the time per step is still unknown: a short epoch measures it.
         if not self._step_seconds:
             return min(self.epoch_steps, TUNING.epoch_steps)
         remaining = self.allowed - self.seconds_now() - self._validation_seconds
         return max(1, min(self.epoch_steps, int(remaining / self._step_seconds)))
 
     def _rate(self, ahead: int = 0) -> float:
-        """Return the learning rate of a future step; ahead: its number minus the number of the last completed step."""
+        """Return the learning rate of a later step. ahead: its number minus the number of the last completed step."""
         fraction = (self._done(ahead) - self.stage_from) / (self._stage_end - self.stage_from)
         return self.learning_rate_factor * self.learning_rate(fraction)
 
