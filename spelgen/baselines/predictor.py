@@ -28,14 +28,19 @@ def roll_out_stiff(
 ) -> tuple[Tensor, Tensor]:
     """Return predicted positions and velocities, (W, K-1, n) each, of W windows of K samples.
 
-    Sample 0 of a window is the initial state; samples 1 to K-1 are predicted.
+    Sample 0 of a window is the initial state; samples 1 to K-1 are predicted. If a prediction diverges, its later
+    states are NaN.
 
     Method: ROS2, a Rosenbrock method. It has order two for any approximation of the Jacobian, and is L-stable with the
     exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the approximation is
     the Jacobian of friction only. Damping and bristles of any stiffness (light links with dry friction) then need no
     smaller steps, and the error of an explicit method is not confused with an error of the dynamics.
 
-    disturbance: constant disturbance (W, n) from `observe`. If a prediction diverges, its later states are NaN.
+    Args:
+        dynamics: dynamics of the arm, see `equations_of`.
+        windows: measured motion (W, K, n) and inputs (W, K-1, n).
+        substeps: number of integrator steps per sample interval.
+        disturbance: constant disturbance in each window, (W, n), see `_stepper`; None: no disturbance.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
     # The windows may have the friction state of another model: for friction without a state, it is omitted.
@@ -88,20 +93,24 @@ def _stepper(
         pose = pose_at(q)
         damping, stiffness = _friction_slopes(dynamics, pose, qd, z, width)
         h = GAMMA * step
-        # Both stages solve equations with the matrix 1 - h A. After elimination of the position, the matrix is
-        # M + h D + h^2 K (n, n), which is factorised once for both stages.
+        # Both stages solve equations with the matrix 1 - h A, with h = GAMMA * step and the approximate Jacobian A of
+        # (q, qd). After elimination of the position, the matrix is M + h D + h^2 K (n, n), which is factorised once for
+        # both stages.
         factors, pivots, _ = torch.linalg.lu_factor_ex(
             pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
         )
 
         def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force) in W windows, (W, n) each."""
+            """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force) in W windows, (W, n) each.
+
+            A is the approximate Jacobian of (q, qd), and h = GAMMA times the step length.
+            """
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
-        # ROS2 for u' = F(u): the next state is u + step (3 k1 + k2) / 2, where (1 - h A) k1 = F(u) and
-        # (1 - h A) k2 = F(u + step k1) - 2 k1.
+        # ROS2 for u' = F(u) with the approximate Jacobian A: the next state is u + step (3 k1 + k2) / 2, where (1 - h
+        # A) k1 = F(u) and (1 - h A) k2 = F(u + step k1) - 2 k1.
         v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
         second = pose_at(q2)
@@ -139,7 +148,7 @@ def _friction_slopes(
 
 @dataclass(frozen=True)
 class PredictorTuning:
-    """Constants of the integration of predictions by the Rosenbrock method."""
+    """Constants of the integration of predicted motion by the Rosenbrock method (`roll_out_stiff`)."""
 
     # [1] Largest number of integrator steps between two samples; a power of two.
     most_substeps: int = 16
@@ -168,7 +177,10 @@ States = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Solver:
-    """The Rosenbrock method, with the fewest steps per sample interval that are accurate in the `probe` windows."""
+    """Integrator of predicted motion by the Rosenbrock method (`roll_out_stiff`).
+
+    It takes the fewest integrator steps per sample interval that are accurate in the `probe` windows.
+    """
 
     dynamics: RigidDynamics
     probe: Windows
@@ -176,9 +188,8 @@ class Solver:
     def __call__(self, windows: Windows, disturbance: Tensor | None = None) -> States:
         """Return predicted q and qd at samples 1 to K-1 of W windows of K samples, (W, K-1, n) each.
 
-        Values after a divergence are NaN.
-
-        disturbance: constant disturbance (W, n) from `observe`.
+        Values after a divergence are NaN. disturbance: constant disturbance in each window, (W, n), see
+        `roll_out_stiff`.
         """
         return self._integrated(windows, self.substeps, disturbance)
 
@@ -188,7 +199,7 @@ class Solver:
 
     @cached_property
     def substeps(self) -> int:
-        """Number of steps per sample interval, chosen at the first use: torque errors need no rollouts.
+        """Number of integrator steps per sample interval, chosen at the first use: torque errors need no rollouts.
 
         A number of steps is accurate enough if twice as many steps change the predictions of the `probe` windows by
         less than `TUNING.tolerance` times the error of the predictions.
