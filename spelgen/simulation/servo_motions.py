@@ -32,7 +32,8 @@ def servo_motions(arm: Chain, settings: Settings, progress: Progress) -> Simulat
     t = sample_times(protocol)
     resolution = 2 * np.pi / TUNING.encoder_counts
     is_revolute = np.array([x.joint_type == "revolute" for x in arm.coordinates])
-    encoder = np.where(is_revolute, resolution, resolution / 10)  # (n,) [rad, m]
+    # encoder: step of each joint's encoder, (n,) [rad, m]
+    encoder = np.where(is_revolute, resolution, resolution / 10)
     logs = []
     for number, random in enumerate(np.random.default_rng(protocol.seed).spawn(protocol.trajectories)):
         u = middle + width * _commands(random, t, len(middle))

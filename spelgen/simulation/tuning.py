@@ -16,8 +16,8 @@ class SimulationTuning:
     # [1] Largest number of integrator steps while the torque is constant. An integration that needs more is stopped
     # with an error.
     most_steps: int = 100_000
-    # [1] Factor of both tolerances in the protocol "tracking". Integration errors of about 1e-11 rad are then still far
-    # below the resolution of the encoders.
+    # [1] Factor of both tolerances of the integration in the protocol "tracking". Integration errors of about 1e-11 rad
+    # are then still far below the resolution of the encoders.
     seen_loosening: float = 100.0
     # [1] Default fraction of a joint's position range and speed limit that a simulated motion uses.
     used_range: float = 0.7
