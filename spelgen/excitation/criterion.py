@@ -93,7 +93,10 @@ class Criterion:
         return self._log_condition(rows) + penalties
 
     def _rows(self, states: Tensor) -> Tensor:
-        """Return the regressor of K parameters, (T, n, K): bodies, then armature and friction (`FRICTION.columns`)."""
+        """Return the regressor of the torque for states (3, T, n), (T, n, K), with K parameters.
+
+        The parameters are the inertial parameters of the bodies, then armature and friction (`FRICTION.columns`).
+        """
         q, qd, qdd = states
         direction = (qd / FRICTION.coulomb_smoothing_velocity).tanh()
         effects = torch.stack([qdd, qd, direction, torch.ones_like(qd)])

@@ -129,9 +129,9 @@ def _checked_harmonics(
 def _accelerated(
     bounds: MotionBounds, acceleration: float | Sequence[float] | None, arm: Chain
 ) -> tuple[MotionBounds, np.ndarray]:
-    """Return the bounds with a limit of acceleration, and the limit of the approach, (n,).
+    """Return the bounds with a limit of the acceleration, and the acceleration limits of the approach, (n,).
 
-    Without a limit, the approach reaches its largest speed in one second.
+    Without an acceleration limit, the approach reaches its largest speed in one second.
     """
     if acceleration is None:
         return bounds, bounds.speed

@@ -36,7 +36,7 @@ class Motion:
     qdd: np.ndarray
 
     def then(self, later: Motion) -> Motion:
-        """Return this motion followed by a later one, which must begin at the last position of this motion."""
+        """Return this motion followed by `later`, a motion that begins at the last position of this motion."""
         second = later.t + self.t[-1], later.q, later.qd, later.qdd
         # The first sample of the later motion is omitted: it repeats the last position of this motion.
         pairs = zip((self.t, self.q, self.qd, self.qdd), second, strict=True)
@@ -152,9 +152,9 @@ class ExcitationTrajectory:
 
         coefficients: sine and cosine coefficients, (2, H, n).
         """
-        frequencies = self._numbers() * 2 * pi / self.duration  # (H,) [rad/s]
+        frequencies = self._numbers() * 2 * pi / self.duration  # frequencies: (H,) [rad/s]
         angles = torch.outer(t, frequencies)
-        sine, cosine = angles.sin(), angles.cos()  # (T, H) each
+        sine, cosine = angles.sin(), angles.cos()  # sine and cosine: (T, H)
         a, b = coefficients
         first, second = frequencies[:, None], (frequencies**2)[:, None]
         position = sine @ a + cosine @ b
