@@ -22,7 +22,7 @@ from spelgen.settings.settings import load_settings
 from spelgen.tasks import run_tasks
 
 PRESETS_ON_LOGS: tuple[str, ...] = ("closed-form", "hybrid")
-# The models of the paper (Wang et al., Sci Rep 15:33179, 2025) are first.
+# Presets that are compared on simulated logs. The models of the paper (Wang et al., Sci Rep 15:33179, 2025) are first.
 SIMULATED_PRESETS: tuple[str, ...] = ("phnode", "spel", "spel-kan", "minimal", "hybrid", "closed-form")
 
 
