@@ -43,7 +43,7 @@ def roll_out_stiff(
         disturbance: constant disturbance in each window, (W, n), see `_stepper`; None: no disturbance.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
-    # The windows may have the friction state of another model: for friction without a state, it is omitted.
+    # The friction state of the windows may be of another model: it is omitted for dynamics whose friction has no state.
     z = windows.z if windows.z is not None and is_stateful(dynamics) else sliding_memory(dynamics, qd)
     largest = windows.qd.abs().amax(dim=(0, 1))
     largest = torch.maximum(largest, 1e-3 * largest.max()).clamp(min=1e-2)
@@ -53,7 +53,7 @@ def roll_out_stiff(
     positions = torch.full_like(windows.q[:, 1:], torch.nan)
     velocities = positions.clone()
     for k in range(windows.dt.shape[1]):
-        step = windows.dt[:, k].unsqueeze(-1) / substeps  # (W, 1) [s]
+        step = windows.dt[:, k].unsqueeze(-1) / substeps  # step: (W, 1) [s]
         for _ in range(substeps):
             q, qd, z = advance((q, qd, z), windows.tau[:, k], step)
         inside = ((qd.abs() <= TUNING.bounds * largest) & q.isfinite()).all(dim=-1, keepdim=True)
@@ -130,7 +130,8 @@ def _friction_slopes(
 ) -> tuple[Tensor, Tensor]:
     """Return the derivatives of friction with respect to velocity (D) and, through the bristles, to position (K).
 
-    Both are diagonals of matrices of W windows, (W, n): the friction of a joint depends only on the joint's motion.
+    Both are diagonals of matrices of W windows, (W, n) [Nm s/rad, N s/m; Nm/rad, N/m]: the friction of a joint depends
+    only on the joint's motion. width: (n,) finite-difference steps of velocity [rad/s, m/s].
     """
     # Central differences are used, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
@@ -157,7 +158,8 @@ class PredictorTuning:
     # [1] A number of steps is accepted if twice as many steps change the predicted velocities by less than this
     # fraction of their RMS error. With this value reported errors change by a thousandth.
     tolerance: float = 5e-2
-    # [1] Lower bound of the RMS error that is multiplied by `tolerance`, divided by the RMS change of velocity.
+    # [1] Lower bound of the RMS velocity error that is multiplied by `tolerance`, as a fraction of the RMS change of
+    # velocity in the windows.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16
@@ -199,7 +201,7 @@ class Solver:
 
     @cached_property
     def substeps(self) -> int:
-        """Number of integrator steps per sample interval, chosen at the first use: torque errors need no rollouts.
+        """Number of integrator steps per sample interval, chosen at the first use: evaluations of torques need none.
 
         A number of steps is accurate enough if twice as many steps change the predictions of the `probe` windows by
         less than `TUNING.tolerance` times the error of the predictions.

@@ -48,7 +48,7 @@ class EvaluatedArm:
 
 
 def constant_velocity(arm: EvaluatedArm) -> list[Predictor]:
-    """Return the predictor that keeps the initial velocity of a window, in a list as for all baselines."""
+    """Return a list with one predictor, for which all joints keep the velocity of the first sample of a window."""
     return [Predictor(CONSTANT_VELOCITY, hold_velocity)]
 
 

@@ -111,7 +111,7 @@ class Job(Group):
         return ablation_designs().get(self.design, self.design)
 
     def build(self) -> ArmModel:
-        """Return the untrained model."""
+        """Return the untrained model of the run."""
         arm = self.inputs.load()
         return build(arm, self.named_design, width=self.width, depth=self.depth, seed=self.seed)
 
@@ -197,7 +197,7 @@ def run_job(job: Job) -> RunResult:
 
 
 def _own_checkpoint(job: Job, run: RunFolder) -> bool:
-    """Return True if the folder has a checkpoint of this run; a checkpoint with another key is discarded."""
+    """Return True if the run's folder has a checkpoint with the key of the run; one with another key is discarded."""
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()

@@ -35,7 +35,7 @@ class ArmResults:
 
 
 def arm_sections(study: Study) -> list[ArmResults]:
-    """Return a section for each arm with finished runs."""
+    """Return the tables and the sentence of each arm with finished runs, for the report of a comparison."""
     arms: dict[str, list[RunResult]] = {}
     for job in study.jobs:
         if job.name in study.results:

@@ -48,7 +48,7 @@ class Criterion:
         self.limits = torch.tensor(efforts, dtype=torch.float64)
 
     def states(self, parameters: np.ndarray) -> Tensor:
-        """Return q, qd and qdd at the samples of the criterion, (3, T, n), for parameters (size,)."""
+        """Return q, qd and qdd for parameters (size,) at the T times of the criterion, (3, T, n)."""
         return self.trajectory.states(torch.from_numpy(parameters), self.times)
 
     def condition(self, states: Tensor) -> float:

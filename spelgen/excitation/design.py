@@ -215,7 +215,10 @@ def _improved(
         return initial
 
     def evaluate(parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the criterion and its gradient (size,), and store the parameters if the criterion is the smallest."""
+        """Return the criterion and its gradient (size,) at parameters (size,), for the optimizer.
+
+        The parameters are stored in `best` if the criterion is smaller than at all earlier parameters.
+        """
         nonlocal best, lowest, done
         value, gradient = criterion.value_and_gradient(parameters)
         done += 1

@@ -96,7 +96,7 @@ class ExcitationTrajectory:
 
     @property
     def size(self) -> int:
-        """Number of parameters."""
+        """Number of parameters of a motion: 2 H + 2 per joint."""
         return self.joints * (2 * self.harmonics + 2)
 
     def motion(self, parameters: np.ndarray, t: np.ndarray) -> Motion:
@@ -123,10 +123,11 @@ class ExcitationTrajectory:
         if self.bounds.acceleration is not None:
             strongest = accelerations.abs().amax(dim=0) / GRID_RATIO
             largest = torch.minimum(largest, torch.from_numpy(self.bounds.acceleration) / strongest)
-        # Any value of the parameter gives an amplitude between zero and the largest amplitude within the bounds.
+        # Any value of the amplitude parameter gives an amplitude between zero and the largest amplitude within the
+        # bounds.
         amplitude = largest * (-self.amplitude_reduction(parameters)).exp()
         # `free` is the width of the range of offsets for which the motion keeps the position range, (n,). The tanh maps
-        # any value of the parameter into this range.
+        # any value of the offset parameter into this range.
         free = room - 2 * amplitude * half
         offset = low - amplitude * (middle - half) + free * (1 + offsets.tanh()) / 2
         q, qd, qdd = amplitude * self._signals(coefficients, t)

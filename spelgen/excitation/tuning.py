@@ -30,7 +30,7 @@ class ExcitationTuning:
     prismatic_speed: float = 0.25
     # [1] Largest total number of triangles of the collision meshes whose convex hulls are computed.
     faces: int = 20_000
-    # [1] Random positions at which pairs of links are tested for a permanent overlap.
+    # [1] Number of random positions at which pairs of links are tested for a permanent overlap.
     positions: int = 200
     # [1] A pair of links is not compared if it is too close at this fraction of the random `positions` or more, as in
     # MoveIt's setup assistant.

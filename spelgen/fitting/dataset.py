@@ -72,7 +72,7 @@ class FitRequest:
 
     @property
     def recordings(self) -> list[Trajectory]:
-        """All trajectories, for training and validation."""
+        """All trajectories of the fit, for training and validation."""
         return [*self.logs, *(() if isinstance(self.validation, float) else self.validation)]
 
 

@@ -75,12 +75,12 @@ class Fit:
 
     @property
     def epochs(self) -> int:
-        """Number of completed epochs."""
+        """Number of completed epochs of the fit."""
         return self.checkpoint.epoch
 
     @property
     def steps(self) -> int:
-        """Number of optimizer steps on windows."""
+        """Number of optimizer steps on windows in the fit."""
         return self.checkpoint.step
 
     @property

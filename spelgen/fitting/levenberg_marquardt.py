@@ -35,9 +35,9 @@ class NormalEquations(NamedTuple):
     descent: Tensor
 
     def step(self, damping: float | Tensor = 0.0) -> Tensor:
-        """Return the steps (H + damping diag H)^-1 (-g), (..., k).
+        """Return the steps (H + damping diag H)^-1 (-g), (..., k), with the Hessian H and the gradient g.
 
-        damping: a number for all systems of equations, or (...), one for each.
+        damping: one number for all systems of equations, or (...), one number per system.
         """
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
         # Marquardt's scaling by diag H instead of Levenberg's identity: steps are independent of the parameters' units.
@@ -46,7 +46,10 @@ class NormalEquations(NamedTuple):
         return result
 
     def predicted_decrease(self, step: Tensor) -> float:
-        """Return the decrease of the cost by a step s (k,) in the quadratic model of the cost: -g^T s - s^T H s / 2."""
+        """Return the decrease of the cost by a step s (k,) in its quadratic model: -g^T s - s^T H s / 2.
+
+        H is the Gauss-Newton Hessian, g the gradient of the cost.
+        """
         return float(step @ (self.descent - self.curvature @ step / 2))
 
 

@@ -68,7 +68,7 @@ class MomentumObjective(Objective):
         return self.notes
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Resume from the best weights in the checkpoint; an incomplete momentum stage is repeated."""
+        """Resume an interrupted fit from the best weights so far; an incomplete momentum stage is repeated."""
         self._set_up()
         for name in self.saved_attributes:
             setattr(self, name, checkpoint[name])
@@ -122,11 +122,11 @@ class MomentumObjective(Objective):
         return time.monotonic() - self._since
 
     def fraction(self, seconds: float) -> float:
-        """Return ``seconds`` divided by the time limit; 0 without a limit, infinite if the limit is zero."""
+        """Return ``seconds`` divided by the time limit of the fit; 0 without a limit, infinite if the limit is zero."""
         return seconds / self.allowed if self.allowed else math.inf
 
     def _new_optimizer(self, generator: torch.Generator) -> WindowOptimizer:
-        """Return an optimizer of the weights that require a gradient. generator: random order of the batches."""
+        """Return an optimizer of the weights that require a gradient. generator: gives the random order of batches."""
         decay = self.config.weight_decay or 0.0
         if self.config.optimizer == "lbfgs":
             return LBFGS(self.model, decay)
@@ -149,8 +149,8 @@ class MomentumObjective(Objective):
     def _momentum_stage(self, progress: TrainingProgress) -> None:
         """Minimize the momentum loss, which needs no ODE solver.
 
-        If this does not lower the validation loss, the previous weights are restored. A run that is interrupted in this
-        stage repeats the whole stage when it is resumed.
+        If the minimization does not lower the validation loss, the previous weights are restored. A run that is
+        interrupted in this stage repeats the whole stage when it is resumed.
         """
         call, steps = TUNING.epoch_steps, self.config.momentum_steps
         optimizer = self._new_optimizer(torch.Generator().manual_seed(self.request.seed))

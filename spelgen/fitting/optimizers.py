@@ -57,7 +57,10 @@ class WindowOptimizer(ABC):
 
 
 def _trainable(model: torch.nn.Module) -> tuple[list[torch.nn.Parameter], list[torch.nn.Parameter]]:
-    """Return two lists: parameters that require a gradient, and the matrices among them, which have weight decay."""
+    """Return two lists of a model's parameters: all that require a gradient, and the matrices among these.
+
+    Only matrices have weight decay.
+    """
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     return parameters, [parameter for parameter in parameters if parameter.dim() > 1]
 
@@ -182,7 +185,10 @@ class LBFGS(WindowOptimizer):
         return waits > 1
 
     def _evaluated(self, summands: Summands) -> Tensor:
-        """Compute the gradients and return the penalised loss, (); a large number if any of them is not finite."""
+        """Compute the gradients of the penalised loss; return this loss, (), or a large number if it is not finite.
+
+        The loss is also replaced by the large number if a gradient is not finite.
+        """
         self._optimizer.zero_grad()
         try:
             value = torch.zeros((), dtype=torch.float64)

@@ -256,12 +256,15 @@ class Posterior:
 
     @cached_property
     def _constants(self) -> Propagated:
-        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance."""
+        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance.
+
+        The square root is (10 B + n, k), see `Propagated`.
+        """
         return self.propagate(_constants)
 
     @cached_property
     def _base_values(self) -> Propagated:
-        """Values of the base parameters, (r,), with a square root of their covariance."""
+        """Values of the r base parameters, (r,), with a square root (r, k) of their covariance."""
         return Propagated(*(self._base[1] @ factor for factor in self._constants))
 
     def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
@@ -329,7 +332,10 @@ def _constants(model: ArmModel) -> Tensor:
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
-    """Return the tensor ``name`` of a posterior's content; None unless it is float64, finite, nonzero, of this shape."""
+    """Return the tensor ``name`` of a posterior's content.
+
+    Return None unless the tensor has the given shape, is float64, finite and not zero.
+    """
     tensor = content.get(name)
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
         return tensor if tensor.any() and tensor.isfinite().all() else None

@@ -51,7 +51,7 @@ class RolloutObjective(MomentumObjective):
         return super().begin()
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Resume from the last complete epoch."""
+        """Resume an interrupted fit after its last complete epoch."""
         super().resume(checkpoint, history)
         self.optimizer = self._optimizer()
         self.model.load_state_dict(checkpoint["model"])
@@ -88,7 +88,10 @@ class RolloutObjective(MomentumObjective):
         self._step_seconds, self._validation_seconds = 0.0, 0.0
 
     def _optimizer(self) -> WindowOptimizer:
-        """Return a new optimizer of all weights that are not fixed. Gradients of fixed weights are disabled."""
+        """Return a new optimizer of all weights that are not fixed. Gradients of fixed weights are disabled.
+
+        In the first stage, the residual terms that the torque fit did not select are fixed.
+        """
         for name, parameter in self.model.named_parameters():
             parameter.requires_grad_(name not in self.fixed)
         return self._new_optimizer(self.generator)
@@ -137,7 +140,7 @@ class RolloutObjective(MomentumObjective):
         return record
 
     def _steps_in_time(self) -> int:
-        """Return the number of steps of the next epoch, limited by the remaining time."""
+        """Return the number of optimizer steps of the next epoch, limited by the remaining time."""
         if math.isinf(self.allowed):
             return self.epoch_steps
         # In the first epoch, the time per step is still unknown: a short epoch measures it.

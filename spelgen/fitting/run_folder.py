@@ -77,7 +77,7 @@ class RunFolder:
             write_bytes(file, written)
 
     def save(self, weights: Content, checkpoint: Content) -> None:
-        """Write model.pt and checkpoint.pt."""
+        """Write the best weights to model.pt, and the checkpoint to checkpoint.pt."""
         write_state(self.weights, weights)
         write_state(self.checkpoint, checkpoint)
 

@@ -66,8 +66,8 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
     )
     names = list(arm.chain.joint_names)
     settings = {"about": ABOUT.format(seed), "moving_joints": names} | carried
-    # Other arms are simulated along prescribed paths. This is not possible with position servos and passive joints, so
-    # such arms keep the protocol of their settings.
+    # Arms with position servos or passive joints cannot be simulated along prescribed paths, as all other arms are.
+    # They keep the protocol of their settings.
     if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
         settings["simulation"] = carried.get("simulation", {}) | {"seed": seed}
         return settings

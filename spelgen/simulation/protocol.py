@@ -51,7 +51,7 @@ def sample_times(simulation: SimulationSettings) -> np.ndarray:
 
 
 def make_friction(arm: Chain, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
-    """Return the friction of the drives.
+    """Return the friction model of the drives of a simulated arm.
 
     The friction of a joint is specified by its settings or, if the settings have none, by <dynamics> in the URDF.
 

@@ -1,4 +1,4 @@
-"""Simulated logs of an arm under position servos: commands of sines, holds and steps, and encoder positions."""
+"""Simulated logs of an arm under position servos: commands that are sums of sines and steps, and encoder positions."""
 
 import numpy as np
 
@@ -97,11 +97,11 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
 def _after_dry_friction(
     qd: np.ndarray, inverse: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> np.ndarray:
-    """Return the velocity (n,) after the impulses of dry friction.
+    """Return the velocity (n,) [rad/s, m/s] after the impulses of dry friction.
 
     Args:
-        qd: Velocity (n,) without dry friction.
-        inverse: Inverse of the mass matrix, (n, n).
+        qd: Velocity (n,) without dry friction [rad/s, m/s].
+        inverse: Inverse of the mass matrix plus the implicit part of the damping, (n, n).
         lower: Lower bounds of the impulses, given by Coulomb friction, (n,) [Nm s, N s].
         upper: Upper bounds of the impulses, given by Coulomb friction, (n,) [Nm s, N s].
     """

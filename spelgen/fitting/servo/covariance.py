@@ -48,7 +48,10 @@ def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content
 
 
 def _common_factor(vector: ParameterVector) -> Tensor:
-    """Return the derivative (K,) of the parameters with respect to the logarithm of a factor of all torques."""
+    """Return the derivative (K,) of the parameters with respect to the logarithm of a common factor of all torques.
+
+    Positions under servos do not depend on this factor of gains, masses, friction and torque offsets.
+    """
     logarithms = vector.mask("stiffness", "damping", "armature", "sizes", "effects").double()
     derivatives = vector.unflatten(logarithms)
     derivatives[vector.bodies][:, -1] = 1.0  # the last parameter of a body is the logarithm of its mass

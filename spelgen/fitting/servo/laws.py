@@ -50,7 +50,7 @@ def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> Servo
 
 
 def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, Tensor]:
-    """Minimize the cost of each joint over its own parameters; return the parameters and the costs, (n,).
+    """Minimize the cost of each joint over its own parameters from x; return the parameters and the costs, (n,).
 
     The method is Levenberg-Marquardt. Each joint has its own damping and termination, since a joint with a poor initial
     guess would slow down all others otherwise. The rollouts of all joints form one batch.
@@ -82,11 +82,12 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
 
 
 def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
-    """Return the parameters with a dead zone at every joint, and with all parameters marked as fitted (`active`).
+    """Return parameters x with a dead zone at every joint, as the initial guess of a fit of dead zones.
 
-    The static position error is (dry friction) / kp + half the dead zone. Half the dead zone is set to ``fraction``
-    times (dry friction) / kp, and Coulomb friction is reduced by the same fraction. The static error then remains about
-    the same, or exactly the same if Coulomb friction is the only dry friction.
+    All parameters are marked as fitted (`active`). The static position error is (dry friction) / kp + half the dead
+    zone. Half the dead zone is set to ``fraction`` times (dry friction) / kp, and Coulomb friction is reduced by the
+    same fraction. The static error then remains about the same, or exactly the same if Coulomb friction is the only dry
+    friction.
     """
     rollouts, row, joints = problem.rollouts, problem.parameters.row, x.joints.clone()
     model = rollouts.model
@@ -100,7 +101,9 @@ def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) 
 
 
 def sliding_friction(friction: FrictionLaws, qd: Tensor, gravity: Tensor) -> Tensor:
-    """Return the magnitude of each joint's dry friction, (n,) [Nm, N], averaged with the weight |qd|.
+    """Return the magnitude of each joint's dry friction in motion, (n,) [Nm, N].
+
+    The magnitude is a mean over samples, weighted by |qd|.
 
     Args:
         friction: friction model.

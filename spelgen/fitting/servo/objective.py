@@ -53,7 +53,7 @@ class ServoObjective(Objective):
 
     def __init__(self, request: FitRequest) -> None:
         super().__init__(request)
-        self._iterates: list[ServoParameters] = []  # parameters at the start of each outer iteration
+        self._iterates: list[ServoParameters] = []  # fitted parameters at the start of each outer iteration
         self._steps = 0
 
     def prepare(self) -> PreparedLogs:
@@ -82,7 +82,7 @@ class ServoObjective(Objective):
         return []
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Resume at the start of the outer iteration that was interrupted."""
+        """Resume an interrupted fit at the start of the outer iteration in which it was interrupted."""
         self._since = time.monotonic() - checkpoint["seconds"]
         state = checkpoint["servo"]
         self.model.load_state_dict(state["start"])

@@ -39,7 +39,7 @@ class ServoParameters:
     active: Tensor
 
     def after(self, step: Tensor) -> ServoParameters:
-        """Return the k parameters after a step (k,); the delay remains at least zero."""
+        """Return the k parameters of a servo fit after a step (k,); the delay remains at least zero."""
         joints, bodies, delay = step.split([self.joints.numel(), len(self.bodies), 1])
         return replace(
             self,
@@ -50,7 +50,7 @@ class ServoParameters:
 
     @property
     def flat(self) -> Tensor:
-        """All k parameters as one vector, (k,)."""
+        """All k parameters of a servo fit as one vector, (k,): joints, bodies, delay."""
         delay = torch.tensor([self.delay], dtype=torch.float64)
         return torch.cat([self.joints.flatten(), self.bodies, delay])
 
@@ -113,7 +113,7 @@ class ParameterMap:
         return named
 
     def write(self, x: ServoParameters) -> None:
-        """Set the parameters of the model to x."""
+        """Set the parameters of the model to the values of `ServoParameters` x."""
         with torch.no_grad():
             for name, rows in self.named(x.joints.unsqueeze(0)).items():
                 self.tensors[name].copy_(rows[0, 0])

@@ -107,11 +107,11 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _stiffness(self) -> Propagated:
-        """kp of all servos, (n,) [Nm/rad, N/m], with a square root of its covariance."""
+        """kp of all servos, (n,) [Nm/rad, N/m], with a square root (n, k) of their covariance."""
         return self.propagate(lambda model: model.servo.kp())
 
     def _ratios(self, joint: int) -> Propagated:
-        """Return the r base parameters / kp of a joint, (r,), with a square root of the covariance of these ratios."""
+        """Return the r base parameters / kp of a joint, (r,), with a square root (r, k) of their covariance."""
         values, (kp, kp_root) = self._base_values, self._stiffness
         ratio = values.value / kp[joint]
         return Propagated(ratio, (values.root - ratio.outer(kp_root[joint])) / kp[joint])

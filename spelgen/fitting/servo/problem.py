@@ -107,7 +107,7 @@ class ServoProblem:
         return self.rollouts.parameters
 
     def residual(self, x: ServoParameters) -> Tensor:
-        """Return predicted minus measured positions after the burn-in, (W, K', n) [rad, m]."""
+        """Return predicted minus measured positions after the burn-in for parameters x, (W, K', n) [rad, m]."""
         return self.rollouts.residual(x)
 
     def joint_costs(self, x: ServoParameters, errors: Tensor) -> Tensor:

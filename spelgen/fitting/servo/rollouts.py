@@ -55,7 +55,7 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Return the rollouts whose load is computed for parameters x along ``motion``; set the model to x."""
+        """Return the rollouts for the load of the bodies with parameters x along ``motion``; set the model to x."""
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
         return replace(self, motion=motion, load=load, inertial=inertial)

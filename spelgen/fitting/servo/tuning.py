@@ -23,7 +23,7 @@ class ServoTuning:
     # [1] Number of samples for which the load of the bodies is computed at once; it limits the memory.
     batch: int = 2**13
 
-    # Standard deviations of the Gaussian prior, about the initial parameters (`servo.parameters`).
+    # Constants of the Gaussian prior about the initial parameters (`servo.parameters`).
 
     # [1] Prior standard deviation of the logarithms of a joint's gains, armature and friction; exp(2) is a factor of
     # seven.

@@ -59,7 +59,7 @@ class ServoWindows:
 
     @property
     def rate(self) -> float:
-        """Mean sample rate [Hz]."""
+        """Mean sample rate of the windows [Hz]."""
         return float(1 / self.dt.mean())
 
     def subsampled(self, count: int) -> ServoWindows:
@@ -84,7 +84,7 @@ class ServoWindows:
         return torch.from_numpy(np.unique(blocks, return_inverse=True)[1])
 
     def motion(self, q: Tensor | None = None, qd: Tensor | None = None) -> MidpointMotion:
-        """Return measured positions, velocities and accelerations at the midpoints between samples.
+        """Return measured positions, velocities and accelerations at the K-1 midpoints between samples.
 
         Without arguments, velocities and accelerations are smoothed derivatives of the measured positions. With a
         predicted motion q, qd (W, K, n), they are the derivatives of the predicted motion plus smoothed derivatives of

@@ -87,7 +87,7 @@ class TorqueJacobian:
         inputs = model.inputs
         self._gain_rows = inputs.gain_rows if isinstance(inputs, MotorInputs) else torch.zeros(0).long()
         self._motors = motors_of(model)
-        self._affects = self._motors != 0  # (n, n), entry (i, j): True if drive i acts on joint j
+        self._affects = self._motors != 0  # _affects: (n, n), entry (i, j): True if drive i acts on joint j
         self._affected = self._affected_joints()
         self._colours = _colour(self._affects.double().mT @ self._affects.double() > 0)
         # Regressors do not depend on x, so they are computed once. The samples are divided into blocks to limit the

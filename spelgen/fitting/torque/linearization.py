@@ -52,7 +52,7 @@ class LinearTerms:
         return ridge
 
     def weights(self, torque: torch.Tensor) -> torch.Tensor:
-        """Return the weights (P, ...) for a torque residual (T, ...) [Nm, N]."""
+        """Return the weights (P, ...) of the linear terms, the ridge solution for a torque residual (T, ...)."""
         return self.ridge @ torque
 
     def residual(self, torque: torch.Tensor) -> torch.Tensor:
@@ -151,7 +151,8 @@ def least_squares_residual(
     """
     curvature, descent = normal_equations(rows, noise, len(free))
     inverse = torch.zeros_like(curvature)
-    # The pseudo-inverse is used, since there is no prior here and some inertial parameters affect no torque.
+    # The pseudo-inverse is used, since unconstrained least squares has no prior and some inertial parameters affect no
+    # torque.
     inverse[free[:, None] & free] = _pseudo_inverse(curvature[free][:, free]).flatten()
     step = inverse @ descent
     squared_residual, gamma = torch.zeros(2, len(noise)).double()

@@ -72,7 +72,10 @@ class TorqueObjective(Objective):
         return self.data
 
     def begin(self) -> list[Diagnostic]:
-        """Fit the model and validate it; return diagnostics. Raises LogError if no log is sampled densely enough."""
+        """Fit the model and validate it; return diagnostics.
+
+        Raises LogError if no log is sampled densely enough for accelerations.
+        """
         model = self.model
         notes = [*self._coupling_notes, *self._delay.notes]
         samples = torque_samples(model, self.data)

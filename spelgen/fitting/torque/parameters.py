@@ -51,7 +51,8 @@ class ParameterVector:
     def __init__(self, model: ArmModel) -> None:
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         self.groups: dict[str, str] = {}
-        self._tensors: dict[str, torch.Tensor] = {}  # parameters and buffers that a fit may change
+        # the model's parameters and buffers that a fit may change
+        self._tensors: dict[str, torch.Tensor] = {}
         self.initial: dict[str, torch.Tensor] = {}
         for name, info in parameter_table(model).items():
             if info.kind in (*RIGID_GROUPS, *SERVO_GROUPS):
@@ -209,7 +210,7 @@ def upper_cholesky(matrix: torch.Tensor) -> torch.Tensor:
 
 
 def log_cholesky_parameters(factor: torch.Tensor) -> torch.Tensor:
-    """Return the log-Cholesky parameters (B, 10) whose upper triangular matrices are `factor` (B, 4, 4).
+    """Return the log-Cholesky parameters (B, 10) of B bodies from the upper triangular factors (B, 4, 4) of the bodies.
 
     This function is the inverse of `body_factor`.
     """
@@ -268,7 +269,7 @@ class ParameterPrior:
 
     @cached_property
     def precision(self) -> torch.Tensor:
-        """Inverse of the prior covariance, (K, K)."""
+        """Inverse of the prior covariance of the K parameters, (K, K)."""
         covariance = prior_covariance(self.widths, self.rigid.initial, self.rigid.groups)
         bodies = self.rigid.mask("bodies")
         covariance[bodies, bodies] = self.body_widths.square().repeat_interleave(10)
@@ -338,7 +339,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 
     mask = prior.rigid.mask("bodies")
-    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # one sum per body, (B,)
+    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), sum per body
     gamma = 10 - covariance.diagonal()[mask].view(-1, 10).sum(dim=1) / prior.body_widths.square()
     relative = (current["bodies"] / prior.body_widths).square()
     updated = {"bodies": float(width((relative * squares).sum(), gamma.sum(), "bodies", initial["bodies"]))}

@@ -86,7 +86,7 @@ def select_functions(
     recordings: torch.Tensor,
     torque_std: torch.Tensor,
 ) -> list[SelectedTerm]:
-    """Return the selected terms: at most one per joint, the best accepted candidate.
+    """Select single-joint residual terms by cross-validation: at most one per joint, the best accepted candidate.
 
     Args:
         model: model with residual terms.
@@ -142,7 +142,7 @@ def _best(
     Args:
         candidates: residual terms of one joint.
         torque_residual: (T, n) [Nm, N].
-        noise: (n,) [Nm, N].
+        noise: (n,) standard deviations of the torque noise [Nm, N].
         correlation_length: number of samples per independent error.
         recordings: (T,), index of the recording of each sample.
         limits: result of `max_torques` for one or two recordings; None: no bounds.

@@ -201,8 +201,8 @@ def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> tor
     Each likelihood is computed with the noise that maximizes it. Positive values favour `estimate`.
     """
     samples = estimate.problem.jacobian.samples
-    # With the noise that maximizes each likelihood, the ratio depends only on the squared residuals and on the number
-    # of independent errors.
+    # With the noise that maximizes each likelihood, the likelihood ratio depends only on the squared residuals and on
+    # the number of independent errors.
     errors = samples.count * min(1.0, samples.interval / TUNING.reversal_correlation_time)
     return errors * (other.state.residual / estimate.state.residual).log()
 
