@@ -31,10 +31,11 @@ def roll_out_stiff(
     Sample 0 of a window is the initial state; samples 1 to K-1 are predicted. If a prediction diverges, its later
     states are NaN.
 
-    Method: ROS2, a Rosenbrock method. It has order two for any approximation of the Jacobian, and is L-stable with the
-    exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the approximation is
-    the Jacobian of friction only. Damping and bristles of any stiffness (light links with dry friction) then need no
-    smaller steps, and the error of an explicit method is not confused with an error of the dynamics.
+    Method: ROS2, a Rosenbrock method. This method has order two for any approximation of the Jacobian, and is L-stable
+    with the exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the
+    approximation is the Jacobian of friction only. Damping and bristles of any stiffness (light links with dry
+    friction) then need no smaller steps, and the error of an explicit method is not confused with an error of the
+    dynamics.
 
     Args:
         dynamics: dynamics of the arm, see `equations_of`.
@@ -130,8 +131,8 @@ def _friction_slopes(
 ) -> tuple[Tensor, Tensor]:
     """Return the derivatives of friction with respect to velocity (D) and, through the bristles, to position (K).
 
-    Both are diagonals of matrices of W windows, (W, n) [Nm s/rad, N s/m; Nm/rad, N/m]: the friction of a joint depends
-    only on the joint's motion. width: (n,) finite-difference steps of velocity [rad/s, m/s].
+    D and K are diagonals of matrices of W windows, (W, n) [Nm s/rad, N s/m; Nm/rad, N/m]: the friction of a joint
+    depends only on the joint's motion. width: (n,) finite-difference steps of velocity [rad/s, m/s].
     """
     # Central differences are used, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
@@ -181,7 +182,7 @@ States = tuple[Tensor, Tensor]
 class Solver:
     """Integrator of predicted motion by the Rosenbrock method (`roll_out_stiff`).
 
-    It takes the fewest integrator steps per sample interval that are accurate in the `probe` windows.
+    The integrator takes the fewest steps per sample interval that are accurate in the `probe` windows.
     """
 
     dynamics: RigidDynamics

@@ -55,7 +55,7 @@ def constant_velocity(arm: EvaluatedArm) -> list[Predictor]:
 def hold_velocity(windows: Windows) -> States:
     """Return q [rad, m] and qd [rad/s, m/s] of W windows of K samples for constant velocity from sample 0.
 
-    Both are (W, K-1, n), at samples 1 to K-1.
+    q and qd are (W, K-1, n), at samples 1 to K-1.
     """
     elapsed = windows.dt.cumsum(dim=1).unsqueeze(-1)  # elapsed: time since sample 0, (W, K-1, 1) [s]
     qd = windows.qd[:, :1]

@@ -100,8 +100,8 @@ class Job(Group):
         """
         protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
         options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
-        # The hash contains the content of the design and not its name, since a YAML file may have changed. It contains
-        # the version of spelgen, since versions may give different results.
+        # The hash contains the content of the design and not its name, since a YAML file may have changed. The hash
+        # contains the version of spelgen, since versions may give different results.
         sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
         return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
 

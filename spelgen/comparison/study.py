@@ -53,7 +53,8 @@ class Study:
             text += f", {len(self.results)} finished before"
         if not self.estimates:
             return text
-        # The estimated time assumes that all workers are equally loaded. It is at least the time of the longest run.
+        # The estimated time assumes that all workers are equally loaded. The estimate is at least the time of the
+        # longest run.
         seconds = max(sum(self.estimates.values()) / parallel, *self.estimates.values(), 0.0)
         return f"{text}; estimated time {duration(seconds)}"
 

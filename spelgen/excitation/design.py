@@ -45,9 +45,9 @@ def excite(
 ) -> Excitation:
     """Return an exciting motion, which starts and ends at rest; the same arguments give the same motion.
 
-    The motion keeps the limits of position and velocity, also of <mimic> joints. It keeps effort limits, too, if the
-    URDF has effort limits and inertials and the optimizer finds such a motion. If the URDF has collision geometry and
-    Pinocchio is installed, motion and approach keep a clearance between links, and to the surroundings.
+    The motion keeps the limits of position and velocity, also of <mimic> joints. The motion keeps effort limits, too,
+    if the URDF has effort limits and inertials and the optimizer finds such a motion. If the URDF has collision
+    geometry and Pinocchio is installed, motion and approach keep a clearance between links, and to the surroundings.
 
     Args:
         arm: configured arm.
@@ -178,7 +178,7 @@ def _collisions(
 def _start(
     start: Sequence[float] | None, arm: Chain, limits: MotionBounds, collisions: Collisions | None
 ) -> np.ndarray:
-    """Return the position from which the approach starts, (n,) [rad, m].
+    """Return the position at which the approach to the exciting motion starts, (n,) [rad, m].
 
     Raises SettingsError for an invalid position, and ArmError for a position with a contact.
     """

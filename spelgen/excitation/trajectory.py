@@ -107,9 +107,9 @@ class ExcitationTrajectory:
     def states(self, parameters: Tensor, t: Tensor) -> Tensor:
         """Return q, qd and qdd, (3, T, n), for parameters (size,) at times t (T,) [s].
 
-        The motion keeps its bounds at all times. They are enforced at grid points with a safety factor: the maximum of
-        a series of H harmonics is at most 1 / cos(pi / N) times its maximum on a grid with N points per period of the
-        highest harmonic (Ehlich and Zeller, Math. Z. 86:41, 1964).
+        The motion keeps its bounds at all times. The bounds are enforced at grid points with a safety factor: the
+        maximum of a series of H harmonics is at most 1 / cos(pi / N) times its maximum on a grid with N points per
+        period of the highest harmonic (Ehlich and Zeller, Math. Z. 86:41, 1964).
         """
         coefficients, offsets = self._coefficients(parameters)
         points = torch.linspace(0.0, self.duration, TUNING.grid * self.harmonics + 1, dtype=torch.float64)
@@ -138,7 +138,7 @@ class ExcitationTrajectory:
         return parameters.reshape(self.joints, -1)[:, -1].square() / 4
 
     def _coefficients(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the sine and cosine coefficients (2, H, n) and the offset parameters (n,) for parameters (size,)."""
+        """Return sine and cosine coefficients (2, H, n) and offset parameters (n,) for parameters (size,)."""
         rows = parameters.reshape(self.joints, 2 * self.harmonics + 2)
         sines_cosines = rows[:, :-2].reshape(self.joints, 2, self.harmonics).permute(1, 2, 0)
         k = self._numbers()

@@ -35,8 +35,8 @@ class ExcitationTuning:
     # [1] A pair of links is not compared if it is too close at this fraction of the random `positions` or more, as in
     # MoveIt's setup assistant.
     overlap: float = 0.95
-    # [1] Distance below which the criterion has a penalty, divided by the clearance. It is greater than one, because
-    # the penalty is computed only at samples, between which distances may be smaller.
+    # [1] Distance below which the criterion has a penalty, divided by the clearance. The number is greater than one,
+    # because the penalty is computed only at samples, between which distances may be smaller.
     margin: float = 2.0
     # [1] Weight of the penalty on distances in the criterion. Weights of 10, 1 and 0.1 give condition numbers of 368,
     # 34 and 18 for a Panda with 36 shapes, all without a contact.

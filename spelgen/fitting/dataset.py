@@ -148,7 +148,7 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
     return TrainingData(
         training=training,
         validation=validation,
-        # The scales are computed from the training windows only, since validation logs must not change the loss
+        # The loss scales are computed from the training windows only, since validation logs must not change the loss
         # function.
         scales=loss_scales(training, model.joint_types),
         preprocessing=resolved,

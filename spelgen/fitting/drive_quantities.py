@@ -67,8 +67,8 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
 
     The coefficients are the slope and the intercept of a straight line through the friction torque at speeds up to the
     typical speed, fitted by least squares. The friction torque is averaged over random positions. The gravity load and
-    the factor of the residual terms at these positions are computed only once, from the argument ``model``: they are
-    also used for models with other friction parameters.
+    the factor of the residual terms at these positions are computed only once, from the argument ``model``: the same
+    load and factor are also used for models with other friction parameters.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
     deviations = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
@@ -77,8 +77,8 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
         # The load of each drive is the gravity torque in the drive's coordinates, at P = 32 random positions, (P, n).
         load = model.gravity(q) @ torch.linalg.inv(motors_of(model))
         factor = friction_factor(model, q)
-    # The speeds are in units of the typical speed. They are dense at low speeds, where the Stribeck effect determines
-    # the intercept of the line.
+    # The speeds are in units of the typical speed. The speeds are dense at low speeds, where the Stribeck effect
+    # determines the intercept of the line.
     speeds = np.geomspace(0.02, 1.0, 25)
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 

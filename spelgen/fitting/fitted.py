@@ -227,7 +227,7 @@ class Fit:
         None if unknown.
         """
         like = next(self.model.parameters())
-        # Filters return views with negative strides. They are copied, since torch does not accept them.
+        # Filters return views with negative strides. The views are copied, since torch does not accept them.
         inputs = [torch.as_tensor(np.ascontiguousarray(x)).to(like) for x in motion if x is not None]
         with torch.no_grad():
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()

@@ -1,8 +1,8 @@
 """Optimizers of window losses: AdamW on batches, or L-BFGS on all windows at once if there are few.
 
-The gradient of a few hundred windows takes no longer than the gradient of a batch. It has no sampling noise, so L-BFGS
-can estimate the curvature and converges to many digits. This matters for short logs and for simulated logs without
-noise.
+The gradient of a few hundred windows takes no longer than the gradient of a batch. The gradient of all windows has no
+sampling noise, so L-BFGS can estimate the curvature and converges to many digits. Accuracy to many digits matters for
+short logs and for simulated logs without noise.
 """
 
 import inspect

@@ -153,7 +153,7 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
 
 
 def _scale(mean_square: Tensor) -> Tensor:
-    """Return the square roots of mean squares (..., n), each at least 1 % of the largest root of the n joints."""
+    """Return the loss scales for mean squares (..., n) of n joints: square roots, at least 1 % of the largest root."""
     root = mean_square.sqrt()
     # The bound 1e-9 keeps the scale positive even if nothing varies, since errors are divided by the scale.
     smallest = (1e-2 * root.amax(dim=-1, keepdim=True)).clamp(min=1e-9)
@@ -187,10 +187,10 @@ def rollout_loss(
 def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tensor:
     """Return the mean squared residual of the weak form of the equations of motion, a dimensionless scalar.
 
-    The residual is p(t) - p(0), with the momentum p = M(q) qd, minus the impulse of all forces from 0 to t. It is
-    divided by t, which gives a mean torque, and by the standard deviation of the joint's torque. The impulse is the
-    trapezium sum along the measured samples: neither an ODE solver nor accelerations are needed. The velocity error
-    M(q)^-1 times the residual is not used, since it would favour an M that is too large.
+    The residual is p(t) - p(0), with the momentum p = M(q) qd, minus the impulse of all forces from 0 to t. The
+    residual is divided by t, which gives a mean torque, and by the standard deviation of the joint's torque. The
+    impulse is the trapezium sum along the measured samples: neither an ODE solver nor accelerations are needed. The
+    velocity error M(q)^-1 times the residual is not used, since it would favour an M that is too large.
 
     Args:
         model: model with the momentum M(q) qd.
@@ -245,8 +245,8 @@ def integration_error(coarse: Tensor, fine: Tensor) -> float:
 def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
     """Return a number of rk4 steps per sample interval that makes the integration error small.
 
-    It is the first of start, 2 start, 4 start, ... with an `integration_error` below `TUNING.integration_fraction`. The
-    search ends at `TUNING.max_substeps` even if the error is larger.
+    The number is the first of start, 2 start, 4 start, ... with an `integration_error` below
+    `TUNING.integration_fraction`. The search ends at `TUNING.max_substeps` even if the error is larger.
     """
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.max_substeps:

@@ -68,7 +68,7 @@ class FittingTuning:
     # [1] Largest accepted integration error of a rollout, as a fraction of the model's prediction error.
     integration_fraction: float = 0.03
     # [1] The integration error is compared with the model's prediction error or with this value, whichever is larger;
-    # both are errors divided by the scales of the loss.
+    # both numbers are errors divided by the scales of the loss.
     min_model_error: float = 1e-2
 
     # Constants of rollouts by the adaptive solver dopri5 (`fitting.rollout`).

@@ -104,7 +104,7 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # The step is an estimate of the integration error. It is added to the covariance as an error of one standard
+    # The step is an estimate of the integration error. The step is added to the covariance as an error of one standard
     # deviation.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
@@ -248,7 +248,8 @@ def servo_summary(record: Content | None) -> FitSummary | None:
                 cells.append(f"{number(interval['value'])} +- {width:.2g} %")
             else:
                 cells.append("open")
-                # The dead zone is not named, since dry friction of the same joint is then undetermined and named.
+                # The dead zone is not in the list of undetermined ratios, since dry friction of the same joint is then
+                # undetermined and in the list.
                 if column != "dead_zone":
                     undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))

@@ -47,7 +47,7 @@ class ServoRollouts:
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
-        """Return the rollouts whose load is computed along the measured motion with the model's present parameters."""
+        """Return the rollouts for the load of the model's bodies, with current parameters, along measured motion."""
         q = windows.q.flatten(0, 1)
         parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()

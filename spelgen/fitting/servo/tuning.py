@@ -43,16 +43,16 @@ class ServoTuning:
     body_directions: int = 6
     # [1] Smallest effect of a fitted direction of the body parameters on gravity, relative to the largest effect.
     min_effect: float = 1e-3
-    # [1] Prior standard deviation of a parameter that is not fitted. It is practically zero, so the parameter is
-    # constant.
+    # [1] Prior standard deviation of a parameter that is not fitted. The deviation is practically zero, so the
+    # parameter is constant.
     fixed: float = 1e-9
 
     # Constants of the cost of a fit and of its derivatives (`servo.problem`, `servo.rollouts`).
 
     # [s] Largest correlation time of the position errors; most measured correlation times are above 0.2 s.
     correlation_time: float = 0.5
-    # [1] Finite-difference step of the parameters. It must be far above the rounding errors of rollouts, which lose
-    # about half the digits of double precision.
+    # [1] Finite-difference step of the parameters. The step must be far above the rounding errors of rollouts, which
+    # lose about half the digits of double precision.
     difference_step: float = 1e-4
     # [1] Largest change of any parameter in a solver step; most parameters are logarithms, for which 1 is a factor of
     # e.
@@ -104,7 +104,8 @@ class ServoTuning:
     # is below 30 or above 90.
     variance_inflation: float = 50.0
     # [1] Standard deviation of the logarithms of the ratios to kp that is due to errors of the friction model, measured
-    # by `benchmarks/servo_recovery.py`. It is added to the standard deviation of the fit (root of the sum of squares).
+    # by `benchmarks/servo_recovery.py`. This deviation is added to the standard deviation of the fit (root of the sum
+    # of squares).
     model_deviation: float = 0.015
     # [1] Largest ratio between the upper end of an interval and the value; with a wider interval, the value counts as
     # not determined.

@@ -46,8 +46,8 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
     The posterior covariance assumes that the correlation times are right, and that errors have the same distribution in
     all motions. The jackknife over contiguous blocks of samples does not need these assumptions, but has few blocks. In
     every direction of the parameter space, the result is the larger one of the posterior and the jackknife covariance.
-    It is scaled such that 1.96 standard deviations are half the 95 % interval of Student's t with (number of blocks -
-    1) degrees of freedom.
+    The covariance is scaled such that 1.96 standard deviations are half the 95 % interval of Student's t with (number
+    of blocks - 1) degrees of freedom.
 
     For 47 arms of `benchmarks/truth.py`, the 95 % intervals contain 97 % of the base parameters and 95 % of g(q). The
     intervals of the posterior covariance contain only 93 % and 89 %.

@@ -177,9 +177,9 @@ def _not_behind_regression(
 ) -> tuple[_StagedFit, RegressionComparison]:
     """Return ``fitted``, or a second fit if ridge regression predicts held-out torques significantly better.
 
-    The second fit has the result of the regression as its initial guess. It is returned only if its held-out error is
-    below the error of ``fitted``. The parameters of the returned fit are written to the model. initial: state_dict of
-    the model before the fit.
+    The second fit has the result of the regression as its initial guess. The second fit is returned only if its
+    held-out error is below the error of ``fitted``. The parameters of the returned fit are written to the model.
+    initial: state_dict of the model before the fit.
     """
     blocks = contiguous_blocks(samples)
     regression = best_regression(model, blocks, joint_torque(model, samples.columns).std(dim=0).numpy())

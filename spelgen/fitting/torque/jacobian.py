@@ -116,7 +116,7 @@ class TorqueJacobian:
         return squared_residual
 
     def logged_scale(self, x: torch.Tensor) -> torch.Tensor:
-        """Return initial gain / current gain per joint, (n,) [1]; 1 for fixed gains.
+        """Return initial / current motor gain per joint, (n,) [1]; 1 for fixed gains.
 
         The measured joint torque is proportional to the current gain. Multiplied by this factor, the measured joint
         torque no longer depends on the current gain.
@@ -124,7 +124,7 @@ class TorqueJacobian:
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 
     def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
-        """Return initial gain / current gain per joint, (..., n) [1]: `logged_scale` with derivatives by autograd.
+        """Return initial / current motor gain per joint, (..., n) [1]: `logged_scale` with derivatives by autograd.
 
         parameters: one set of parameters by name, or a batch (...) of sets.
         """

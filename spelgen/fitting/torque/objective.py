@@ -47,7 +47,7 @@ FITTED = {
 class TorqueObjective(Objective):
     """Objective of a fit to torques.
 
-    `begin` runs the whole fit. It takes seconds to minutes, so no checkpoints are written during the fit.
+    `begin` runs the whole fit. A fit takes seconds to minutes, so no checkpoints are written during the fit.
     """
 
     name: ClassVar[str] = "torque"
@@ -95,7 +95,7 @@ class TorqueObjective(Objective):
         fit_notes, solution = fit_torques(model, samples, self.config, regularizer)
         self.results = {"notes": [note.message for note in fit_notes]}
         notes += fit_notes
-        # Residual terms that were not selected are zero. They are removed from the validated model to save time.
+        # Residual terms that were not selected are zero. These terms are removed from the validated model to save time.
         subset = replace(self.data, validation=thinned(self.data.validation, TUNING.validation_windows))
         validation = Validation(without_idle_residuals(model), subset, self.request.options.device)
         substeps = validation.substeps()

@@ -179,7 +179,8 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
 
     The pseudo-inertia of a body is C S C^T with a constant matrix C and S = T T^T, where T is the upper triangular
     matrix `body_factor(raw)`. Let X be the first-order change of T by the step. The first-order change of S is then T
-    (T^-1 X + (T^-1 X)^T) T^T. It is added to S, or only a fraction of it, so that S remains positive definite.
+    (T^-1 X + (T^-1 X)^T) T^T. This change of S is added to S, or only a fraction of the change, so that S remains
+    positive definite.
 
     Args:
         raw: (B, 10) log-Cholesky parameters of B bodies.

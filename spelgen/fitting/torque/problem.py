@@ -92,7 +92,7 @@ class NoiseEstimator:
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
         """Return the noise (n,) [Nm, N] for an iteration of noise annealing.
 
-        It is `annealing_fraction` times the noise that is estimated from the residual.
+        This noise is `annealing_fraction` times the noise that is estimated from the residual.
 
         squared_residual: (n,) sum over all samples [Nm^2, N^2].
         """

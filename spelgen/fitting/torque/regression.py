@@ -68,7 +68,7 @@ def _regression(
     def products(x: SampleBlock) -> np.ndarray:
         """Return the Gram matrix (K + 1, K + 1) of the K columns of the regressor and the torque.
 
-        Both are first divided by `torque_std` per joint.
+        Columns and torque are first divided by `torque_std` per joint.
         """
         rows = np.concatenate([columns(x), joint_torque(model, x).numpy()[..., None]], axis=2)
         rows = (rows / torque_std[:, None]).reshape(-1, rows.shape[2])

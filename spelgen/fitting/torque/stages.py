@@ -258,8 +258,8 @@ def fit_residual_terms(
         estimate = _refit(estimate, samples, selected).with_current_covariance()
     residual_samples = estimate.problem.jacobian.residual_samples(estimate.state.x)
     selected += select_networks(model, residual_samples, float(correlation_length.max()))
-    # Friction factors and networks are not eliminated by variable projection. Their fits and the rigid-body fit are
-    # therefore alternated.
+    # Friction factors and networks are not eliminated by variable projection. The fits of these terms and the
+    # rigid-body fit are therefore alternated.
     for _ in range(TUNING.alternations if selected else 0):
         estimate = _refit(estimate.with_current_covariance(), samples, selected)
     return estimate, selected
