@@ -136,8 +136,9 @@ def _friction_slopes(
     """
     # Central differences are used, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
-    # Negative damping (friction that decreases with velocity) is omitted from D, so that the matrix M + h D + h^2 K
-    # remains positive definite. The method then treats this part of friction explicitly.
+    # Negative damping (friction that decreases with velocity) is omitted from the friction derivative D, so that the
+    # matrix M + h D + h^2 K of a Rosenbrock step remains positive definite. The method then treats this part of
+    # friction explicitly.
     damping = slope.clamp(min=0)
     if not z.shape[-1]:
         return damping, torch.zeros_like(damping)

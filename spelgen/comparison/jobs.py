@@ -116,7 +116,7 @@ class Job(Group):
         return build(arm, self.named_design, width=self.width, depth=self.depth, seed=self.seed)
 
     def result(self) -> RunResult | None:
-        """Return the stored result if its key is the key of this run, else None. Raises RunError."""
+        """Return the stored result if it has the key of this run, a hash of all inputs, else None. Raises RunError."""
         path = self.folder / "result.json"
         if not path.is_file():
             return None

@@ -198,7 +198,8 @@ class Validation:
         # Validation batches are four times as large as training batches: no derivatives are computed, which saves
         # memory.
         self.batches = data.validation.to(device).split(4 * batch)
-        # The windows are evenly spread, so that the probe contains fast and slow motion.
+        # The windows of the probe, on which the number of integration steps is chosen, are evenly spread over the
+        # training windows: they contain fast and slow motion.
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)
 
     def loss(self, substeps: int) -> float:

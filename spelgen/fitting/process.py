@@ -118,7 +118,8 @@ class TrainingProgress:
         columns = ("{task.description}", BarColumn(12), MofNCompleteColumn(), TimeRemainingColumn())
         self._bar = Progress(*columns, "{task.fields[state]}", console=self._console)
         self._task = self._bar.add_task("training", total=None, visible=False, state="")
-        self._line = ""  # text of the current stage, printed at the end of the stage if there is no terminal
+        # text about the progress of the current stage, printed at the end of the stage if there is no terminal
+        self._line = ""
 
     def __enter__(self) -> TrainingProgress:
         if self._show and self._console.is_terminal:

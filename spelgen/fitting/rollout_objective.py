@@ -119,7 +119,7 @@ class RolloutObjective(MomentumObjective):
             # `state` is the state of the fit before the epoch: a diverged epoch is repeated from it.
             state = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             steps, start = self._steps_in_time(), self.seconds_now()
-            # the mean loss is NaN if the loss or the gradient of any step is not finite
+            # The mean loss of an epoch is NaN if the loss or the gradient of any step is not finite.
             loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
             trained = self.seconds_now()
             self.step, self._step_seconds = self.step + steps, (trained - start) / steps

@@ -31,7 +31,7 @@ class SimulationTuning:
 
     # [s] Largest integrator step of an arm under position servos.
     servo_step: float = 1e-3
-    # [1] Gauss-Seidel iterations over the joints for the impulses of dry friction.
+    # [1] Number of Gauss-Seidel iterations over the joints for the impulses of dry friction.
     friction_sweeps: int = 4
     # [1] Counts of an encoder per revolution: 12 bits.
     encoder_counts: int = 4096

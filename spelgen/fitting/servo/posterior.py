@@ -99,7 +99,7 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _scale_index(self) -> int | None:
-        """Index of the joint `scale_joint`; None if a kp is known."""
+        """Index of the joint whose kp divides the base parameters (`scale_joint`); None if a kp is known."""
         if not self.model.servo.trained.all():
             return None
         ratios = map(self._ratios, range(self.model.n))

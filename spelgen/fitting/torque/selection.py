@@ -244,7 +244,7 @@ def block_squares(values: torch.Tensor) -> torch.Tensor:
 def significant_reduction(
     before: torch.Tensor, after: torch.Tensor, standard_errors: float = SELECTION.standard_errors
 ) -> float | None:
-    """Return the relative reduction of squared errors, or None if it is not significant.
+    """Return the relative reduction of squared errors by a residual term, or None if it is not significant.
 
     A t test is applied to g = (before - after) / (before + after) of all blocks. g is between -1 and 1, so that no
     single block dominates the variance, for example one with large torques or with extrapolation. A negligible number
@@ -256,7 +256,8 @@ def significant_reduction(
         standard_errors: value of t that the mean of g over the blocks must exceed.
     """
     negligible = 2 * SELECTION.min_reduction * before.mean()
-    # If a term halves the squared error of one block and doubles the squared error of another, their g add up to zero.
+    # If a term halves the squared error of one block and doubles the squared error of another, the relative reductions
+    # g of these blocks add up to zero.
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:
