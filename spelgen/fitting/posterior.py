@@ -268,7 +268,10 @@ class Posterior:
         return Propagated(*(self._base[1] @ factor for factor in self._constants))
 
     def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
-        """Return the quantities of the drives, and the function that returns their values (quantities, n)."""
+        """Return the constants of the drives that have intervals, and the function that returns their values.
+
+        The function returns one row per constant for a model, (constants, n).
+        """
         return torque_drive_quantities(self.model)
 
     def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:

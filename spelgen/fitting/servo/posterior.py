@@ -47,7 +47,7 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def base_parameters(self) -> tuple[Interval, ...]:
-        """95 % intervals of the base parameters, or of their ratios to kp of `scale_joint`."""
+        """95 % intervals of the base parameters or, if no kp is known, of their ratios to kp of `scale_joint`."""
         if self._scale_index is None:
             return super().base_parameters
         values, roots = self._ratios(self._scale_index)
@@ -80,7 +80,10 @@ class ServoPosterior(Posterior):
         return (*super().unidentifiable, *pairs, *common)
 
     def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
-        """Return the quantities of the servos, and the function that returns their values, (8, n)."""
+        """Return the quantities of the servos that have intervals, and the function that returns their values.
+
+        The quantities are the keys of `SERVO_UNITS`. The function returns (8, n) for a model.
+        """
         line, joints = friction_line(self.model), tuple(range(self.model.n))
         quantities = [
             DriveQuantity(name, unit, name != "offset/kp", joints) for name, unit in SERVO_UNITS.items()
