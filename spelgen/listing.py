@@ -133,7 +133,7 @@ def number(value: float | None) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a time such as `40 s`, `2.5 min` or `3.5 h`."""
+    """Return a duration, given in seconds, as text such as `40 s`, `2.5 min` or `3.5 h`."""
     # Times have at most three digits: durations of repeated trainings differ by more than the rounding.
     if seconds < 100:
         return f"{seconds:.0f} s"

@@ -51,7 +51,8 @@ class Coordinate(NamedTuple):
         revolution, or 1 m, about zero.
         """
         is_revolute, limits = self.joint_type == "revolute", self.limits
-        # Huge or equal limits are not usable: exporters write +-1e16, or equal limits, for a joint without limits.
+        # Huge or equal limits are not usable as a range: exporters write +-1e16, or equal limits, for a joint without
+        # limits.
         if limits is None or not 0 < limits[1] - limits[0] < 1e3:
             half_range = pi if is_revolute else 0.5
             return -half_range, half_range

@@ -144,7 +144,8 @@ def _leave_out_repeats(rows: Rows) -> None:
     Otherwise repeated rows are only reported.
     """
     t, samples = rows.t, len(rows.t)
-    # A recording of fewer rows does not show whether the arm moves or rests, so that repeats cannot be recognised.
+    # A recording of fewer than eight rows does not show whether the arm moves or rests, so that repeats cannot be
+    # recognised.
     if samples < TUNING.jump_window:
         return
     repeats, copies = repeated_rows(rows.data[:, 1:], len(rows.layout.joints))
