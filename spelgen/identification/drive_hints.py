@@ -1,8 +1,8 @@
 """Detection of couplings of motors that the settings do not declare, by least squares on a subset of the samples.
 
-The friction model depends on the velocity only. The Gram matrices of the regressor are computed once, since a candidate
-for a coupling changes the columns of two joints only. The best candidate is accepted if it lowers the torque residual
-on held-out blocks of time.
+The friction model depends on the velocity only. The Gram matrices of the regressor are computed once for all joints; a
+candidate for a coupling changes the matrices of two joints only. The best candidate is accepted if it lowers the torque
+residual on held-out blocks of time.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ class Coupling:
 def drive_rows(
     chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, speeds: np.ndarray
 ) -> np.ndarray:
-    """Return the regressor (S, n, K) of the joint torques.
+    """Return the regressor Y (S, n, K) of the joint torques: tau = Y @ parameters at each of S samples.
 
-    The columns belong to the inertial parameters of the bodies, then to each friction effect of all drives. q, qd, qdd:
-    (S, n) [rad, m], per s, per s^2. speeds: matrix C (n, n) from joint speeds to motor speeds, with the declared
-    couplings.
+    The K columns belong to the inertial parameters of the bodies, then to each friction effect of all drives. q, qd,
+    qdd: (S, n) [rad, m] and their derivatives with respect to time [s]. speeds: matrix C (n, n) from joint speeds to
+    motor speeds, with the declared couplings.
     """
     bodies = chain_regressor(chain, q, qd, qdd)
     return np.concatenate([bodies, FRICTION.columns(qd, qdd, None, speeds)], axis=2)
 
 
 def drive_problem(chain: BodyChain, drives: Drives, samples: MotionSamples) -> DriveProblem:
-    """Return the least-squares problem for the joint torques of samples without time shift."""
+    """Return the least-squares problem of the joint torques of `samples`, without a shift of torques in time."""
     q, qd, qdd = samples.motion
     regressors = drive_rows(chain, q, qd, qdd, drives.speeds)
     rows = np.concatenate([regressors, samples.tau[..., None]], axis=2)
@@ -106,7 +106,7 @@ class DriveProblem:
         return replace(self, rows=rows, products=block_products(rows, self.products.shape[1]))
 
     def in_one_block(self, stride: int) -> DriveProblem:
-        """Return the problem on every `stride`-th sample, in a single block: without held-out samples."""
+        """Return the problem on every `stride`-th sample, in a single block of time: no samples are held out."""
         rows = self.rows[::stride]
         return replace(self, samples=self.samples.every(stride), rows=rows, products=block_products(rows, 1))
 
@@ -123,7 +123,7 @@ class DriveProblem:
         solution = normal_solution(fitted, 1)
         left = np.append(solution, np.full_like(solution[:, :1], -1.0), axis=1)
         errors = left.swapaxes(1, 2) @ products @ left
-        # the residual of an exact model consists of rounding errors
+        # bounded from below: the residual of an exact model consists of rounding errors
         return np.asarray(np.maximum(errors[..., 0, 0].T, TUNING.negligible))
 
     def cost(self, coupling: Coupling) -> float:
@@ -132,11 +132,14 @@ class DriveProblem:
         return float(errors / self.errors[:, coupling.pair].mean())
 
     def coupled(self, coupling: Coupling) -> DriveProblem:
-        """Return a copy whose Gram matrices of both coupled joints belong to a model with this coupling."""
+        """Return the problem of a model with this coupling.
+
+        Only the Gram matrices of both coupled joints are recomputed; `rows` remains the regressor without the coupling.
+        """
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
         motion = self.samples.motion[1:]
         qd, qdd = motion[..., [joint]] + ratio * motion[..., [moved_by]]
-        columns = FRICTION.columns(qd, qdd)[:, 0]  # (S, effects)
+        columns = FRICTION.columns(qd, qdd)[:, 0]  # (S, effects) of the motor
         n, effects = self.rows.shape[1], columns.shape[1]
         of_motor = np.arange(effects) * n + joint - effects * n - 1
         rows = self.rows[:, coupling.pair].copy()
@@ -160,8 +163,10 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     candidates: list[Coupling] = []
     for joint, moved_by in permutations(problem.free, 2):
         if abs(joint - moved_by) > 1:
-            continue  # shafts and belts couple neighbours; fits of other pairs explain other effects, such as springs
-        # the ratio is refined later, within half to twice each of these values
+            # Only neighbours are tried, which shafts and belts couple; fits of other pairs explain other effects, such
+            # as springs.
+            continue
+        # three ratios of motor speed are tried; the best one is refined later, within half to twice its value
         for ratio, sign in product((0.4, 1.0, 2.5), (1.0, -1.0)):
             candidates.append(Coupling(joint, moved_by, sign * ratio, "joints"))
             candidates.append(Coupling(joint, moved_by, sign * ratio, "motors"))
@@ -171,8 +176,8 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     best = _with_best_ratio(nearest, problem.in_one_block(1).cost)
     logged = problem.errors[:, best.pair].mean(axis=1)
     coupled = problem.coupled(best).errors[:, best.pair].mean(axis=1)
-    # If the model with the coupling has a large error in any block, neither model explains the torques, and the
-    # comparison is no evidence.
+    # The coupling is rejected if the model with it has a large error in any block: such a model does not explain the
+    # torques, and a smaller error than without the coupling is no evidence.
     explained = coupled.max() < HINTS.coupling_gain
     if not (explained and _is_sure(logged, coupled, HINTS.coupling_gain, len(candidates))):
         return None
@@ -180,7 +185,7 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
 
 
 def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coupling:
-    """Return a coupling with the ratio of minimum cost.
+    """Return the coupling `start` with the ratio of minimum cost, between half and twice its ratio.
 
     A fraction of small integers near the minimum is preferred if its cost is at most 2 % higher.
     """
@@ -196,12 +201,12 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
 
 
 def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
-    """Return True if a candidate lowers the errors per block (B,) significantly, and their mean by the factor `gain`.
+    """Return True if a candidate for a coupling significantly lowers the errors of B blocks of time.
 
     Args:
         logged: (B,) errors without the candidate.
         mended: (B,) errors with the candidate.
-        gain: largest ratio of both means.
+        gain: largest accepted ratio of the mean error with the candidate to the mean error without it.
         candidates: number of candidates of which this candidate is the best.
     """
     if mended.mean() >= gain * logged.mean():

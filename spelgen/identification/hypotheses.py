@@ -57,7 +57,7 @@ class Hypothesis:
         return b"".join(x.tobytes() for x in arrays), self.gravity
 
     def changed(self, fault: Fault, **changes: object) -> Hypothesis:
-        """Return the hypothesis with changed fields, which correct one more fault of the log."""
+        """Return the hypothesis with changed fields that correct one more kind of fault, `fault`."""
         faults = self.faults if fault in self.faults else (*self.faults, fault)
         return replace(self, faults=faults, **changes)  # type: ignore[arg-type]
 
@@ -72,7 +72,10 @@ class Hypothesis:
         return samples._replace(values=signals[..., None])
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the logged samples for `samples` of the joints, for a hypothesis of scales and offsets only."""
+        """Return the inverse of `signals`: logged samples for `samples` of the joints.
+
+        The hypothesis must have no delays, and no exchanged columns.
+        """
         signals = samples.values.copy()
         signals[:, :, 0] -= self.offset[:, None]
         return samples._replace(values=signals / _per_signal(self.scale)[..., None])
@@ -84,7 +87,7 @@ def _per_signal(values: np.ndarray) -> np.ndarray:
 
 
 def _permuted(values: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Return signals (S, n, 4, E) in which joint k has the motion of joint source[0, k], torque of source[1, k]."""
+    """Return signals (S, n, 4, E) with the motion of joint source[0, k] and the torque of source[1, k] at joint k."""
     return np.concatenate([values[:, source[0], :3], values[:, source[1], 3:]], axis=2)
 
 

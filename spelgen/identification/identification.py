@@ -187,14 +187,15 @@ class Identification:
         )
 
     def quality(self) -> str:
-        """Return two sentences: the condition number, and the number of parameters in each class of precision."""
+        """Return sentences about the condition number, and the number of parameters in each class of precision."""
         conditioned = f"Condition number {self.condition:.3g} (columns of length one): "
         if self.unseen:
             conditioned = (
                 f"The logs do not excite {counted(self.unseen, 'direction')} of the base parameters: those values are "
                 "arbitrary; excite the arm more, or train the preset closed-form, which has a prior at the URDF."
             )
-        elif self.condition < 30.0:  # torque errors are not amplified noticeably
+        # [1] condition number below which torque errors are not amplified noticeably
+        elif self.condition < 30.0:
             conditioned += "well posed."
         elif self.condition < 300.0:
             conditioned += "acceptable."

@@ -142,7 +142,7 @@ class _Equations:
         parameters: number K of parameters.
         """
         count, first = sum(len(block.q) for block in self._blocks), 0
-        group = np.arange(count) * BLOCKS // count  # contiguous blocks of samples
+        group = np.arange(count) * BLOCKS // count  # `group`: the contiguous block of each sample
         products = np.zeros((len(self.drives.speeds), BLOCKS, parameters + 1, parameters + 1))
         for columns, tau in self._rows(friction):
             rows = np.concatenate([columns, tau[..., None]], axis=2).swapaxes(0, 1)
@@ -154,7 +154,10 @@ class _Equations:
         return products
 
     def solved(self, method: LeastSquares) -> Identification:
-        """Return the result for a method. Raises LogError if there are no samples."""
+        """Return the identification with the friction model and the weights of `method`.
+
+        Raises LogError if there are no samples.
+        """
         if not self._blocks:
             raise LogError(
                 "no samples to identify from",
@@ -164,7 +167,8 @@ class _Equations:
         products = self._products(method.friction, len(base.parameters))
         torques = np.concatenate([block.tau for block in self._blocks])
         deviation = torques.std(axis=0)
-        # bounded from below, since a joint with a constant torque would have an infinite weight
+        # The range of a torque is bounded from below, since a joint with a constant torque would have an infinite
+        # weight.
         torque_range = np.maximum(deviation, 1e-3 * deviation.max())
         weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
         # with the weights "noise", joints are reweighted by their residuals in each iteration

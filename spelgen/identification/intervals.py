@@ -72,7 +72,7 @@ class Interval:
         numbers = {"value": self.value, "deviation": self.std, "low": self.low, "high": self.high}
         finite = {
             name: x if math.isfinite(x) else None for name, x in numbers.items()
-        }  # JSON has no infinity
+        }  # infinite numbers become None, since JSON has no infinity
         return {"name": self.name, "unit": self.unit, **finite, "determined": self.determined}
 
 
@@ -99,12 +99,12 @@ def student_scale(blocks: int) -> float:
 
 
 def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the block-jackknife covariance of a MAP estimate of k parameters, and the jackknife's steps.
+    """Return the steps of a block jackknife, and the covariance of a MAP estimate of k parameters.
 
     The first value (B, k) has the Newton step of the estimate for the removal of each of the B blocks. The second value
-    (k, k) is the covariance J + S^-1 P S^-1, with the jackknife covariance J of these steps and the Hessian S of all
-    blocks and the prior. Errors of samples may be correlated within blocks, and their variance may differ between
-    blocks (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
+    (k, k) is the covariance J + S^-1 P S^-1, with the jackknife covariance J of these steps, the Hessian S of all
+    blocks and the prior, and the precision P of the prior. Errors of samples may be correlated within blocks, and their
+    variance may differ between blocks (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
 
     Args:
         curvature: (B, k, k) Gauss-Newton Hessian of each block.
@@ -126,7 +126,7 @@ def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
     lower bound must be positive definite.
     """
     scale = lower_bound.diagonal().sqrt()  # scaled to a unit diagonal, since parameters have different units
-    # for samples without noise the lower bound is singular except for rounding errors: its eigenvalues are clamped
+    # For samples without noise the lower bound is singular except for rounding errors, so its eigenvalues are clamped.
     variances, axes = torch.linalg.eigh(lower_bound / scale.outer(scale))
     deviations = variances.clamp(min=1e-12).sqrt()
     root, inverse = scale.unsqueeze(-1) * axes * deviations, (axes / deviations / scale.unsqueeze(-1)).mT

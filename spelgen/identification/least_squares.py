@@ -79,7 +79,7 @@ class Solution:
 
 
 def solve(product: np.ndarray, columns: np.ndarray) -> Solution:
-    """Return the parameters that minimize the weighted squared residual; the minimum-norm solution if it is singular.
+    """Return the parameters that minimize the weighted squared torque residual; of several minima, the shortest vector.
 
     Args:
         product: (K + 1, K + 1) Gram matrix of the weighted regressor and torque.

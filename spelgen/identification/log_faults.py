@@ -44,7 +44,7 @@ class Correction:
         return np.asarray(self.hypothesis.scale / self.unchanged.scale)
 
     def lines(self) -> str:
-        """Return a text with the settings that implement the hypothesis, and where to write them; "" if none do."""
+        """Return a text with the settings that correct the log, and where to write them; "" if there are none."""
         entries: dict[str, dict[str, object]] = {}
         of_log: dict[str, object] = {}
         of_robot: dict[str, object] = {}
@@ -96,7 +96,10 @@ class Fault(ABC):
         """Return the fits of hypotheses that correct one fault of this kind in addition to the faults of `base`."""
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterable[HypothesisFit]:
-        """Return the fits of corrections that take seconds; they are tried if no other correction is enough."""
+        """Return the fits of corrections whose search takes seconds, such as orders of all joints.
+
+        They are computed only if no correction among `fits` explains the torques.
+        """
         return ()
 
     def text(self, correction: Correction) -> str:
@@ -104,16 +107,16 @@ class Fault(ABC):
         return self.description
 
     def joints(self, correction: Correction) -> list[str]:
-        """Return the names of the joints that have this fault: of those with settings; all joints if there are none."""
+        """Return the names of the joints that have settings to correct the fault; all joints if no joint has."""
         names = correction.arm.joint_names
         return [x for k, x in enumerate(names) if self.joint_keys(correction, k)] or list(names)
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the settings of a joint in the group `logs` that correct the fault; {} if it is right."""
+        """Return the settings of a joint in the group `logs` that correct the fault; {} for a joint without fault."""
         return {}
 
     def log_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the settings in the group `logs` that correct the fault, besides the settings of joints."""
+        """Return the settings in the group `logs` that correct the fault of all joints, such as `torque_delay`."""
         return {}
 
     def robot_keys(self, correction: Correction) -> dict[str, object]:
@@ -121,5 +124,5 @@ class Fault(ABC):
         return {}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if an error of the URDF or of the mounting may be the reason; else ""."""
+        """Return the code of a warning if the fault may be an error of the URDF or mounting; "" for an error."""
         return ""

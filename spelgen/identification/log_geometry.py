@@ -37,7 +37,7 @@ class GeometryProblem:
         seconds: float,
         unchanged: Hypothesis | None = None,
     ) -> None:
-        """Prepare the problem of an arm with n joints.
+        """Define the problem of an arm with n joints.
 
         Args:
             arm: arm with its vector of gravity and the inertial parameters of its URDF.
@@ -61,7 +61,7 @@ class GeometryProblem:
         self._counted: np.ndarray | None = None
         self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
-        self._chains: dict[Vector3, BodyChain] = {}  # under each direction of gravity
+        self._chains: dict[Vector3, BodyChain] = {}  # chains of bodies, per vector of gravity
 
     def thinned(self, count: int) -> GeometryProblem:
         """Return the problem on at most `count` samples, evenly spaced."""
@@ -70,7 +70,7 @@ class GeometryProblem:
         return fewer
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
-        """Return the problem that is fitted only to some torques.
+        """Return the problem that is fitted to some torques only; other torques and their regressor rows become zero.
 
         counted: mask (S, n) of these torques in the unchanged log.
         """
@@ -104,7 +104,10 @@ class GeometryProblem:
         return other
 
     def gravity_torques(self, fit: HypothesisFit) -> tuple[np.ndarray, np.ndarray]:
-        """Return the gravity torques (S, n) [Nm, N] of a fit, and with the inertial parameters of the URDF."""
+        """Return two gravity torques (S, n) [Nm, N]: with the fitted parameters, and with those of the URDF.
+
+        Both are at the positions and with the vector of gravity of the fit's hypothesis.
+        """
         weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
         columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
         return columns @ fit.parameters, columns @ self.prior_mean
@@ -119,7 +122,7 @@ class GeometryProblem:
         return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
     def residual(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
-        """Return the model's torques with the parameters (K,) minus the logged ones, (S, n) [Nm, N]."""
+        """Return the torque residual (S, n) [Nm, N] of parameters (K,): torques of the model minus logged torques."""
         torque = self.equations(hypothesis)[0] @ parameters
         return np.asarray(torque - hypothesis.signals(self.samples).tau)
 
@@ -136,8 +139,8 @@ class GeometryProblem:
                 self._chains[hypothesis.gravity] = body_chain(self.arm, hypothesis.gravity)
             rows = drive_rows(self._chains[hypothesis.gravity], q, qd, qdd, self.speeds)
             if self._has_hysteresis:
-                # the deflections of drive j act on joint i with the factor C_ji, like its other friction
-                # under a hypothesis, a joint may have the motion of another column, or motion of the opposite sense
+                # The deflections of drive j act on joint i with the factor C_ji, like its other friction. Under a
+                # hypothesis, a joint may have the motion of another column, or motion of the opposite sense.
                 bent = self.samples.bent[:, hypothesis.source[0]] * np.sign(hypothesis.scale[0])[:, None]
                 bristles = bent[:, None] * self.speeds.T[:, :, None]
                 rows = np.concatenate([rows, bristles.reshape(*q.shape, -1)], axis=2)
@@ -163,7 +166,7 @@ class GeometryProblem:
         variance = len(tau) * _variance(tau)
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         errors, scale = np.full(len(normal), 0.1), 0.1
-        for _ in range(6):  # further iterations change the cost by less than 0.1
+        for _ in range(6):  # number of reweightings: further ones change the cost by less than 0.1
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
             matrix = np.tensordot(weights, normal, 1)
             # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable
@@ -240,12 +243,13 @@ class GeometryProblem:
         """Return the penalty for positions q (S, n) beyond the position limits: at most 15 for each joint.
 
         Limits of a URDF may be wrong, and zeros may be calibrated badly: the penalty is proportional to the distance
-        beyond the limits up to half of the range between them. Whole turns of revolute joints are no matter.
+        beyond the limits up to half of the range between them. Revolute joints may be logged a whole turn beyond their
+        limits.
         """
         penalty = 0.0
         for coordinate, low, high in zip(self.arm.coordinates, q.min(axis=0), q.max(axis=0), strict=True):
             lower, upper = coordinate.limits or (0.0, 0.0)
-            if not 0 < upper - lower < 1e3:  # equal or huge limits are no limits
+            if not 0 < upper - lower < 1e3:  # equal or huge limits mean that the joint is unlimited
                 continue
             turns = 2 * np.pi * np.arange(-1, 2) * (coordinate.joint_type == "revolute")
             distance = np.maximum(high + turns - upper, lower - low - turns).min()
@@ -333,19 +337,23 @@ def _variance(tau: np.ndarray) -> np.ndarray:
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric positive definite matrix; it is scaled to a unit diagonal before inversion."""
+    """Return the inverse of a symmetric positive definite matrix (K, K), inverted with a unit diagonal."""
     scaled, scale = _with_unit_diagonal(matrix)
     return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
 
 
 def solution(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return `inverse(matrix) @ vector`, in a third of the time."""
+    """Return `inverse(matrix) @ vector`, (K,), for a matrix (K, K) and a vector (K,), in a third of the time."""
     scaled, scale = _with_unit_diagonal(matrix)
     return np.asarray(np.linalg.solve(scaled, vector / scale) / scale)
 
 
 def _with_unit_diagonal(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a matrix (K, K) divided by the scale of its rows and columns, and the scale (K,)."""
+    """Return a positive semidefinite matrix (K, K) scaled to a unit diagonal, and its scale (K,).
+
+    Rows and columns are divided by the scale, the square root of the diagonal. A tiny ridge makes the matrix
+    invertible.
+    """
     scale = np.sqrt(np.diag(matrix))
     scale = np.where(scale > 0, scale, 1.0)
     return matrix / np.outer(scale, scale) + 1e-12 * np.eye(len(matrix)), scale
