@@ -17,14 +17,14 @@ def number(value: float) -> float | None:
 
 
 def listed(values: np.ndarray) -> object:
-    """Return an array of any shape as nested lists of numbers."""
+    """Return an array of any shape as nested lists of numbers for JSON: rounded to five digits, None if not finite."""
     if values.ndim == 0:
         return number(values.item())
     return list(map(listed, values))
 
 
 def array(values: object) -> np.ndarray:
-    """Return the array for nested lists from `listed`; None becomes NaN."""
+    """Return the array of floats for nested lists from `listed`; None becomes NaN."""
     return np.array(values, dtype=float)
 
 

@@ -30,7 +30,7 @@ LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
 
 @dataclass(frozen=True)
 class Row:
-    """Row of a table: one quantity, with a number per column. ranked: whether the smallest number is best."""
+    """Row of a table: one quantity, with a number per column. ranked: True if the smallest number is the best one."""
 
     label: str
     values: Numbers
@@ -105,7 +105,10 @@ def _without_empty_baselines(full: Table) -> Table:
 
 
 def joined(runs: Mapping[str, Results]) -> list[Table]:
-    """Return the tables and rows that all runs have, with a column for the model of each run."""
+    """Return tables that compare runs: one column per run, with the numbers of the run's model.
+
+    Tables and rows that not all runs have are omitted. runs: {name of a run: its results}.
+    """
     tables: dict[str, dict[str, dict[str, float | None]]] = {}
     for run, results in runs.items():
         for one_table in result_tables(results):
@@ -163,7 +166,7 @@ def _horizon_tables(results: Results) -> list[Table]:
             head = f"{head} ({horizon.seconds:.3g} s)"
         relative[head] = {name: errors.mean_relative_rms for name, errors in horizon.errors.items()}
         tips[head] = {name: errors.tip_mm for name, errors in horizon.errors.items()}
-        # On short logs there are no predictions with an observer, so the note does not explain it.
+        # The note explains the observer, if there are predictions with an observer: there are none on short logs.
         if observed(MODEL) in horizon.errors:
             note = OBSERVER
     q = {name: errors.q for name, errors in horizon.errors.items()}
@@ -196,7 +199,7 @@ def _torque_tables(results: Results) -> list[Table]:
 
 
 def _replay_tables(results: Results) -> list[Table]:
-    """Return the tables of replayed commands: per trajectory and per joint."""
+    """Return the tables of position errors under replayed commands: per trajectory and per joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
         rows = {}
@@ -221,8 +224,12 @@ def _by_joint(
 ) -> Table:
     """Return a table of the errors of all predictors, with one row per joint.
 
-    title: title with the placeholder {} for the unit. quantity: position, velocity or torque, for the unit. errors:
-    {predictor: errors of all joints}.
+    Args:
+        results: the evaluation, for the names and types of the joints.
+        title: title with the placeholder {} for the unit.
+        quantity: "position", "velocity" or "torque", which determines the unit.
+        errors: {predictor: errors of all joints}.
+        note: explanation below the table.
     """
     units = [asdict(UNITS[joint_type])[quantity] for joint_type in results.joint_types]
     # If all joints have the same unit, it is in the title: a unit in each row would widen the first column.

@@ -1,4 +1,4 @@
-"""Torque errors of inverse dynamics on measured trajectories, by one protocol for all predictors."""
+"""Torque errors of inverse dynamics on measured trajectories, by one protocol for the model and all baselines."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,7 +45,11 @@ class TorqueErrors:
 
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
-    """Return the torque errors of the dynamics on these samples; only `nmse_with_pauses` includes pauses."""
+    """Return the torque errors of the inverse dynamics of a predictor on `samples`.
+
+    dynamics: the model or a baseline. samples: motion and torques of each trajectory. Samples of pauses between motions
+    are used only for `nmse_with_pauses`.
+    """
     errors_by_log, by_trajectory = [], {}
     for sample in samples:
         residual, rows = predicted_torques(dynamics, sample) - sample.tau, is_moving(sample.qd)
@@ -64,7 +68,7 @@ def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueEr
 
 
 def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
-    """Return the torques of the inverse dynamics on these samples, (T, n) [Nm, N]."""
+    """Return the torques of the inverse dynamics for the motion in `samples`, (T, n) [Nm, N]."""
     motion = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
         torques: np.ndarray = dynamics.inverse_dynamics(*motion, *friction_past(dynamics, samples)).numpy()

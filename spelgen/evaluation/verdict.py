@@ -31,7 +31,7 @@ Limits = Sequence[tuple[float, float] | None]
 
 @dataclass
 class _Uses:
-    """Uses of a model.
+    """Uses of a model, which the assessment functions fill in.
 
     good: uses for which the model is sufficient. bad: uses for which the model is not sufficient. proofs: texts with
     the errors from which this was decided.
@@ -159,7 +159,7 @@ def _relative(errors: StateErrors | None) -> float:
 
 
 def _better_baselines(results: Results) -> list[str]:
-    """Return sentences about the horizons at which constant velocity or another baseline has a smaller error."""
+    """Return sentences that name the horizons at which constant velocity or another baseline has a smaller error."""
     times = []
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
@@ -210,7 +210,8 @@ def _worst_motion(results: Results) -> tuple[str, float]:
     The relative error is the RMS error divided by the RMS change over the horizon.
     """
     for last in results.horizons[-1:]:
-        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN.
+        # An unknown error (None) becomes NaN.
+        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)
         if np.isfinite(errors).all():
             return results.joints[errors.argmax()], errors.max()
     return "", math.inf
@@ -246,9 +247,15 @@ def _recommendations(
     worst: str,
     speed: str,
 ) -> dict[str, str]:
-    """Return motions to record, with reasons, the most useful first.
+    """Return {motion to record: reason}, the most useful motion first.
 
-    worst, speed: name of the worst joint and words for its worst speed, see `_worst_joint`.
+    Args:
+        results: the evaluation.
+        identified: content of least_squares.json, with the range of motion of the training logs.
+        limits: position limits of the joints.
+        independent: names of joints on whose position the dynamics do not depend.
+        worst: name of the worst joint, see `_worst_joint`.
+        speed: words for the speed at which its error is largest, see `_worst_joint`.
     """
     recommendations = {}
     trained = identified.get("coverage") or {}
