@@ -17,7 +17,10 @@ Values = Sequence[float] | np.ndarray
 
 @dataclass(frozen=True)
 class Margins:
-    """Margins around the plot area [pixels]. `bare` replaces `bottom` if the x axis has no numbers and no label."""
+    """Margins around the plot area of a chart [pixels].
+
+    `bare` replaces `bottom` if the x axis has no numbers and no label.
+    """
 
     left: int = 52
     right: int = 14
@@ -158,7 +161,7 @@ class Band:
         return np.concatenate([_floats(self.low), _floats(self.high)])
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the SVG path of the outline, clipped to both axes. Values that are NaN are drawn at the top."""
+        """Return the SVG path of the outline of the area, clipped to both axes. NaN is drawn at the top."""
         # Quantiles of diverged predictions are NaN or infinite: the band of such times extends to the top of the chart.
         low, high = (np.nan_to_num(_floats(y), nan=np.inf) for y in (self.low, self.high))
         # The outline follows the lower curve, then the upper curve backwards.
@@ -253,7 +256,7 @@ def _spaced(pixels: np.ndarray) -> str:
 
 
 def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
-    """Return the finite values of all columns as one vector; if `positive`, only the positive values."""
+    """Return the finite values of several arrays as one vector; if `positive`, only the positive values."""
     values = np.concatenate([np.zeros(0), *columns])
     return np.asarray(values[np.isfinite(values) & ((values > 0) | (not positive))])
 
@@ -269,7 +272,8 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
     room = pad * (high - low)
     # A nearly constant curve gets a wider axis; otherwise its rounding errors of about 1e-16 would fill the chart.
     if high - low <= 1e-9 * max(abs(low), abs(high)):
-        room = 0.5 * abs(high) or 1.0  # With equal margins above and below, the line lies in the middle.
+        # The margins above and below a constant line are equal, so that it lies in the middle.
+        room = 0.5 * abs(high) or 1.0
     return Axis(low - room, high + room, start, end)
 
 

@@ -58,7 +58,14 @@ def write_comparison(study: Study, sections: Sequence[ArmResults]) -> Path:
 
 
 def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -> SimulatedCurves:
-    """Return the charts of one simulated arm. truth: URDF of the simulated arm."""
+    """Return the charts of one simulated arm in a comparison of presets.
+
+    Args:
+        study: jobs and results of the comparison.
+        section: results of the runs on this arm.
+        inputs: files of the arm.
+        truth: URDF with the true parameters of the simulated arm.
+    """
     first: dict[str, SimulatedFigures] = {}
     for result in section.results:
         if result.simulated is not None:

@@ -72,6 +72,12 @@ def base_table(
 
     Its columns are the values of the URDF, of the model and of linear least squares. The values of least squares have
     95 % intervals; the values of the model have 95 % intervals if there is a posterior.
+
+    Args:
+        model: The trained model; None: no column of the model.
+        arm: The arm with the parameters of the URDF.
+        identified: Result of linear least squares, as JSON content.
+        posterior: Posterior of the model; None: no intervals of the model.
     """
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
@@ -119,7 +125,7 @@ def base_table(
 
 
 def _number(value: float) -> str:
-    """Return the text of a number with four digits; "" for NaN."""
+    """Return the text of a number with four significant digits; "" for NaN."""
     return f"{value:.4g}".replace("nan", "")
 
 
@@ -131,7 +137,11 @@ def _interval(parameter: Content) -> str:
 
 
 def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None) -> Listing:
-    """Return the table of mass, centre of mass and principal moments. values: inertial parameters (bodies, 10)."""
+    """Return the table of mass, centre of mass and principal moments of each body.
+
+    values: inertial parameters of the model, (bodies, 10). arm: arm with the parameters of the URDF for comparison;
+    None if unknown. posterior: intervals of the identifiable parameters; None if unknown.
+    """
     alone = ""
     if posterior is not None:
         alone = ", ".join(f"{x.name} = {x.text} {x.unit}" for x in posterior.bodies)

@@ -134,7 +134,14 @@ def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, floa
 def coverage_panels(
     traces: Traces, identified: Content | None, joints: Sequence[NamedJoint], limits: Limits
 ) -> list[Panel]:
-    """Return charts per joint: histograms of position and velocity in training and test logs, and position limits."""
+    """Return charts per joint: histograms of position and velocity in training and test logs, and position limits.
+
+    Args:
+        traces: curves of the evaluation, with the histograms of the test logs.
+        identified: content of least_squares.json, with the histograms of the training logs; None if absent.
+        joints: Names and units of the joints.
+        limits: position limits of the joints.
+    """
     logs = {"training": (identified or {}).get("coverage")}
     logs["test"] = traces.coverage
     panels = []
@@ -167,7 +174,7 @@ def _histogram(name: str, histogram: Content) -> Band:
 
 
 def energy_chart(trace: TorqueTrace) -> Chart:
-    """Return the chart of the terms of the energy balance along a trajectory."""
+    """Return the chart of the energy balance along a trajectory: work of the drives, stored energy, and losses."""
     styles = ("truth", "urdf", "friction", "model")
     terms = zip(trace.energy.items(), styles, strict=True)
     lines = [Line(name, trace.t, energy, style) for (name, energy), style in terms]

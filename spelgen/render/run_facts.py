@@ -1,4 +1,4 @@
-"""Facts about a run: most important figures, training, options, and the commands that reproduce the run."""
+"""Facts about a run for its page: most important figures, training, options, and commands that reproduce the run."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ from spelgen.spec import ModelSpec, Options
 
 
 class Run:
-    """The content of a run folder; an attribute is None if its file is absent.
+    """The content of a run folder, read for its page; an attribute is None if its file is absent.
 
     Attributes:
         config: Record of the fit.
@@ -42,7 +42,7 @@ class Run:
     """
 
     def __init__(self, path: Path | str) -> None:
-        """Read the files. Raises RunError or ModuleError."""
+        """Read the files of the run folder `path`. Raises RunError or ModuleError."""
         folder = self.folder = RunFolder(path)
         self.spec = folder.read_spec()
         self.config = folder.read_record() if folder.config.is_file() else None

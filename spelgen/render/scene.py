@@ -141,7 +141,11 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
 
 
 def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shape:
-    """Return tubes from the link's origin to its child joints, or to the centre of mass of the last link."""
+    """Return the shape of a link without meshes: tubes from the link's origin to its child joints.
+
+    A last link has a tube to its centre of mass. The joint of the link is drawn as a drum or block. names: the drawn
+    links. radius: radius of the tubes [m].
+    """
     joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
     below = [joint for joint in robot.joints_below[name] if joint.child in names]
     meshes = []
@@ -186,7 +190,7 @@ class Shape:
 
 
 def joined(meshes: Sequence[Trimesh]) -> Shape:
-    """Return one shape with the triangles of all meshes."""
+    """Return one shape with the triangles of all meshes, which are in the frame of one link."""
     import trimesh
 
     if not meshes:
