@@ -97,7 +97,7 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
 
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     """Return {file name: text} of the estimator's header and source."""
-    # C has no empty arrays, so a model without bristles gets one unused zero.
+    # C has no empty arrays, so a model without bristles gets one unused break-away displacement, zero.
     breakaway = model.breakaway.ravel() if model.memory else [0.0]
     tables: dict[str, Iterable[float]] = {
         "load_prior": TUNING.load_prior,
@@ -130,5 +130,5 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
 
 
 def _numbers(values: Iterable[float]) -> list[str]:
-    """Return C literals that give exactly the same doubles as these values."""
+    """Return the values as C literals that give exactly the same doubles."""
     return ["INFINITY" if math.isinf(value) else repr(float(value)) for value in values]

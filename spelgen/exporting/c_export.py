@@ -18,7 +18,7 @@ from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
-# Warnings are errors here, because users compile the files with the strict flags of their own projects.
+# Compiler warnings are errors, because users compile the files with the strict flags of their own projects.
 _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 
 
@@ -59,7 +59,7 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
 
 
 def compiler() -> str | None:
-    """Return the path of a C compiler; None if there is none."""
+    """Return the path of the first C compiler on this machine among gcc, clang and cc; None if there is none."""
     return next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
 
 
@@ -78,7 +78,10 @@ def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -
 def called_by_c(
     library: Path, functions: Sequence[CFunction], dtype: type[np.floating] = np.float64
 ) -> Called:
-    """Return a function for `check_parity`, which calls an entry point of a compiled export for arrays of states."""
+    """Return a function for `check_parity`, which calls an entry point of a compiled export once per state.
+
+    library: shared library of the export. functions: C functions in the library. dtype: type ``real`` of the C code.
+    """
     loaded = ctypes.CDLL(str(library))
     by_name = {function.entry.name: function for function in functions}
     # The friction state is double even if all other arrays are float.

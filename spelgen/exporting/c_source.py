@@ -13,11 +13,11 @@ from spelgen.exporting.description import EntryPoint, TrainedModel
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.templates import render
 
-_WIDTH = 118  # maximum length of a line
+_WIDTH = 118  # maximum number of characters in a line of a C function
 FRICTION_STATES = ("z", "z_next", "z_start", "low", "high")
 """Inputs and outputs that are friction states, of type double; all others are of type ``real``."""
-# {0} and {1} are operands. SIN, COS and other macros are the functions for float or double. tanh is used only for the
-# friction state, which is always double.
+# C expressions of CasADi's operations: {0} and {1} are operands. SIN, COS and other macros are the functions for float or
+# double. tanh is used only for the friction state, which is always double.
 _FORMS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
@@ -44,9 +44,12 @@ class CFunction:
     """C code of an entry point.
 
     Attributes:
+        entry: the entry point.
         symbol: name of the C function.
         shapes: {output: (rows,) or (rows, columns)}.
         about: text of the comment above the function.
+        signature: C declaration of the function, without a semicolon.
+        definition: C definition of the function.
         operations: upper bound of the number of arithmetic operations of a call, without networks.
     """
 
@@ -103,7 +106,10 @@ def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, st
 
 
 def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
-    """Return the C function of an entry point, which computes the outputs of a CasADi function."""
+    """Return the C function of an entry point, which computes the outputs of a CasADi function.
+
+    function: CasADi function of scalar expressions, made by `named_function`; its residual terms are computed in C.
+    """
     # The C function computes the residual terms first, since its other statements depend on them.
     residuals, calls = residual_calls(model, residuals_needed(function))
     variables, lines = _statements(function, list(entry.outputs))

@@ -66,7 +66,10 @@ class Trained:
 
 
 def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
-    """Return a trained model as NumPy arrays. Raises RunError for a model without rigid bodies."""
+    """Return a trained model as NumPy arrays, from which C and CasADi code is generated.
+
+    Raises RunError for a model without rigid bodies. loaded: arm of the model.
+    """
     # A copy in double precision on the CPU: the user's model may be in single precision or on a GPU.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
@@ -185,9 +188,9 @@ def _network(
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
-    """Return {index of a joint: cubic spline}; joints whose coefficients are all zero are omitted.
+    """Return {index of a joint: cubic spline of q}; joints whose coefficients are all zero are omitted.
 
-    weights: coefficients of the B-splines of each joint, (n, splines).
+    terms: residual terms, for the knots. weights: coefficients of the B-splines of each joint, (n, splines).
     """
     splines = {}
     for joint in torch.nonzero(weights.any(dim=1)).flatten().tolist():

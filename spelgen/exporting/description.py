@@ -66,7 +66,7 @@ class Residuals:
 
 
 def spline_energy(spline: BSpline) -> BSpline:
-    """Return the potential energy of a torque spline, its antiderivative.
+    """Return the potential energy [J] of a torque spline as a function of q, its antiderivative.
 
     As in the runtime, its constant is chosen such that the energies at both ends differ only in sign.
     """
@@ -100,10 +100,12 @@ class TrainedModel:
 
     Attributes:
         name: identifier of the robot in code.
+        arm: kinematic chain of the arm.
         joint_labels: names of the joints for comments, only letters, digits and _.
         inertias: (bodies, 10), inertial parameters in the frames of the joints.
         constant_mass: (n, n), armature and constant residual terms of M.
         motors: C, (n, n), motor velocities = C qd.
+        residuals: residual terms that depend on q.
         friction: the ``FrictionConstants`` of the runtime, as arrays.
         breakaway: (n, K) [rad, m], break-away displacements of K bristles per joint.
         inputs: G, (n, n), joint torques = G times motor torques.
@@ -111,6 +113,8 @@ class TrainedModel:
         torque_offset: (n,), measured torque at zero torque.
         friction_compensation: (n,) [Nm s/rad, N s/m], coefficient of a torque proportional to qd that the drives add
             without measuring it.
+        tip: frame of the tip.
+        servos: position servos of the joints; None for an arm under torques.
     """
 
     name: str

@@ -125,7 +125,7 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
     model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
-    # The constraint is the linear map from the coordinates to the positions of all joints, including mimic joints.
+    # `constraint` is the linear map from the coordinates to the positions of all joints, including mimic joints.
     constraint = body_constraint(arm)
     # The rows of the map are sorted in MuJoCo's order of joints, the order of the tree of bodies.
     order = np.argsort([model.joint(name).dofadr[0] for name in constraint.names])
@@ -163,7 +163,8 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     _add(root, "compiler", angle="radian", autolimits="true")
     _add(root, "option", gravity=arm.gravity)
     world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in _SECTIONS)
-    # If the speed of a motor depends on several joints, its inertia is the armature of a tendon instead of a joint.
+    # `is_coupled`: motors whose speed depends on several joints; their inertia is the armature of a tendon, not of a
+    # joint.
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
     elements, tip = [world], tip_frame(projection.arm)
     for body, inertia in zip(tip.bodies, projection.inertias, strict=True):
@@ -291,7 +292,7 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
 
 
 def _form(shape: LinkShape, assets: etree._Element) -> dict[str, object]:
-    """Return type and size of a geom as attributes; a mesh is also added to the assets."""
+    """Return type and size of the geom of a shape as attributes; a mesh is also added to `assets`."""
     if shape.mesh is None:
         sizes = {"box": [x / 2 for x in shape.size], "cylinder": [shape.size[0], shape.size[-1] / 2]}
         return {"type": shape.kind, "size": sizes.get(shape.kind, shape.size)}
@@ -310,13 +311,13 @@ def _is_flat(vertices: np.ndarray) -> bool:
 
 
 def _add(parent: etree._Element, tag: str, **attributes: object) -> etree._Element:
-    """Add an element and return it; attributes that are None are omitted."""
+    """Add an element to `parent` and return it; attributes that are None are omitted."""
     texts = {name: _text(value) for name, value in attributes.items() if value is not None}
     return etree.SubElement(parent, tag, texts)
 
 
 def _text(value: object) -> str:
-    """Return the value of an attribute: a text unchanged, numbers with all digits and separated by blanks."""
+    """Return the value of an XML attribute: a text unchanged, numbers with all digits and separated by blanks."""
     if isinstance(value, str):
         return value
     return " ".join(f"{float(number):.17g}" for number in np.ravel(value))  # type: ignore[call-overload]

@@ -165,7 +165,7 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
     speed = ca.fabs(qd) / constants.stribeck_velocity
     rounding = constants.stribeck_rounding
     slow = 1 / (1 + (1 + rounding) / 8 * speed**2 / (speed + rounding))
-    for _ in range(3):  # squaring three times gives the eighth power
+    for _ in range(3):  # squaring `slow` three times gives its eighth power
         slow = slow * slow
     dry = constants.coulomb + constants.load_dependence * load + constants.stribeck * slow
     viscous = constants.viscous * qd + constants.saturation * _smooth_sign(qd, constants.saturation_velocity)
@@ -184,7 +184,7 @@ def sliding_bristles(model: TrainedModel, qd: ca.SX) -> ca.SX:
 
 
 def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
-    """Return the friction state z, (n K, 1), after a displacement of the motors without reversals.
+    """Return the friction state z, (n K, 1), after a displacement of the motors without reversals: z + dq, clipped.
 
     Args:
         breakaway: break-away displacements of K bristles per motor, (n, K) [rad, m].

@@ -91,7 +91,7 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 
     matrix: (..., n, n), positive definite, or triangular with a unit diagonal. right: (..., n, columns).
     """
-    n = matrix.shape[-1]  # a Python integer, so that tracing unrolls the loop
+    n = matrix.shape[-1]  # `n` is a Python integer, so that tracing unrolls the loop over k
     identity = torch.eye(n, dtype=matrix.dtype)
     # Either of the matrix and the right-hand side may have no batch dimension.
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
@@ -188,5 +188,5 @@ def onnx_session(content: bytes) -> onnxruntime.InferenceSession:
     # One thread is used, since synchronising several takes longer than operations with small matrices.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # Only errors are printed, no warnings of unused inputs.
+    options.log_severity_level = 3  # with level 3, only errors are printed, no warnings of unused inputs
     return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])

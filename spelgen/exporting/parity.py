@@ -63,7 +63,7 @@ def require_parity(differences: dict[str, float], tolerance: float, states: int)
     differences: {entry point: largest relative difference}. states: number of random states, for the summary.
     """
     for name, difference in differences.items():
-        if not difference <= tolerance:  # The negated comparison is True for NaN, too.
+        if not difference <= tolerance:  # The comparison is negated, so that NaN raises the error, too.
             raise RunError(
                 f"{name} differs from the model by {difference:.1e}",
                 element="parity check",
@@ -154,7 +154,11 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
 def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> Values:
     """Return {output: array (states, ...)} of one entry point, computed by the torch model.
 
-    name: name of the entry point. inputs: {input: array (states, n)}.
+    Args:
+        model: the torch model in double precision.
+        trained: the model with its arm, for the friction state and the tip.
+        name: name of the entry point.
+        inputs: {input: array (states, n)}.
     """
     entry = ENTRY_POINTS[name]
     arguments = []

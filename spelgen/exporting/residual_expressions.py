@@ -38,7 +38,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
         # network; the Jacobian `first` would take n passes.
         "rate": (entries, entries, 1),
         "kinetic": (entries, n, 1),
-        # `first`, `second` and the slopes occur only in derivatives of the dynamics.
+        # `first`, `second`, `torque_slope` and `factor_slope` occur only in derivatives of the dynamics.
         "first": (entries, entries, n),
         "second": (entries, entries, n * n),
         "energy": (has_potential, 1, 1),
@@ -107,5 +107,5 @@ def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX,
         (symbols["gravity"], symbols["stiffness"]),
         (symbols["torque"], ca.diag(symbols["torque_slope"])),
     ]
-    # Terms that the model does not have are structural zeros and are omitted.
+    # Residual terms that the model does not have are structural zeros and are omitted.
     return [(symbol, jacobian) for symbol, jacobian in jacobians if symbol.nnz()]

@@ -26,6 +26,8 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class NearestFriction(NamedTuple):
     """Viscous and Coulomb friction that approximate the friction of a model best, (n,) each.
 
+    A URDF or MuJoCo can represent this friction, but not the friction of a model.
+
     Attributes:
         viscous: coefficients [Nm s/rad, N s/m].
         forward, backward: Coulomb torques [Nm, N] in both directions of motion, backward <= 0 <= forward.
@@ -94,7 +96,7 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     # A copy in double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
-    # The rigid bodies of a model are used if it has some; its residual terms are omitted, as the summary states.
+    # The model's own rigid bodies are used if it has some; its residual terms are omitted, as the summary states.
     exact = isinstance(model, RigidBodyDynamics)
     bodies = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
@@ -113,7 +115,10 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
 
 
 def sampled_positions(arm: Chain) -> Tensor:
-    """Return random positions in the joints' ranges, (positions, n) [rad, m]; the seed is fixed."""
+    """Return random positions (positions, n) [rad, m] in the joints' ranges, at which models are compared.
+
+    The seed is fixed, so that the result is reproducible.
+    """
     return torch.from_numpy(random_inputs(arm.coordinates, TUNING.positions)["q"])
 
 
@@ -166,9 +171,9 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
     fractions = np.concatenate([-fractions[::-1], fractions])
     speeds = np.outer(fractions, nominal_speeds(arm.coordinates))
     positions = q[:: TUNING.positions // TUNING.friction_positions]
-    positions = positions.unsqueeze(1).expand(-1, len(speeds), -1)  # (positions, speeds, n)
+    positions = positions.unsqueeze(1).expand(-1, len(speeds), -1)  # positions: (positions, speeds, n)
     qd = torch.from_numpy(speeds).expand_as(positions)
-    torques = model.friction_torque(positions, qd).numpy()  # (positions, speeds, n)
+    torques = model.friction_torque(positions, qd).numpy()  # torques: (positions, speeds, n)
     rows = []
     for joint, speed in enumerate(speeds.T):
         # Torques are multiplied by the direction of motion, so that viscous and Coulomb friction are not

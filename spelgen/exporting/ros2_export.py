@@ -74,7 +74,7 @@ def _missing_part(trained: Trained) -> tuple[str, str] | None:
 
 
 def _use(package: str, name: str, *, controller: bool) -> str:
-    """Return the line of the README about the use of the package."""
+    """Return the line of the README about the use of the package. controller: True if it contains the controller."""
     use = (
         f"Put this folder into a workspace and run colcon build --packages-select {package}. "
         f"{package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver."

@@ -73,9 +73,13 @@ def program_names(trained: Trained) -> list[str]:
 
 
 def check_programs(called: Called, trained: Trained, names: Sequence[str], tolerance: float) -> Parity:
-    """Compare programs with the torch model; return the differences. Raises RunError if one is too large.
+    """Compare exported programs with the torch model; return the differences. Raises RunError if one is too large.
 
-    tolerance: largest allowed difference of float64 programs; for float32 it is `ExportTuning.float32_tolerance`.
+    Args:
+        called: function that evaluates an exported program.
+        trained: the model and its arm.
+        names: names of the programs.
+        tolerance: largest allowed difference of float64 programs; for float32 it is `ExportTuning.float32_tolerance`.
     """
     if trained.float32:
         return check_parity(called, trained, names, TUNING.float32_tolerance, dtype=np.float32)
@@ -83,7 +87,7 @@ def check_programs(called: Called, trained: Trained, names: Sequence[str], toler
 
 
 def number_type(model: PreparedModel) -> str:
-    """Return the name of the model's number type: ``float32`` or ``float64``."""
+    """Return the name of the type of the numbers of an exported model: ``float32`` or ``float64``."""
     return str(model.dtype).removeprefix("torch.")
 
 
@@ -135,7 +139,11 @@ def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
 
 
 class _Program(nn.Module):
-    """A module whose forward method is one entry point, as torch.export requires."""
+    """A module whose forward method is one entry point of a model; torch.export requires such a module.
+
+    model: the model with precomputed parameters. name: name of the entry point. flat_state: True if the friction state
+    z is (batch, n K) instead of (batch, n, K) for K bristles per joint.
+    """
 
     def __init__(self, model: PreparedModel, name: str, flat_state: bool) -> None:
         super().__init__()

@@ -88,7 +88,7 @@ def _settings_text(projection: RigidBodyProjection) -> str:
     """Return the arm's settings as YAML with new rotor inertia and friction."""
     path = projection.arm.robot.path.with_suffix(".yaml")
     content: dict[str, dict[str, dict[str, object]]] = {}
-    # All other settings in the user's file are kept.
+    # All other settings in the user's settings file are kept.
     if path.exists():
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
@@ -143,7 +143,7 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
 
 
 def _plain(value: npt.ArrayLike) -> object:
-    """Return a number, or an array as a list, rounded to twelve digits, more than any fit determines."""
+    """Return a number, or an array as nested lists, rounded to twelve digits, more than any fit determines."""
     rounded = np.vectorize(lambda x: float(_number(x)), otypes=[float])
     return rounded(value).tolist()
 

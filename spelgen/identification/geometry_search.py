@@ -103,9 +103,10 @@ def _weighed(
 
     The model of `problem` lacks presliding hysteresis. The residual of the hysteresis is a few per cent of the torque
     under each hypothesis, and hides a part of the cost decrease of the right hypothesis. With hysteresis all cost
-    decreases are larger, also those of wrong hypotheses (on recorded arms up to 32 instead of 17). Therefore the larger
-    one of two decreases is used: the decrease without hysteresis, and half of the decrease with hysteresis. For a
-    hypothesis with another delay the smaller one of both full decreases is used, since hysteresis resembles a delay.
+    decreases are larger, also the decreases of wrong hypotheses (on recorded arms up to 32 instead of 17). Therefore
+    the larger one of two decreases is used: the decrease without hysteresis, and half of the decrease with hysteresis.
+    For a hypothesis with another delay the smaller one of both full decreases is used, since hysteresis resembles a
+    delay.
 
     Args:
         problem: problem without hysteresis.

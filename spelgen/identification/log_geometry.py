@@ -104,7 +104,7 @@ class GeometryProblem:
         return other
 
     def gravity_torques(self, fit: HypothesisFit) -> tuple[np.ndarray, np.ndarray]:
-        """Return two gravity torques (S, n) [Nm, N]: with the fitted parameters, and with those of the URDF.
+        """Return two gravity torques (S, n) [Nm, N]: with the parameters of a fit, and with the URDF's parameters.
 
         Both are at the positions and with the vector of gravity of the fit's hypothesis.
         """

@@ -85,7 +85,7 @@ def require_sound_logs(
 
     A fit calls this function before it uses the logs.
     """
-    # the checks are those of `spelgen logs`, so that training and this command reject the same logs
+    # the command `spelgen logs` makes the same checks, so that training and the command reject the same logs
     report = check_logs(logs, arm, mapping)
     collect(report.errors)
     # Findings of checks that need no arm, and of the delay of torques, are omitted: the fit itself reports them.

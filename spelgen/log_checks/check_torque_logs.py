@@ -163,7 +163,7 @@ class TorqueLogs:
         )
 
     def _stated_hypothesis(self) -> Hypothesis:
-        """Return the hypothesis of a log without faults: signs, scales and offsets are those of the mapping.
+        """Return the hypothesis of a log without faults, with the signs, scales and offsets of the mapping.
 
         The scale of the torques includes the gear ratios of the drives if each motor drives one joint.
         """

@@ -83,8 +83,7 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     if not suspects.any():
         return []
     fits = []
-    # The initial signs are those of the torques of the URDF or, for joints with little load, of the velocity
-    # (friction).
+    # Initial signs are the signs of the URDF's torques or, for joints with little load, of the velocity (friction).
     for torque in (problem.residual(problem.unchanged, problem.prior_mean) + tau, qd):
         for _ in range(4):
             signs = np.where(suspects, np.sign(torque * tau), 1.0)

@@ -207,7 +207,7 @@ def rounded_factor(factor: float) -> float:
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
-    """Return a message if torques exceed the joint's effort limit so much that their unit is wrong; else None."""
+    """Return a message if torques exceed the joint's effort limit 20 times, so that their unit is wrong; else None."""
     # an effort of 0 in a URDF means that the limit is unknown
     limit, largest = joint.coordinate.effort or 0.0, joint.report.largest("tau")
     # The bound is 20 times the limit: torques in mNm are 1000 times as large as in Nm, and no drive gives 20 times its
