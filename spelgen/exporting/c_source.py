@@ -16,8 +16,8 @@ from spelgen.templates import render
 _WIDTH = 118  # maximum number of characters in a line of a C function
 FRICTION_STATES = ("z", "z_next", "z_start", "low", "high")
 """Inputs and outputs that are friction states, of type double; all others are of type ``real``."""
-# C expressions of CasADi's operations: {0} and {1} are operands. SIN, COS and other macros are the functions for float or
-# double. tanh is used only for the friction state, which is always double.
+# C expressions of the operations of CasADi: {0} and {1} are operands. SIN, COS and other macros are the functions for
+# float or double. tanh is used only for the friction state, which is always double.
 _FORMS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
