@@ -105,7 +105,7 @@ def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
 
 
 def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
-    """Return every k-th sample of the motion, with the smallest k that gives at most `max_samples` samples."""
+    """Return every k-th sample of a motion for a chart, with the smallest k that gives at most `max_samples`."""
     # Samples are omitted, not averaged: a filter would hide spikes, which the reported errors contain.
     stride = -(-len(motion.t) // max_samples)
     arrays = {name: values for name, values in vars(motion).items() if isinstance(values, np.ndarray)}
@@ -131,7 +131,7 @@ def predicted_motion(trajectory: str, windows: Windows, states: States, k: int =
 
 
 def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
-    """Return the measured and the predicted motion of a replayed log of position servos.
+    """Return the measured and the predicted motion along a replayed log of position servos, for a chart.
 
     error: (T-1, n) predicted minus measured positions [rad, m] at all samples except the first.
     """

@@ -25,7 +25,7 @@ from spelgen.logs.windows import Windows, cut_windows, joined
 
 
 def past_steps(rate: float) -> int:
-    """Return the number of sample intervals before a prediction in which the momentum observer runs.
+    """Return the number of sample intervals before a prediction from which a momentum observer estimates a disturbance.
 
     rate: sample rate [Hz].
     """
@@ -154,7 +154,7 @@ class EvaluatedLogs:
 
     @property
     def rate(self) -> float:
-        """Mean sample rate [Hz]."""
+        """Mean sample rate of the test logs [Hz]."""
         return sum(x.sample_rate for x in self.pieces) / len(self.pieces)
 
     @property

@@ -9,7 +9,7 @@ from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
 
 def number(value: float) -> float | None:
-    """Return a number rounded to five digits; None if it is not finite."""
+    """Return a number for JSON, rounded to five digits; None if it is not finite."""
     # JSON has no infinity and no NaN. Five digits exceed the accuracy of every figure, and keep pages small.
     if math.isfinite(value):
         return float(f"{value:.5g}")
@@ -38,5 +38,5 @@ def record(value: object) -> dict[str, object]:
 
 
 def finite(values: np.ndarray | torch.Tensor) -> tuple[float | None, ...]:
-    """Return the values of an array (T,) as floats, not rounded; None in place of NaN and infinity."""
+    """Return the values of an array (T,) as floats for JSON, not rounded; None in place of NaN and infinity."""
     return tuple(x if math.isfinite(x) else None for x in values.tolist())

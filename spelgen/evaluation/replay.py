@@ -19,7 +19,7 @@ from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split
 
 @dataclass(frozen=True)
 class ReplayErrors:
-    """Root mean square position errors of one predictor [rad, m].
+    """RMS errors of the positions that one predictor gives under the commands of test logs [rad, m].
 
     trajectories: {log: error over time and joints}. mean: mean of these errors. joints: error of each joint over time
     and all logs, (n,).
@@ -46,7 +46,7 @@ PositionErrors = tuple[Trajectory, np.ndarray]
 
 
 class ServoModel:
-    """The trained model as a `CommandFollower`: it predicts positions under position commands."""
+    """The trained model as a predictor of positions under position commands (`CommandFollower`), like the baselines."""
 
     about = "the model"
 

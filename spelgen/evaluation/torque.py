@@ -40,7 +40,7 @@ class TorqueErrors:
 
     @property
     def worst_nmse(self) -> float | None:
-        """Return the nMSE of the worst joint; None if all torques are constant."""
+        """Largest nMSE (squared error / variance of the torque) of all joints; None if all torques are constant."""
         return max((nmse for nmse in self.joint_nmse if nmse is not None), default=None)
 
 
@@ -76,7 +76,7 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 
 
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
-    """Return the friction state (T, n, K) of K bristles and the direction of motion (T, n), in [-1, 1].
+    """Return the past of the motion on which friction depends: bristle state (T, n, K) and direction (T, n) in [-1, 1].
 
     The methods of `dynamics` that compute friction take these values as their last arguments. A value that they do not
     take is omitted (see `known_past`).
@@ -86,15 +86,18 @@ def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]
 
 
 def mean_nmse(residual: np.ndarray, torque: np.ndarray) -> float | None:
-    """Return the mean nMSE over joints; None if all torques are constant, or an error is not finite.
+    """Return the mean over joints of the nMSE, the mean squared torque error divided by the variance of the torque.
 
-    residual, torque: (T, n) [Nm, N].
+    None is returned if all torques are constant, or if an error is not finite. residual, torque: (T, n) [Nm, N].
     """
     return _mean(_nmse(residual, torque))
 
 
 def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """Return the nMSE of each joint, (n,), for residual and torque (T, n); NaN for a joint of constant torque."""
+    """Return the nMSE of each joint, (n,): the mean squared residual divided by the variance of the torque.
+
+    It is NaN for a joint of constant torque. residual, torque: (T, n) [Nm, N].
+    """
     deviation = torque.std(axis=0)
     largest = np.abs(torque).max(axis=0, initial=0.0)
     # A torque is treated as constant if its standard deviation is at the level of rounding errors.
@@ -107,7 +110,10 @@ def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
 
 
 def _mean(nmse: np.ndarray) -> float | None:
-    """Return the mean nMSE over the joints of varying torque; None without such a joint, or if an nMSE is infinite."""
+    """Return the mean of nMSE values (n,) over the joints of varying torque, i.e. without NaN.
+
+    None is returned without such a joint, or if an nMSE is infinite.
+    """
     varying = nmse[~np.isnan(nmse)]
     return finite(varying.mean(keepdims=True))[0] if varying.size else None
 

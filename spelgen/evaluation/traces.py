@@ -127,8 +127,8 @@ def motion_traces(
     """
     growth = None
     predicted: tuple[PredictedMotion, ...] = ()
-    # If the arm is at rest, relative errors would be divided by a change of zero, so the curves of predicted motion are
-    # omitted.
+    # If the arm is at rest in the windows, relative errors would be divided by a change of zero, so the curves of
+    # predicted motion are omitted.
     if predictions is not None and predictions.windows.q.diff(dim=1).abs().max() >= AT_REST:
         errors = _relative_errors(predictions, logs.joint_types)
         growth = _growth(predictions, errors, tip)
@@ -173,7 +173,7 @@ def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> di
 def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosition | None) -> Growth:
     windows = predictions.windows
     seconds = windows.dt.cumsum(dim=1).mean(dim=0).numpy()
-    # Times are spaced geometrically, because errors grow by orders of magnitude.
+    # The times of the curve are spaced geometrically, because errors grow by orders of magnitude.
     times = np.unique(np.geomspace(1, len(seconds), TUNING.curve_times).round().astype(int)) - 1
     relative, tips = {}, {}
     for name, (q, _) in predictions.states.items():
@@ -200,7 +200,7 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
 
 
 def _quantiles(values: Tensor) -> Quantiles:
-    """Return quantiles over W windows, (T,) each, of values (W, T) at T times; NaN is treated as infinity."""
+    """Return the 10, 50 and 90 % quantiles over W windows, (T,) each, of errors (W, T) at T times; NaN is infinity."""
     ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values.numpy()
     last = len(ordered) - 1
     return Quantiles(*(ordered[round(quantile * last)] for quantile in (0.1, 0.5, 0.9)))
@@ -227,8 +227,8 @@ def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Traj
     fast = np.quantile(np.abs(joined_column(pieces, "qd")), 0.995, axis=0)
     # The grid of speeds is finer near zero, where the sign of friction changes.
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)
-    speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n): 81 speeds of each joint
-    # (81, n, n): entry [k, j] is a velocity vector at which only joint j moves.
+    speeds = torch.from_numpy(grid[:, None] * fast)  # speeds: (81, n), 81 speeds of each joint
+    # velocity vectors (81, n, n): entry [k, j] is a velocity vector at which only joint j moves.
     alone = torch.diag_embed(speeds)
     positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)
     curves = {}

@@ -91,7 +91,10 @@ def verdict(
 
 
 def _assess_torques(results: Results, uses: _Uses) -> None:
-    """Add the uses that the torque error of the worst joint permits, since a mean over joints would hide this joint."""
+    """Add to `uses` the uses for which the model's torque error is small enough, and the error as a proof.
+
+    The joint with the largest error decides, since a mean over joints would hide this joint.
+    """
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
         return
@@ -153,7 +156,7 @@ def _assess_replays(results: Results, uses: _Uses) -> None:
 
 
 def _relative(errors: StateErrors | None) -> float:
-    """Return the mean of RMS error / RMS change over the horizon; infinity if this relative error is unknown."""
+    """Return the mean relative error of a prediction (RMS error / RMS change over the horizon); infinity if unknown."""
     error = None if errors is None else errors.mean_relative_rms
     return math.inf if error is None else error
 
@@ -300,7 +303,7 @@ def _outside(
         for name, inner, outer in ranges:
             if quantity == "q" and name in independent:
                 continue
-            # 10 % is tolerated, because models extrapolate over small distances.
+            # An excess of 10 % of the range is tolerated, because models extrapolate over small distances.
             room = 0.1 * (inner["high"] - inner["low"])
             if outer["low"] < inner["low"] - room or outer["high"] > inner["high"] + room:
                 exceeded.append(f"{word} of {name}")

@@ -51,7 +51,8 @@ _ENTRIES = (
 def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFunction]:
     """Return the C functions that only the estimator calls: the terms of the momentum balance, and payload torques.
 
-    levels: noise levels; ``levels.point``, the tip in the frame of the last body, is a constant in the C code.
+    model: the model as NumPy arrays. levels: noise levels; ``levels.point``, the tip in the frame of the last body, is
+    a constant in the C code.
     """
     n, bodies = model.n, model.arm.bodies
     sizes = {"q": n, "qd": n, "qdd": n, "tau": n, "load": 10, "low": model.memory, "high": model.memory}
@@ -96,7 +97,7 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
 
 
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
-    """Return {file name: text} of the estimator's header and source."""
+    """Return {file name: text} of the estimator's C header and source, with the noise levels as constants."""
     # C has no empty arrays, so a model without bristles gets one unused break-away displacement, zero.
     breakaway = model.breakaway.ravel() if model.memory else [0.0]
     tables: dict[str, Iterable[float]] = {

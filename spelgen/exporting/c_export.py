@@ -23,7 +23,10 @@ _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 
 
 def export_c(trained: Trained) -> Exported:
-    """Return the C files of a trained model. Raises RunError if their results differ from the results of the model."""
+    """Return the C files of a trained model with a README, checked against the model.
+
+    Raises RunError if results of the C code and of the model differ.
+    """
     files, checked = c_files(trained)
     name = trained.described.name
     use = (
@@ -35,7 +38,10 @@ def export_c(trained: Trained) -> Exported:
 
 
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
-    """Return {file name: content} of the C files, and a sentence with the result of the parity check."""
+    """Return {file name: content} of the C files of a model, and a sentence with the result of the parity check.
+
+    Raises RunError if results of the C code and of the model differ.
+    """
     model, levels = trained.described, trained.levels
     entries, texts = dict(trained.entry_points), {}
     if levels is not None:
@@ -64,7 +70,10 @@ def compiler() -> str | None:
 
 
 def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -> Path:
-    """Compile C files to a shared library and return its path. Raises RunError with the compiler's messages."""
+    """Compile C files to a shared library and return its path. Raises RunError with the compiler's messages.
+
+    program: path of the C compiler. flags: further options of the compiler.
+    """
     sources = [sources] if isinstance(sources, Path) else sources
     library = sources[0].with_suffix(".so")
     command = [program, *_FLAGS, *flags, *map(str, sources), "-o", str(library), "-lm"]
@@ -78,7 +87,7 @@ def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -
 def called_by_c(
     library: Path, functions: Sequence[CFunction], dtype: type[np.floating] = np.float64
 ) -> Called:
-    """Return a function for `check_parity`, which calls an entry point of a compiled export once per state.
+    """Return a function for `check_parity`, which calls a compiled function, such as inverse_dynamics, per state.
 
     library: shared library of the export. functions: C functions in the library. dtype: type ``real`` of the C code.
     """
@@ -100,7 +109,7 @@ def called_by_c(
             # Outputs start as NaN, so that the parity check fails if a function does not write an entry.
             outputs[key] = np.full((states, *shape), np.nan, dtypes.get(key, dtype))
         arguments += outputs.values()
-        # The functions are called once per state, as by a control loop.
+        # The C functions are called once per state, as by a control loop.
         for state in range(states):
             rows = [array[state : state + 1] for array in arguments]
             call(*(row.ctypes.data_as(ctypes.c_void_p) for row in rows))

@@ -46,17 +46,23 @@ class Trained:
 
     @cached_property
     def described(self) -> description.TrainedModel:
-        """The model with NumPy arrays in place of PyTorch modules. Raises RunError for a model without rigid bodies."""
+        """The trained model with NumPy arrays in place of PyTorch modules.
+
+        Raises RunError for a model without rigid bodies.
+        """
         return describe(self.model, self.arm)
 
     @cached_property
     def entry_points(self) -> dict[str, description.EntryPoint]:
-        """The entry points to export, by name. Raises RunError for unknown names in ``entries``."""
+        """The functions of the model to export, by name, such as inverse_dynamics.
+
+        Raises RunError for unknown names.
+        """
         return description.entry_points(self.described, self.entries)
 
     @property
     def tip(self) -> str:
-        """The name of the tip link."""
+        """Name of the link that is the tip of the arm."""
         return self.arm.tip or self.arm.robot.last_link(self.arm.chain.joint_names)
 
     @property
@@ -70,7 +76,8 @@ def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
 
     Raises RunError for a model without rigid bodies. loaded: arm of the model.
     """
-    # A copy in double precision on the CPU: the user's model may be in single precision or on a GPU.
+    # The arrays are made from a copy in double precision on the CPU: the user's model may be in single precision or on
+    # a GPU.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
         preset = model.spec.options.preset
@@ -126,7 +133,7 @@ def array(value: Tensor) -> np.ndarray:
 
 
 def servos_of(model: ArmModel) -> description.Servos | None:
-    """Return the position servos of a model; None if it has none."""
+    """Return the constants of the position servos of a model as NumPy arrays; None for a model under torques."""
     if model.input_quantity == "torque":
         return None
     kp, kd, limit, dead_zone = map(array, model.servo.prepare())
@@ -134,7 +141,7 @@ def servos_of(model: ArmModel) -> description.Servos | None:
 
 
 def _residuals(model: ArmModel) -> description.Residuals:
-    """Return the residual terms of a model, without the terms that are zero."""
+    """Return the residual terms of a model as NumPy arrays and splines, without the terms that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
     # The residual term of M is a sum of functions; entries to which no function contributes are omitted.
@@ -203,11 +210,12 @@ def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
 
 
 def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[description.Harmonics, ...]:
-    """Return the torque ripple: up to two elements per joint, for harmonics of the joint and of its motor.
+    """Return the torque ripple of all joints: up to two elements per joint, for harmonics of joint and motor.
 
-    weights: (n, 2 H), coefficients of H cosines, then of H sines. The H frequencies are harmonics of a revolution of
-    the joint, then harmonics of a revolution of the motor. An export computes the harmonics k = 1, 2, ... of one
-    frequency in sequence. Harmonics with zero amplitude are therefore removed only after the last nonzero one.
+    terms: residual terms, for the frequencies. weights: (n, 2 H), coefficients of H cosines, then of H sines. The H
+    frequencies are harmonics of a revolution of the joint, then harmonics of a revolution of the motor. An export
+    computes the harmonics k = 1, 2, ... of one frequency in sequence. Harmonics with zero amplitude are therefore
+    removed only after the last nonzero one.
     """
     ripple = []
     cosines, sines = map(array, weights.chunk(2, dim=-1))

@@ -20,7 +20,7 @@ UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 
 @dataclass(frozen=True)
 class Exporter:
-    """A format of exports.
+    """A format to which models are exported, such as urdf or onnx.
 
     Attributes:
         function_name: "module:function" of the function that returns the ``Exported`` for a ``Trained``. It is imported
@@ -95,14 +95,14 @@ class Exported:
 
 
 def format_by_extension(path: Path) -> str:
-    """Return the name of the format with this file name extension. Raises RunError if no format has it."""
+    """Return the name of the export format with the extension of `path`. Raises RunError if no format has it."""
     if path.suffix not in _BY_SUFFIX:
         raise RunError(f"the name {path.name!r}", expected="FILE.urdf, FILE.xml or --to FORMAT")
     return _BY_SUFFIX[path.suffix]
 
 
 def require_fitting(to: str, path: Path) -> None:
-    """Raise RunError if the extension of a path contradicts the format."""
+    """Raise RunError if the extension of an output path contradicts the export format `to`."""
     suffix = EXPORTERS[to].suffix
     if path.suffix == suffix or (not suffix and path.is_dir()):
         return
@@ -123,7 +123,7 @@ def with_readme(
     summary: Sequence[str],
     example: Sequence[str] = (),
 ) -> Exported:
-    """Return an export whose files include a README.
+    """Return an export whose files include a README for its users.
 
     Args:
         trained: the model and its arm.

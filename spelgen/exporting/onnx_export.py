@@ -23,7 +23,10 @@ from spelgen.exporting.tuning import TUNING
 
 
 def export_onnx(trained: Trained) -> Exported:
-    """Return an .onnx file for each entry point. Raises RunError if results of ONNX Runtime and the model differ."""
+    """Return an .onnx file for each entry point, a function of the model such as inverse_dynamics, with a README.
+
+    Raises RunError if results of ONNX Runtime and of the model differ.
+    """
     model = torch_export.prepared(trained)
     models, files = {}, {}
     for name in torch_export.program_names(trained):
@@ -45,7 +48,7 @@ def export_onnx(trained: Trained) -> Exported:
 
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
-    """Return the serialised ONNX model of an entry point."""
+    """Return the serialised ONNX model of an entry point, a function of the model such as inverse_dynamics."""
     # Functions without an ONNX operator are replaced already while torch traces the program.
     with _silent_exporter():
         with _Decomposed():
@@ -80,7 +83,10 @@ def _silent_exporter() -> Iterator[None]:
 
 
 def _cross(a: Tensor, b: Tensor, *, dim: int) -> Tensor:
-    """Return the cross product along a dimension of size 3; a, b: (...,), of equal shapes."""
+    """Return the cross product of a and b, (...,) of equal shapes, along the dimension `dim` of size 3.
+
+    It replaces torch.linalg.cross, which has no ONNX operator.
+    """
     second, third = torch.tensor([1, 2, 0]), torch.tensor([2, 0, 1])
     forward = a.index_select(dim, second) * b.index_select(dim, third)
     return forward - a.index_select(dim, third) * b.index_select(dim, second)
@@ -135,7 +141,7 @@ def _cholesky_ex(matrix: Tensor) -> _Cholesky:
 
 
 def _scalar_tensor(s: float, dtype: int = onnx.TensorProto.DOUBLE, **options: object) -> onnxscript.ir.Value:
-    """Return an ONNX constant in double precision; torch's own translation would round it to float32."""
+    """Return the ONNX constant of a number in double precision; torch's own translation would round it to float32."""
     value = np.array(s, dtype=onnx.helper.tensor_dtype_to_np_dtype(dtype))
     constant = onnxscript.opset18.Constant(value=onnx.numpy_helper.from_array(value))
     return cast("onnxscript.ir.Value", constant)
@@ -147,7 +153,7 @@ def _softplus(x: Tensor) -> Tensor:
 
 
 class _Decomposed(TorchFunctionMode):
-    """Context in which torch functions without ONNX operators are replaced by decompositions into other functions."""
+    """Context in which torch functions without ONNX operators, such as solve, are replaced by decompositions."""
 
     functions: ClassVar[dict[object, Callable[..., object]]] = {
         torch.nn.functional.softplus: _softplus,
@@ -164,7 +170,7 @@ class _Decomposed(TorchFunctionMode):
         args: tuple[object, ...] = (),
         kwargs: dict[str, object] | None = None,
     ) -> object:
-        """Call the decomposition of a torch function if ``functions`` has one, otherwise the function itself."""
+        """Call the replacement of a torch function if it is one of ``functions``, otherwise the function itself."""
         return self.functions.get(func, func)(*args, **(kwargs or {}))
 
 

@@ -24,7 +24,7 @@ Called = Callable[[str, Values], Mapping[str, np.ndarray]]
 
 
 def _energy(model: ArmModel, q: Tensor, qd: Tensor) -> Tensor:
-    """Return the two columns kinetic energy and potential energy, (states, 2) [J], at q and qd, (states, n)."""
+    """Return kinetic and potential energy of the torch model, two columns (states, 2) [J], at q and qd, (states, n)."""
     kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
     return torch.stack([kinetic, model.potential_energy(q)], dim=-1)
 
@@ -47,7 +47,7 @@ _REFERENCES: dict[str, Callable[..., Tensor]] = {
 
 @dataclass(frozen=True)
 class Parity:
-    """Result of a parity check.
+    """Result of the comparison of an export with the torch model.
 
     differences: {entry point: largest difference between export and torch model, divided by the largest value of the
     torch model}. summary: sentence for the user with the largest of these differences.
@@ -58,7 +58,7 @@ class Parity:
 
 
 def require_parity(differences: dict[str, float], tolerance: float, states: int) -> Parity:
-    """Return the differences as a ``Parity``. Raises RunError if a difference is above the tolerance.
+    """Return the differences between export and model as a ``Parity``. Raises RunError if one is above the tolerance.
 
     differences: {entry point: largest relative difference}. states: number of random states, for the summary.
     """
@@ -114,9 +114,10 @@ def check_parity(
 
 
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0) -> Values:
-    """Return {input of entry points: random values}, (states, n) each, and (states, memory) for z.
+    """Return {input of the dynamics, such as q: random values for comparisons}, (states, n) each.
 
-    The seed is fixed, so that exports are reproducible. memory: number of values in the friction state z.
+    The friction state z is (states, memory). The seed is fixed, so that exports are reproducible. memory: number of
+    values in the friction state z.
     """
     random = np.random.default_rng(0)
     # Velocities are mostly within the limits, because friction at higher speeds is extrapolated.
@@ -152,12 +153,12 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
 
 
 def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> Values:
-    """Return {output: array (states, ...)} of one entry point, computed by the torch model.
+    """Return {output: array (states, ...)} of one function of the torch model, such as inverse_dynamics, as reference.
 
     Args:
         model: the torch model in double precision.
         trained: the model with its arm, for the friction state and the tip.
-        name: name of the entry point.
+        name: name of the function (entry point).
         inputs: {input: array (states, n)}.
     """
     entry = ENTRY_POINTS[name]

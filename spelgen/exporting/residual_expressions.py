@@ -79,7 +79,7 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
 
 
 def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
-    """Return c, (m, 1), with 1/2 qd^T R qd = c^T mass; qd: (n, 1).
+    """Return the coefficients c, (m, 1), with which 1/2 qd^T R qd = c^T mass; qd: (n, 1).
 
     R is the residual term of M, `mass` (m, 1) are the m nonzero entries in its lower triangle.
     """

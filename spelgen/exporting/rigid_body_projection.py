@@ -93,7 +93,7 @@ class RigidBodyProjection:
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     """Return the rigid bodies and the friction that approximate a trained model of ``arm`` best."""
-    # A copy in double precision, so that the user's model is not changed.
+    # The model is copied and converted to double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
     # The model's own rigid bodies are used if it has some; its residual terms are omitted, as the summary states.
@@ -137,7 +137,7 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
     load = gravity.square().mean().sqrt().clamp(min=1e-9)
 
     def distance() -> Tensor:
-        """Return the cost plus the ridge penalty, ()."""
+        """Return the cost of the rigid bodies plus the ridge penalty, a scalar."""
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
         # The parameters represent differences from the values in the URDF. The ridge penalty towards the URDF is
@@ -182,7 +182,7 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
         columns = np.stack([np.abs(speed), speed > 0, speed < 0], axis=-1)
         (viscous, forward, backward), _ = nnls(columns, torque.mean(axis=0))
         residual = torque - columns @ (viscous, forward, backward)
-        # A joint without friction has the error zero, not 0 / 0.
+        # The error of a joint without friction is zero, not 0 / 0.
         error = np.linalg.norm(residual) / (np.linalg.norm(torque) or 1.0)
         rows.append((viscous, forward, -backward, float(error)))
     return NearestFriction(*np.array(rows).T)

@@ -160,7 +160,7 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     result = energies(model.arm, positions, model.inertias.tolist(), float)
     mass = ca.SX(model.n, model.n)
     for (row, column), entry in result.mass.items():
-        # Both triangles have the same expression, which CasADi computes once.
+        # Both triangles of M have the same expression, which CasADi computes once.
         mass[row, column] = mass[column, row] = entry
     return mass, ca.SX(result.potential)
 
@@ -181,7 +181,7 @@ def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: 
     jacobian = ca.SX(6, q.shape[0])
     while carrier >= 0:
         body = bodies[carrier]
-        # The joint axis is the z axis of the body's frame.
+        # the joint axis is the z axis of the body's frame
         axis, origin = poses[carrier + 1][:3, 2], poses[carrier + 1][:3, 3]
         column = ca.vertcat(axis, ca.SX(3, 1))
         if body.joint_type == "revolute":

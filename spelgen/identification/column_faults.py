@@ -24,7 +24,7 @@ class WrongOrder(Fault):
     """Kind of fault: the columns of the joints are in another order."""
 
     def __init__(self, code: str, description: str, rows: tuple[int, ...], starts: int = 9) -> None:
-        """Define the columns that are in another order.
+        """Define the columns of a log (motion, torques or both) that may belong to other joints.
 
         Args:
             code: code of the finding.
@@ -36,7 +36,7 @@ class WrongOrder(Fault):
         self._rows, self._starts = rows, starts
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits of the hypotheses that exchange the columns of two joints, for all pairs of joints."""
+        """Yield least-squares fits of the log's torques with the columns of two joints exchanged, for all pairs."""
         return map(problem.fit, self._swapped(base.hypothesis))
 
     def _swapped(self, base: Hypothesis) -> Iterator[Hypothesis]:
@@ -46,10 +46,10 @@ class WrongOrder(Fault):
             yield base.changed(self, source=source)
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with the best orders of all joints, one per start of the search.
+        """Yield least-squares fits of the log's torques with the best orders of all joints, one per start.
 
-        An order is improved by exchanging two joints at a time. The search also starts at random orders, since the
-        cost has local minima for arms with many joints.
+        A search starts at an order of the joints, and improves it by exchanging two joints at a time. It also starts at
+        random orders, since the cost has local minima for arms with many joints.
         """
         joints, rng = problem.arm.joint_names, np.random.default_rng(0)
         present = np.arange(len(joints))
@@ -79,10 +79,10 @@ class WrongOrder(Fault):
                 yield fit
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the settings that correct the columns of a joint.
+        """Return the settings that assign the right columns of the log to a joint; {} if it has its own columns.
 
-        If all its columns belong to one other joint, this is the name of that joint in the log; otherwise the column of
-        each quantity.
+        If all columns belong to one other joint, the setting is `name`, the name of that joint in the log; otherwise
+        `columns`, the column of each quantity.
         """
         names, mapping = correction.arm.joint_names, correction.mapping
         motion, torque = (names[k] for k in correction.hypothesis.source[:, joint])
@@ -105,15 +105,15 @@ class WrongScale(Fault):
     """
 
     def __init__(self, factors: Sequence[np.ndarray]) -> None:
-        """Define the candidates for the factors, (2, n) each."""
+        """Define the candidates for factors on the motion and torque of n joints, (2, n) each."""
         self.factors = factors
 
     @abstractmethod
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints with this fault, for factors on their motion and torque, (n,) each."""
+        """Return the mask (n,) of the joints with this fault, for factors (n,) that correct their motion and torque."""
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit of the hypothesis with each candidate for the factors."""
+        """Yield the least-squares fit of the log's torques with each candidate for factors on motion and torque."""
         reading = base.hypothesis
         for factor in self.factors:
             # Both signs of the offset are tried: the offset in the mapping may have been measured with the right or the
@@ -123,7 +123,10 @@ class WrongScale(Fault):
                 yield problem.fit(reading.changed(self, scale=reading.scale * factor, offset=offset))
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the settings of a joint that change: `sign`, `units`, `gain`, `torque_offset` and `offset`."""
+        """Return the settings that correct the scale of a joint's signals, as far as they change.
+
+        These settings are `sign`, `units`, `gain`, `torque_offset` and `offset`.
+        """
         if not self.has(*correction.factors)[joint]:
             return {}
         name, (motion, torque) = correction.arm.joint_names[joint], correction.factors[:, joint].tolist()
@@ -160,11 +163,11 @@ class JointSense(WrongScale):
         super().__init__([np.stack([sign, torque]) for sign in signs for torque in (np.ones(n), sign)])
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose motion has the opposite sense."""
+        """Return the mask (n,) of the joints whose motion has the opposite sense: their factor `motion` is negative."""
         return np.asarray(motion < 0)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about the fault, which states whether the torques have the opposite sense, too."""
+        """Return the text about joints of the opposite sense, which states whether it includes their torques."""
         motion, torque = correction.factors
         if (torque[motion < 0] < 0).all():
             return "positions, velocities and torques of the opposite sense"
@@ -181,7 +184,7 @@ class TorqueSense(WrongScale):
         super().__init__([np.stack([np.ones(n), sign]) for sign in (-np.ones(n), *(1.0 - 2.0 * np.eye(n)))])
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints of which only the torque has the opposite sense."""
+        """Return the mask (n,) of the joints of which only the torque has the opposite sense (factor below 0)."""
         return np.asarray((torque < 0) & (motion > 0))
 
 
@@ -222,7 +225,7 @@ class TorqueUnit(WrongScale):
             yield best
 
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
-        """Return the fit with the torques multiplied by `factors` (n,).
+        """Return the least-squares fit of the torques after multiplication by `factors` (n,), one per joint.
 
         The total factor on the torques, relative to the unchanged log, is rounded to two digits.
         """
@@ -231,11 +234,11 @@ class TorqueUnit(WrongScale):
         return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * present])))
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose torque has another unit."""
+        """Return the mask (n,) of the joints whose torque has another unit: a factor `torque` other than 1 or -1."""
         return np.asarray(np.abs(torque) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about the fault: the largest factor, and the opposite sense of the torques.
+        """Return the text about torques in another unit: the largest factor, and the opposite sense of the torques.
 
         The opposite sense is omitted if another fault of the hypothesis, such as `TorqueSense`, has it.
         """
@@ -250,7 +253,7 @@ class TorqueUnit(WrongScale):
         return f"torques of another unit{sense}, {times}"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if all factors are between 0.1 and 10; else "".
+        """Return the code of a warning if all factors on the torques are between 0.1 and 10; else "", for an error.
 
         Masses of a URDF may be wrong by such a factor, but never by a factor of ten.
         """
@@ -265,11 +268,11 @@ class PositionUnit(WrongScale):
     rarity = 2
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose positions have another unit."""
+        """Return the mask (n,) of the joints whose positions have another unit: a factor `motion` not 1 or -1."""
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about the fault, with the units of the logged positions."""
+        """Return the text about positions in another unit, which names this unit."""
         joints = np.flatnonzero(self.has(*correction.factors)).tolist()
         return f"positions in {' and '.join(dict.fromkeys(position_unit(correction, k) for k in joints))}"
 
@@ -291,9 +294,9 @@ def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
 
 
 def position_unit(correction: Correction, joint: int) -> str:
-    """Return the unit of a joint's positions, such as "deg", that corresponds to the scale in the hypothesis.
+    """Return the unit, such as "deg", that a hypothesis about a log assumes for the positions of a joint.
 
-    It is the unit whose factor to SI units is nearest to this scale.
+    It is the unit whose factor to SI units is nearest to the scale of the positions in the hypothesis.
     """
     scale = abs(float(correction.hypothesis.scale[0, joint]))
     units = UNITS[correction.arm.coordinates[joint].joint_type]

@@ -27,7 +27,7 @@ class ZeroOffset(Fault):
     rarity = 2
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit with the best offset of each joint.
+        """Yield, for each joint, the least-squares fit of the log's torques with the best zero offset of its position.
 
         Offsets as small as calibration errors, and offsets that hardly lower the torque residual, are omitted.
         """
@@ -37,15 +37,16 @@ class ZeroOffset(Fault):
     def _best(
         self, problem: GeometryProblem, base: HypothesisFit, joint: int, is_revolute: bool
     ) -> Iterator[HypothesisFit]:
-        """Yield the fit with the best offset of one joint, if it is large enough and lowers the torque residual.
+        """Yield the least-squares fit with the best zero offset of a joint, if it lowers the torque residual enough.
 
-        A multiple of 90 degrees is preferred to the offset of minimum cost if its cost is about equal.
+        Offsets as small as calibration errors are omitted. A multiple of 90 degrees is preferred to the offset of
+        minimum cost if its cost is about equal.
         """
         reading, unit = base.hypothesis, np.eye(len(base.hypothesis.offset))[joint]
         min_offset = GEOMETRY.min_angle if is_revolute else GEOMETRY.min_shift
 
         def shifted(values: np.ndarray) -> Hypothesis:
-            """Return the hypothesis in which the joint's offset is changed by `values`, (1,) [rad, m]."""
+            """Return the hypothesis in which the joint's zero offset is changed by `values`, (1,) [rad, m]."""
             return reading.changed(self, offset=reading.offset + values * unit)
 
         starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if is_revolute else np.zeros((1, 1))
@@ -68,7 +69,7 @@ class ZeroOffset(Fault):
             yield best if is_right_angle else problem.fit(shifted(offset.round(4)))
 
     def text(self, correction: Correction) -> str:
-        """Return the text about the fault, with the largest offset of the joints that have the right sense."""
+        """Return the text about zero offsets: the largest offset of the joints that have the right sense."""
         shifts = correction.hypothesis.offset - correction.unchanged.offset
         shifts[correction.factors[0] < 0] = 0.0
         k = int(np.abs(shifts).argmax())
@@ -78,7 +79,7 @@ class ZeroOffset(Fault):
         return f"positions with another zero, by {size}"
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the setting `offset` of a joint of the right sense; {} for the opposite sense.
+        """Return the setting `offset` of a joint, the zero of its position; {} for a joint of the opposite sense.
 
         `JointSense` returns the offset for joints of the opposite sense, since another sign changes the offset, too.
         """
@@ -88,7 +89,7 @@ class ZeroOffset(Fault):
         return {"offset": plain_number(offset)}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if all offsets are so small that they may be errors of the URDF; else ""."""
+        """Return the code of a warning if all zero offsets may be errors of the URDF, since they are small; else ""."""
         shifts = correction.hypothesis.offset - correction.unchanged.offset
         return self.code if np.abs(shifts).max() < GEOMETRY.serious_angle else ""
 
@@ -100,10 +101,11 @@ class Delay(Fault):
     rarity = 2
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with the best delay of the signals of each joint, and of the torques of all joints.
+        """Yield least-squares fits of the log's torques in which the signals of a joint, or all torques, are delayed.
 
-        Delays as short as the apparent delays that friction causes are omitted. Nothing is yielded if the hypothesis of
-        `base` has a delay, or if the samples do not contain the signals around them, which a shift in time needs.
+        Each fit has the best delay of its signals. Delays as short as the apparent delays that friction causes are
+        omitted. Nothing is yielded if the hypothesis of `base` has a delay, or if the samples do not contain the
+        signals around them, which a shift in time needs.
         """
         reading, longest = base.hypothesis, problem.samples.longest_delay
         if not longest or reading.delay.any():
@@ -113,7 +115,7 @@ class Delay(Fault):
         for signals in _delayed_signals(len(reading.offset)):
 
             def delayed(delay: np.ndarray, signals: np.ndarray = signals) -> Hypothesis:
-                """Return the hypothesis in which `signals`, a (2, n) mask, have a delay, (1,) [s]."""
+                """Return the hypothesis that `signals`, a mask (2, n), are delayed by `delay`, (1,) [s]."""
                 return reading.changed(self, delay=reading.delay + delay * signals)
 
             # The descent starts at the best of three delays: a Gauss-Newton step from 0 would be too short for noisy
@@ -134,14 +136,14 @@ class Delay(Fault):
                 yield fit
 
     def text(self, correction: Correction) -> str:
-        """Return the text about the fault: the delayed signals and the longest delay."""
+        """Return the text about delayed signals: which signals of the joints, and the longest delay."""
         delay = correction.hypothesis.delay
         longest = 1e3 * float(delay.ravel()[np.abs(delay).argmax()])
         order = "later" if longest > 0 else "earlier"
         return f"{_late_signals(delay)} logged {abs(longest):.3g} ms {order}"
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the setting `delay` of a joint; {} if the setting `torque_delay` of the log is enough."""
+        """Return the setting `delay` of a joint's signals; {} if the setting `torque_delay` of the log is enough."""
         mapping, delays = correction.mapping, correction.hypothesis.delay[:, joint]
         if self.log_keys(correction) or not delays.any():
             return {}
@@ -154,7 +156,7 @@ class Delay(Fault):
         return {"delay": {**present.model_dump(exclude_unset=True), **late}}
 
     def log_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the setting `torque_delay` if the torques of all joints have the same delay; else {}."""
+        """Return the setting `torque_delay` of the log if the torques of all joints have one delay; else {}."""
         delay = correction.hypothesis.delay[1]
         if not delay.any() or (delay != delay[0]).any():
             return {}
@@ -172,9 +174,9 @@ class JointClock(Fault):
     advice = "no setting corrects it: log all joints with one clock"
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit in which the constant delay of `base` is replaced by a delay that changes linearly.
+        """Yield the least-squares fit of the torques in which the delay of `base` changes linearly with time.
 
-        Nothing is yielded if `base` has no delay, or a delay that changes.
+        Nothing is yielded if `base` has no delay, or a delay that already changes.
         """
         delay = base.hypothesis.delay
         if delay.any() and not base.hypothesis.drift.any():
@@ -183,7 +185,7 @@ class JointClock(Fault):
             yield from self._best(problem, reading, np.full(2, delay[delay != 0][0]), 1.0 * (delay != 0))
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with a delay that changes linearly during a recording, at most three."""
+        """Yield at most three least-squares fits in which the delay of some signals changes linearly with time."""
         reading, starts = unchanged.hypothesis, []
         for signals in _delayed_signals(len(reading.offset)) if problem.samples.longest_delay else ():
             for last in GEOMETRY.clock_starts:
@@ -198,9 +200,10 @@ class JointClock(Fault):
     def _best(
         self, problem: GeometryProblem, reading: Hypothesis, start: np.ndarray, signals: np.ndarray
     ) -> Iterator[HypothesisFit]:
-        """Yield the fit with the best delays (2,) [s] at the start and the end of a recording, if they differ.
+        """Yield the least-squares fit with the best delays (2,) [s] at the start and end of a recording.
 
-        start: (2,) [s] initial delays of the descent. signals: (2, n) mask of the delayed motions and torques.
+        Nothing is yielded if both delays are about equal. start: (2,) [s] initial delays of the descent. signals: (2,
+        n) mask of the delayed motions and torques.
         """
         delays, best = problem.descend(
             lambda x: self._drifting(problem, reading, x, signals), start, largest=0.3, smallest=0.002
@@ -220,7 +223,7 @@ class JointClock(Fault):
         return reading.changed(self, delay=first * signals, drift=drift * signals)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about the fault: the signals, and the relative error of the rate of their clock."""
+        """Return the text about signals with another clock: which signals, and the error of the clock's rate."""
         drift = correction.hypothesis.drift
         largest = float(drift.ravel()[np.abs(drift).argmax()])
         return f"{_late_signals(drift)} of a clock that runs {abs(largest):.2%} {'fast' if largest > 0 else 'slow'}"
@@ -259,16 +262,16 @@ class Compensation(Fault):
     rarity = 3
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit with the best fraction of gravity, or without gravity if it fits about equally well.
+        """Yield the least-squares fit of the torques with the best fraction of gravity, or without gravity.
 
-        The fraction is between -0.5 and 0.5.
+        The fraction is between -0.5 and 0.5. The fit without gravity is preferred if its cost is about equal.
         """
         present = np.array(base.hypothesis.gravity)
         if not present.any():
             return
 
         def reduced(fraction: np.ndarray) -> Hypothesis:
-            """Return the hypothesis in which the torques contain this fraction, (1,), of gravity."""
+            """Return the hypothesis that the torques contain this fraction, (1,), of gravity."""
             return with_gravity(self, base, fraction * present)
 
         without = problem.fit(reduced(np.zeros(1)))
@@ -281,7 +284,7 @@ class Compensation(Fault):
         yield some if some.cost < without.cost - GEOMETRY.ambiguous else without
 
     def text(self, correction: Correction) -> str:
-        """Return the text about the fault, with the fraction of gravity that remains in the torques."""
+        """Return the text about a gravity compensation, with the fraction of gravity that remains in the torques."""
         present = np.array(correction.unchanged.gravity)
         fraction = float(np.array(correction.hypothesis.gravity) @ present / (present @ present))
         return f"torques in which gravity is compensated: {fraction:.2g} times the URDF's gravity remains in all joints"
@@ -298,21 +301,21 @@ class Gravity(Compensation):
     rarity = 1
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit with the best direction of gravity; directions along the axes of the root link are preferred.
+        """Yield the least-squares fit of the torques with the best direction of gravity.
 
-        Nothing is yielded if the direction differs from the present one by less than errors of the mounting, or if the
-        torques may contain no gravity.
+        Directions along the axes of the root link are preferred. Nothing is yielded if the direction differs from the
+        present one by less than errors of the mounting, or if the torques may contain no gravity.
         """
         present = np.array(base.hypothesis.gravity)
         size = float(np.linalg.norm(present))
         standard = size or 9.81  # [m/s^2] magnitude of gravity
 
         def turned(gravity: np.ndarray) -> Hypothesis:
-            """Return the hypothesis with this vector of gravity, (3,) [m/s^2]."""
+            """Return the hypothesis that gravity is this vector, (3,) [m/s^2]."""
             return with_gravity(self, base, gravity)
 
         def normalised(gravity: np.ndarray) -> np.ndarray:
-            """Return the vector of the present magnitude in the direction of `gravity`, (3,) [m/s^2]."""
+            """Return the vector (3,) [m/s^2] in the direction of `gravity`, with the present magnitude."""
             return np.asarray(gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9))
 
         # Gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as for
@@ -340,14 +343,14 @@ class Gravity(Compensation):
             yield axis if is_axis else problem.fit(turned(new.round(3)))
 
     def text(self, correction: Correction) -> str:
-        """Return the text about the fault, with the angle between gravity in the settings and in the hypothesis."""
+        """Return the text about the orientation of the arm: the angle between gravity in settings and hypothesis."""
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         cosine = float(new @ present / max(np.linalg.norm(new) * np.linalg.norm(present), 1e-9))
         angle = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
         return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if the tilt is so small that it may be an error of the mounting; else ""."""
+        """Return the code of a warning if the tilt of gravity may be an error of the mounting; else ""."""
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         is_small = np.linalg.norm(present - new) < GEOMETRY.serious_angle * np.linalg.norm(present)
         return self.code if is_small else ""

@@ -45,7 +45,7 @@ class Coupling:
 
     @property
     def pair(self) -> list[int]:
-        """Indices of both joints: `joint`, `moved_by`."""
+        """Indices of the coupled joints: the joint that the motor drives, and the joint that also rotates the motor."""
         return [self.joint, self.moved_by]
 
 
@@ -96,12 +96,12 @@ class DriveProblem:
 
     @property
     def free(self) -> list[int]:
-        """Indices of the joints that have no declared coupling and a torque that is not constant."""
+        """Indices of the joints for which a coupling is searched: no coupling declared, and a torque that varies."""
         joins = self.speeds != 0
         return np.flatnonzero(varying(self.rows[..., -1]) & ((joins | joins.T).sum(axis=0) == 1)).tolist()
 
     def of_torques(self, tau: np.ndarray) -> DriveProblem:
-        """Return the problem with the torques replaced by tau (S, n)."""
+        """Return the problem with other joint torques, tau (S, n) [Nm, N], for example without a delay."""
         rows = np.concatenate([self.rows[..., :-1], tau[..., None]], axis=2)
         return replace(self, rows=rows, products=block_products(rows, self.products.shape[1]))
 
@@ -127,7 +127,7 @@ class DriveProblem:
         return np.asarray(np.maximum(errors[..., 0, 0].T, TUNING.negligible))
 
     def cost(self, coupling: Coupling) -> float:
-        """Return the squared torque residual of both joints with a coupling, divided by the residual without it."""
+        """Return the squared torque residual of two coupled joints, divided by the residual without their coupling."""
         errors = self.coupled(coupling).errors[:, coupling.pair].mean()
         return float(errors / self.errors[:, coupling.pair].mean())
 
@@ -139,7 +139,7 @@ class DriveProblem:
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
         motion = self.samples.motion[1:]
         qd, qdd = motion[..., [joint]] + ratio * motion[..., [moved_by]]
-        columns = FRICTION.columns(qd, qdd)[:, 0]  # (S, effects) of the motor
+        columns = FRICTION.columns(qd, qdd)[:, 0]  # columns: (S, effects) of the motor
         n, effects = self.rows.shape[1], columns.shape[1]
         of_motor = np.arange(effects) * n + joint - effects * n - 1
         rows = self.rows[:, coupling.pair].copy()
@@ -155,8 +155,8 @@ class DriveProblem:
 def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     """Return the coupling of two neighbouring joints that lowers the torque residual most; None if none is significant.
 
-    The second value is the squared residual of both joints with the coupling, divided by the residual without it.
-    Joints with a declared coupling are omitted.
+    The second value is the squared torque residual of both joints with the coupling, divided by the residual without
+    it. Joints with a declared coupling are omitted.
     """
     # all pairs are compared on every fourth sample with three ratios, which suffices to find the best pair
     coarse = problem.in_one_block(4)
@@ -211,7 +211,7 @@ def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: in
     """
     if mended.mean() >= gain * logged.mean():
         return False
-    # relative differences are between -1 and 1, so that no single block dominates their mean
+    # `gains` are relative differences between -1 and 1, so that no single block dominates their mean
     gains = (logged - mended) / (logged + mended)
     standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
     # The best of hundreds of candidates is always better by chance. The significance level of 1/400 is therefore

@@ -31,7 +31,7 @@ RANK = attrgetter("rank")
 def kinds_of_faults(
     arm: Chain, torque_factors: Sequence[np.ndarray] = (), position_scale: np.ndarray | None = None
 ) -> tuple[Fault, ...]:
-    """Return all kinds of faults of logs of an arm with n joints that the search corrects.
+    """Return all kinds of faults that the search tests on logs of an arm with n joints, such as an opposite sense.
 
     torque_factors: candidates (n,) for factors on the torques. position_scale: (n,) factor from logged positions to SI
     units; None: the unit of positions is right.
@@ -57,12 +57,12 @@ def kinds_of_faults(
 
 
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
-    """Return the fit of the unchanged log and, if any hypotheses fit significantly better, the fits of the best.
+    """Return the fit of the unchanged log and, if hypotheses about faults fit significantly better, their fits.
 
-    Fits that are about as good as the best one are returned, too; the best one is first. faults: kinds of faults that
-    are tested.
+    The best fit is first, and is followed by fits that are about as good. faults: kinds of faults; each kind and
+    combinations are tested.
     """
-    # the many hypotheses are compared on few samples, and the best ones below on more
+    # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]

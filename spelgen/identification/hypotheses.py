@@ -44,7 +44,7 @@ class Hypothesis:
 
     @classmethod
     def unchanged(cls, arm: Chain) -> Hypothesis:
-        """Return the hypothesis of the unchanged log, in SI units and without offsets."""
+        """Return the hypothesis that a log in SI units has no faults: no exchanged columns, offsets or delays."""
         n = len(arm.coordinates)
         x, y, z = map(float, arm.gravity)
         order, zeros = np.tile(np.arange(n), (2, 1)), np.zeros((2, n))
@@ -52,7 +52,7 @@ class Hypothesis:
 
     @property
     def motion_key(self) -> tuple[bytes, Vector3]:
-        """Key under which the regressor is cached: it depends only on the motion and on gravity."""
+        """Key under which the regressor of the hypothesis is cached, since it depends only on motion and gravity."""
         arrays = (self.source[0], self.scale[0], self.offset, self.delay[0], self.drift[0])
         return b"".join(x.tobytes() for x in arrays), self.gravity
 
@@ -62,7 +62,7 @@ class Hypothesis:
         return replace(self, faults=faults, **changes)  # type: ignore[arg-type]
 
     def signals(self, samples: MotionSamples) -> MotionSamples:
-        """Return the samples of the joints, in SI units, for logged samples under this hypothesis."""
+        """Return the signals of the joints, in SI units, that logged samples mean under this hypothesis."""
         delays = _per_signal(self.delay)
         if self.drift.any():
             delays = delays + samples.times[:, None, None] * _per_signal(self.drift)
@@ -113,5 +113,5 @@ class HypothesisFit:
 
     @property
     def rank(self) -> float:
-        """Cost plus penalties for rare faults, so that common faults of about the same cost are preferred."""
+        """Cost plus penalties for rare faults; the hypothesis of lowest rank is preferred."""
         return self.cost + sum(fault.rarity for fault in self.hypothesis.faults)

@@ -111,12 +111,12 @@ class Identification:
 
     @cached_property
     def intervals(self) -> tuple[Interval, ...]:
-        """Base parameters with their 95 % intervals."""
+        """The base parameters, each with its standard deviation and its 95 % interval."""
         estimates = zip(self.base.names, self.values.tolist(), self.deviations.tolist(), strict=True)
         return tuple(Interval(name, value, std, base_unit(name)) for name, value, std in estimates)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the result in JSON form; the form is a public contract with the version `SCHEMA`."""
+        """Return the result in JSON form for other programs; `SCHEMA` is the version of the form."""
         joints = list(self.arm.joint_names)
         friction = self.method.friction
         records = []
@@ -160,7 +160,7 @@ class Identification:
         ])  # fmt: skip
 
     def listings(self) -> tuple[Listing, Listing]:
-        """Return the table of the torque residual per joint, and the table of the base parameters."""
+        """Return two tables for display: the torque residual of each joint, and the base parameters."""
         joints: list[tuple[str, ...]] = []
         for x, rms, nmse in zip(self.arm.coordinates, self.residual, self.nmse, strict=True):
             joints.append((x.name, f"{rms:.4g}", UNITS[x.joint_type].torque, f"{nmse:.3g}"))

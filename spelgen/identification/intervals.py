@@ -37,23 +37,23 @@ class Interval:
 
     @property
     def half(self) -> float:
-        """Half the width of the 95 % interval."""
+        """Half the width of the 95 % interval of the quantity, in its unit."""
         return QUANTILE * self.std
 
     @property
     def low(self) -> float:
-        """Lower end of the 95 % interval."""
+        """Lower end of the 95 % interval of the quantity, in its unit."""
         low = self.value - self.half
         return max(low, 0.0) if self.positive else low
 
     @property
     def high(self) -> float:
-        """Upper end of the 95 % interval."""
+        """Upper end of the 95 % interval of the quantity, in its unit."""
         return self.value + self.half
 
     @property
     def determined(self) -> str:
-        """Class of precision, ``firm``, ``fair``, ``weak`` or ``may be zero``.
+        """Class of precision of the estimate: ``firm``, ``fair``, ``weak`` or ``may be zero``.
 
         The bounds of the first three classes are standard deviations of 5 %, 20 % and 100 % of the value.
         """
@@ -125,8 +125,10 @@ def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
     In coordinates in which the lower bound is the identity, eigenvalues of the covariance below one become one. The
     lower bound must be positive definite.
     """
-    scale = lower_bound.diagonal().sqrt()  # scaled to a unit diagonal, since parameters have different units
-    # For samples without noise the lower bound is singular except for rounding errors, so its eigenvalues are clamped.
+    # the lower bound is scaled to a unit diagonal, since parameters have different units
+    scale = lower_bound.diagonal().sqrt()
+    # The eigenvalues of the lower bound are clamped: for samples without noise it is singular except for rounding
+    # errors.
     variances, axes = torch.linalg.eigh(lower_bound / scale.outer(scale))
     deviations = variances.clamp(min=1e-12).sqrt()
     root, inverse = scale.unsqueeze(-1) * axes * deviations, (axes / deviations / scale.unsqueeze(-1)).mT

@@ -40,7 +40,7 @@ class Correction:
 
     @property
     def factors(self) -> np.ndarray:
-        """Factors (2, n) on the motion and on the torques, with which the present scales are multiplied."""
+        """Factors (2, n) on the motion and torques of n joints, relative to the scales of the current mapping."""
         return np.asarray(self.hypothesis.scale / self.unchanged.scale)
 
     def lines(self) -> str:
@@ -93,17 +93,17 @@ class Fault(ABC):
 
     @abstractmethod
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterable[HypothesisFit]:
-        """Return the fits of hypotheses that correct one fault of this kind in addition to the faults of `base`."""
+        """Return least-squares fits of hypotheses that correct one more fault of this kind than `base`."""
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterable[HypothesisFit]:
-        """Return the fits of corrections whose search takes seconds, such as orders of all joints.
+        """Return fits of hypotheses whose search takes seconds, such as orders of all joints.
 
-        They are computed only if no correction among `fits` explains the torques.
+        The search calls it only if no hypothesis among `fits` explains the torques.
         """
         return ()
 
     def text(self, correction: Correction) -> str:
-        """Return a description of the fault of the log."""
+        """Return a description of the fault of a log, for the error message."""
         return self.description
 
     def joints(self, correction: Correction) -> list[str]:
@@ -120,7 +120,7 @@ class Fault(ABC):
         return {}
 
     def robot_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the settings of the robot, outside the group `logs`, that correct the fault."""
+        """Return the settings of the robot, outside the group `logs`, that correct the fault, such as `gravity`."""
         return {}
 
     def minor_code(self, correction: Correction) -> str:

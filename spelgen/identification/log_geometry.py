@@ -64,7 +64,7 @@ class GeometryProblem:
         self._chains: dict[Vector3, BodyChain] = {}  # chains of bodies, per vector of gravity
 
     def thinned(self, count: int) -> GeometryProblem:
-        """Return the problem on at most `count` samples, evenly spaced."""
+        """Return the same problem on at most `count` samples, evenly spaced."""
         fewer = copy(self)
         fewer.samples, fewer._equations = self.samples.thinned(count), {}
         return fewer
@@ -88,14 +88,17 @@ class GeometryProblem:
         return extended
 
     def with_signs(self, signs: np.ndarray) -> GeometryProblem:
-        """Return the problem with torques that are multiplied by signs, (S, n)."""
+        """Return the same problem with logged torques that are multiplied by `signs`, (S, n), 1 or -1 each."""
         other, values = copy(self), self.samples.values.copy()
         values[:, :, 3] *= signs[..., None]
         other.samples = self.samples._replace(values=values)
         return other
 
     def without_gravity(self, joint: int) -> GeometryProblem:
-        """Return the problem of the unchanged log with a model in which one joint's torque contains no gravity."""
+        """Return the problem of the unchanged log with a model in which the torque of one joint contains no gravity.
+
+        The comparison of both problems' costs shows whether the logged torque of the joint contains gravity.
+        """
         weightless = replace(self.unchanged, gravity=(0.0, 0.0, 0.0))
         rows = self.equations(self.unchanged)[0].copy()
         rows[:, joint] = self.equations(weightless)[0][:, joint]
@@ -154,8 +157,8 @@ class GeometryProblem:
         """Return the fit that minimises the cost under a hypothesis, by iteratively reweighted least squares.
 
         The noise variance of each joint is marginalised: the joint's negative log likelihood is N / 2 log(sum of
-        squared residuals). The prior of the inertial parameters is a Student t distribution, so that its precision
-        is reweighted in each iteration.
+        squared residuals), with the number N of independent errors. The prior of the inertial parameters is a Student t
+        distribution, so that its precision is reweighted in each iteration.
         """
         rows, normal = self.equations(hypothesis)
         signals = hypothesis.signals(self.samples)
@@ -185,9 +188,10 @@ class GeometryProblem:
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
-        """Return the Gauss-Newton step (D,) of additional quantities, fitted together with the parameters of a fit.
+        """Return the Gauss-Newton step (D,) of D quantities of a hypothesis, such as a delay.
 
-        columns: (S, n, D) derivative of the residual with respect to these quantities.
+        The parameters of `fit` are estimated together with the quantities. columns: (S, n, D) derivative of the torque
+        residual with respect to the quantities.
         """
         rows, _ = self.equations(fit.hypothesis)
         tau, known = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
@@ -209,7 +213,7 @@ class GeometryProblem:
         smallest: float,
         allowed: Callable[[np.ndarray], np.ndarray] = np.asarray,
     ) -> tuple[np.ndarray, HypothesisFit]:
-        """Return continuous quantities of a hypothesis, (D,), with a low cost, and their fit.
+        """Return continuous quantities (D,) of a hypothesis, such as a delay, that minimise the cost, and their fit.
 
         At most four Gauss-Newton steps are made. The descent ends when a step does not lower the cost, or is
         negligible.
@@ -311,14 +315,16 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         typical: mass assumed for a body without <inertial> [kg].
     """
     if own[0] <= 0:
-        # a wide prior: standard deviations of 20 times the typical mass, with an extent of at least half a metre
+        # without <inertial> the prior is wide: standard deviations of 20 times the typical mass, at an extent of at
+        # least 0.5 m
         extent = max(length, 0.5)
         return 20.0 * typical * np.diag(np.repeat([1.0, extent, extent**2], (1, 3, 6)))
     mass = own[0]
     center, moments = own[1:4] / mass, own[[4, 7, 9]]
     gyration = np.sqrt(max(float(moments.sum() / 2 / mass - center @ center), 0.0))
     extent = max(float(np.linalg.norm(center)), gyration, length / 2, 0.03)
-    radius = max(gyration, 0.3 * extent)  # bounded from below, since some URDFs contain point masses
+    # the radius of gyration is bounded from below, since some URDFs contain point masses
+    radius = max(gyration, 0.3 * extent)
     root = np.zeros((10, 10))
     root[:, 0] = own
     for axis, unit in enumerate(np.eye(3)):
@@ -327,7 +333,7 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         root[1:4, 1 + axis] = mass * extent * unit
         root[4:, 1 + axis] = mass * extent * tensor[np.triu_indices(3)]
     root[4:, 4:] = mass * radius**2 * np.eye(6)
-    # standard deviations of 50 %: of masses, of centres of mass relative to the extent of the body, and of tensors
+    # the standard deviations are 50 %: of masses, of centres of mass relative to the extent of the body, and of tensors
     return 0.5 * root
 
 

@@ -53,23 +53,23 @@ class MotionSamples(NamedTuple):
 
     @classmethod
     def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
-        """Return the samples of signals, (S, n) each, without the signals around them."""
+        """Return samples of signals at single times, (S, n) each, without the signals around them (E = 1)."""
         values = np.stack([q, qd, qdd, tau], axis=2)[..., None]
         return cls(values, np.zeros((*q.shape, 0)), np.sign(qd), np.zeros(len(q)))
 
     @property
     def motion(self) -> np.ndarray:
-        """Positions, velocities and accelerations, (3, S, n)."""
+        """Positions, velocities and accelerations at the samples, (3, S, n) [rad, m] and per s, per s^2."""
         return np.moveaxis(self.central[..., :3], 2, 0)
 
     @property
     def tau(self) -> np.ndarray:
-        """Joint torques, (S, n)."""
+        """Joint torques at the samples, (S, n) [Nm, N]."""
         return self.central[..., 3]
 
     @property
     def central(self) -> np.ndarray:
-        """Signals (S, n, 4) at the times of the samples."""
+        """Signals q, qd, qdd and tau at the times of the samples, (S, n, 4)."""
         return self.values[..., self.values.shape[3] // 2]
 
     def at(self, delays: np.ndarray) -> np.ndarray:
@@ -108,7 +108,7 @@ class MotionSamples(NamedTuple):
 
 
 def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
-    """Return the concatenation of several sets of samples."""
+    """Return the samples of several recordings as one set, in the given order."""
     return MotionSamples(*map(np.concatenate, zip(*samples, strict=True)))
 
 
@@ -190,5 +190,5 @@ class DriveLog:
         return sum(len(x.values) for x in self._samples)
 
     def samples(self) -> MotionSamples | None:
-        """Return the collected samples, at most `DriveHintTuning.samples`; None if there are none."""
+        """Return the samples of all trajectories, at most `DriveHintTuning.samples`; None if there are none."""
         return joined_samples(self._samples).thinned(HINTS.samples) if self._count else None

@@ -39,7 +39,7 @@ class TorqueDelay:
 
     @property
     def notes(self) -> list[Diagnostic]:
-        """Message about the delay, or about a coupling that prevents the estimation of a delay; [] if none is found."""
+        """Message about the delay, or about a coupling, with which no delay is estimated; [] without both."""
         if self.coupling is not None:
             joint, other = (number + 1 for number in self.coupling[0].pair)
             message = (
@@ -112,8 +112,8 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     if not varying(problem.rows[..., -1]).any():
         return NO_DELAY
     estimates = []
-    # Dry friction with and without a state, with the same filter as the torques. A delay that only one of both models
-    # shows is an error of this model.
+    # Both friction models have dry friction with the same filter as the torques, one with and one without a state. A
+    # delay that only one of both models shows is an error of this model.
     _, qd, qdd = samples.motion
     for dry in (samples.bent, samples.direction[..., None]):
         friction = FRICTION.columns(qd, qdd, dry, problem.speeds)

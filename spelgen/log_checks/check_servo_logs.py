@@ -83,7 +83,10 @@ def find_servo_unit(joints: Sequence[JointReport], unit: str) -> Advice | None:
 
 
 def _are_encoders(steps: np.ndarray) -> bool:
-    """Return True if most quantisation steps (J,) [degrees] are steps of encoders with 2**10 to 2**14 counts."""
+    """Return True if most quantisation steps (J,) [degrees] of J joints are about 360 / 2**k, k from 10 to 14.
+
+    Encoders of position servos have these steps.
+    """
     counts = 360 / steps
     powers = np.clip(np.round(np.log2(counts)), 10, 14)
     return bool(len(steps) and (np.abs(counts / 2**powers - 1) < ENCODER_STEP).mean() > 0.5)
@@ -123,10 +126,10 @@ class Following(NamedTuple):
 
 
 def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Following | None:
-    """Return the tracking of the commands of n joints over all recordings; None if no recording is long enough.
+    """Return the tracking of the commands of n position servos: delay, correlation, gain and errors over all recordings.
 
-    saturation: (n,) [rad, m] distance of a position from its command at which the servo's torque is at its limit;
-    infinity if the limit is unknown.
+    None is returned if no recording is long enough. saturation: (n,) [rad, m] distance of a position from its command
+    at which the servo's torque is at its limit; infinity if the limit is unknown.
     """
     pieces: list[Trajectory] = []
     for log in logs:
@@ -145,7 +148,8 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
         tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))
     best = np.abs(correlations).argmax(axis=0)
     correlation = np.take_along_axis(np.array(correlations), best[None], axis=0)[0]
-    moves = u_std > 0.01  # [rad, m] a command with a smaller standard deviation is constant with noise
+    # [rad, m] standard deviation below which a command is treated as constant with noise
+    moves = u_std > 0.01
     saturated = np.mean(np.abs(commands - q) > saturation, axis=0)
     joints = []
     for k, error in enumerate(_steady_state_errors(pieces)):
@@ -200,7 +204,7 @@ class ServoLogs:
         self._logs: list[Trajectory] = []
 
     def add(self, trajectory: Trajectory) -> None:
-        """Add a trajectory. Raises LogError if it has no commands."""
+        """Add a trajectory to the logs that `check` tests. Raises LogError if it has no commands."""
         require_commands(trajectory)
         self._logs.append(trajectory)
 

@@ -63,7 +63,7 @@ class TorqueLogs:
         self._seconds, self._is_bag = 0.0, False
 
     def add(self, trajectory: Trajectory) -> None:
-        """Add a trajectory. Raises LogError if it has no torques."""
+        """Add a trajectory to the logs that `check` tests. Raises LogError if it has no torques."""
         require_torques([trajectory])
         inputs = self._drives.inputs.T
         pieces = []
@@ -86,7 +86,7 @@ class TorqueLogs:
 
         The findings are added to `summary`. reports: statistics of each joint.
         """
-        # a check is omitted if the mapping accepts it, or if every trajectory does
+        # a check is omitted if the mapping accepts its findings, or if the mappings of all trajectories do
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         chain, empty = self._arm.chain, MotionSamples.of(*np.zeros((4, 0, len(reports))))
         motion = joined_samples([empty, *self._samples]).thinned(6000)
@@ -96,7 +96,8 @@ class TorqueLogs:
             completed.append(replace(report, gravity=gravity))
             offset = self._mapping.offset("q", coordinate.name)
             evidence.append(JointEvidence(coordinate, completed[-1], offset))
-        # the model is fitted only to sound logs: wrong velocities give wrong friction, and other faults wrong hints
+        # The model is fitted only to logs without errors: wrong velocities give wrong friction, and other faults wrong
+        # hints.
         is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
@@ -291,7 +292,7 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
     """
     visible = 0.5 * float(problem.samples.tau.std(axis=0).max())
     gravity = float(np.linalg.norm(fit.hypothesis.gravity))
-    levers: list[float] = []  # [m] length of the chain from the first joint to each body
+    levers: list[float] = []  # [m] `levers`: length of the chain from the first joint to each body
     for k, body in enumerate(problem.arm.bodies):
         length = float(np.linalg.norm(np.array(body.translation, dtype=float)))
         levers.append(0.0 if body.parent < 0 else levers[body.parent] + length)
@@ -308,8 +309,8 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
             axis = stated / size
             ratio = float(axis @ found) / size
             deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / size
-            # CAD models are wrong by a factor of less than 2.5. Four standard deviations are required, since one of
-            # many bodies may exceed two by chance.
+            # Masses of CAD models are wrong by a factor of less than 2.5. Four standard deviations are required, since
+            # one of many bodies may exceed two by chance.
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
             message = (

@@ -131,8 +131,8 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
         sides = zip(SIDES, at_torque[..., k], strict=True)
         doubt = certain * deviation[:, k]
         excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
-        # The excess must be larger than the friction: friction estimated from few samples may be wrong, and its error
-        # is no evidence of a limit.
+        # The torque excess at a flat top must be larger than the friction: friction estimated from few samples may be
+        # wrong, and its error is no evidence of a limit.
         sure = max(certain * noise[k], 0.08 * samples.tau[:, k].std(), abs(friction[k]))
         is_clipped = excess > sure
         if is_clipped.any():

@@ -132,11 +132,11 @@ class LogReport:
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """The warnings among the findings."""
+        """The findings that are warnings, without the remarks."""
         return tuple(x for x in self.findings if x.severity == "warning")
 
     def to_dict(self) -> dict[str, object]:
-        """Return the report in JSON form; `schema` is the version of the form."""
+        """Return the report in JSON form for other programs; `schema` is the version of the form."""
         return {
             "schema": 3,
             "robot": self.robot,
@@ -160,7 +160,7 @@ class LogReport:
         )
 
     def listings(self, limit: int | None = None) -> list[Listing]:
-        """Return all tables; the table of sample times contains at most `limit` trajectories."""
+        """Return all tables of the report; the table of sample times contains at most `limit` trajectories."""
         return [_clock_table(self.trajectories, limit), *self.tables]
 
     def _short_listings(self) -> list[Listing]:
@@ -227,7 +227,10 @@ def joint_report(
 
 
 def _median(values: np.ndarray, share: float) -> float | None:
-    """Return the median of the finite values; None if the fraction of finite values is at most `share`."""
+    """Return the median of the finite values of a statistic, one per trajectory.
+
+    None is returned if the fraction of finite values is at most `share`.
+    """
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) > share * len(values) else None
 

@@ -93,7 +93,7 @@ def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
 
 
 def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the residual of values after projection onto the span of the columns.
+    """Return the residual of signals `values` after projection onto the span of `columns` (least squares).
 
     columns: (S, C) for S samples. values: (S,) or (S, K).
     """
@@ -248,7 +248,7 @@ def find_one_way(joint: JointEvidence) -> str | None:
     )
 
 
-# checks that need no torques, and therefore also apply to arms under position servos
+# `POSITION_CHECKS` need no torques, and therefore also apply to arms under position servos
 POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
 CHECKS: list[Check[JointEvidence]] = [
     Check("torque-beyond-drive", "error", find_beyond_drive, expected="Nm or N at the joint", do=SAY_UNIT),

@@ -84,7 +84,7 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     weights = 1.0 / distances.prod(axis=2)
     weights /= np.linalg.norm(weights, axis=1, keepdims=True)
     differences = np.einsum("tk,tnk->tn", weights, sliding_window_view(values, 4, axis=0))
-    # the median of |x| is 0.6745 standard deviations for a normally distributed x
+    # For normally distributed noise, the median of the magnitudes is 0.6745 standard deviations.
     return np.asarray(np.median(np.abs(differences), axis=0) / 0.6745)
 
 

@@ -119,11 +119,11 @@ def logs_page(report: LogReport, arm: Chain, inputs: np.ndarray) -> str:
 
 
 def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
-    """Return the charts of each joint: position, velocity and torque.
+    """Return the charts of each joint along a log: position, velocity and torque.
 
-    The chart of the velocity also shows dq/dt, and the chart of the torque also shows the gravity torque of the URDF.
-    A log of position servos has only the chart of the position, which also shows the command. inputs: input matrix G
-    (n, n): joint torques = G times logged torques.
+    The chart of the velocity also shows dq/dt, and the chart of the torque also shows the gravity torque of the URDF. A
+    log of position servos has only the chart of the position, which also shows the command. inputs: input matrix G (n,
+    n): joint torques = G times logged torques.
     """
     # The log is split at gaps first, so that dq/dt contains no difference across a gap.
     segments = [segment[:: -(-len(log.t) // TUNING.points)] for segment in split_at_gaps(log)]

@@ -36,7 +36,10 @@ class SimulatedCurves:
 
 
 def write_comparison(study: Study, sections: Sequence[ArmResults]) -> Path:
-    """Write comparison.html into the study's folder; return its path."""
+    """Write comparison.html, the page about a comparison of presets, into the study's folder; return its path.
+
+    sections: results of the runs on each arm.
+    """
     curves = {}
     jobs = {job.arm: job for job in study.jobs}
     for section in sections:
@@ -84,7 +87,7 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
         # every example.
         along = next(iter(examples.values()))
         true = true_mass(truth, torch.from_numpy(along.q), arm.joint_names).numpy()
-        # Only the lower triangle is shown, since M is symmetric.
+        # Only the lower triangle of M is shown, since M is symmetric.
         rows, columns = np.tril_indices(len(arm.joint_types))
         entries = {name: m[:, rows, columns].T for name, m in {"true": true, **learned}.items()}
         mass = mass_panels(along.t, entries, {"true": "truth", **styles}, arm.joint_types, width=400)

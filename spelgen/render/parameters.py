@@ -37,7 +37,7 @@ class ParameterTable(Listing):
 def parameter_tables(
     model: ArmModel | None, arm: Arm | None, identified: Content | None, posterior: Posterior | None
 ) -> list[Listing]:
-    """Return the tables of a run's parameters.
+    """Return the tables of the parameters of a run for a page: base parameters, bodies, joints, constants of M.
 
     Args:
         model: The trained model; None if the run has no weights.
@@ -61,7 +61,10 @@ def parameter_tables(
 
 
 def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
-    """Return the inertial parameters in the order of ``Body.inertia``, (bodies, 10) [kg, kg m, kg m^2]."""
+    """Return the inertial parameters of the bodies of a model, (bodies, 10) [kg, kg m, kg m^2].
+
+    They are in the order of ``Body.inertia``.
+    """
     return np.asarray(model.inertial_parameters.detach())
 
 
@@ -130,7 +133,10 @@ def _number(value: float) -> str:
 
 
 def _interval(parameter: Content) -> str:
-    """Return the value of a base parameter as text, with its confidence interval if it has one."""
+    """Return the text of a base parameter of least squares: its value and, if known, half its 95 % interval.
+
+    parameter: the base parameter in its JSON form.
+    """
     if parameter["deviation"] is None:
         return _number(parameter["value"])
     return Interval("", parameter["value"], parameter["deviation"]).text
@@ -168,7 +174,10 @@ def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None
 
 
 def _about_center(body: np.ndarray) -> tuple[str, str, str]:
-    """Return mass, centre of mass and principal moments about the centre as text. body: inertial parameters (10,)."""
+    """Return mass, centre of mass and principal moments about the centre of a body, each as text for a table.
+
+    body: inertial parameters (10,).
+    """
     # A body in a URDF may have no mass. The cells of its centre of mass and principal moments are then empty.
     if body[0] <= 0:
         return f"{body[0]:.4g}", "", ""
@@ -222,7 +231,8 @@ def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]
     # M is linear in the learned functions of q and in the learned constants. Therefore the derivative of M with respect
     # to a constant does not depend on q. `bases` contains the derivatives, (constants, n, n).
     functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
-    # The derivative is M itself if this constant is 1, and all other constants and all functions are 0.
+    # The derivative of M with respect to a constant is M for the value 1 of this constant, if all other constants and
+    # all functions are 0.
     zeros = torch.zeros(functions, count, dtype=torch.float64)
     units = torch.eye(count, dtype=torch.float64)
     rows = []

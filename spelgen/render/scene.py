@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class SceneLink:
-    """A link and its motion relative to its parent.
+    """A link in the animated picture of an arm, and its motion relative to its parent.
 
     The displacement of the joint is ratio * q[joint] + offset [rad, m].
 
@@ -70,7 +70,10 @@ class Scene:
 
 
 def scene(urdf: Path, joints: Sequence[str]) -> Scene:
-    """Return the scene of an arm. joints: names of its moving joints. Raises the errors of ``read_urdf``."""
+    """Return the links of an arm with their shapes, for the animated picture on a page.
+
+    joints: names of the moving joints of the arm. Raises the errors of ``read_urdf``.
+    """
     robot = read_urdf(urdf)
     constraint = mimic_constraint(robot, joints)
     # Other branches of the robot (a second arm, a base with wheels) are not drawn.
@@ -122,10 +125,10 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
-    """Return the names of the drawn links, parents first.
+    """Return the names of the links that the animated picture of an arm shows, parents first.
 
-    The drawn links are the links from the root to each of the `joints`, all links that move with the joints, and links
-    that are fixed to another drawn link.
+    The picture shows the links from the root to each of the `joints`, all links that move with the joints, and links
+    that are fixed to another shown link.
     """
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
     carried = set()
@@ -180,7 +183,7 @@ def _rotation(joint: UrdfJoint) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Triangle mesh in the link frame.
+    """Triangle mesh of a link, in the frame of the link.
 
     vertices: (V, 3) [m], V vertices. faces: (F, 3), vertex indices of F triangles, counterclockwise from outside.
     """
@@ -210,14 +213,14 @@ def tube(start: np.ndarray, end: np.ndarray, radius: float, sides: int = 10) -> 
     """
     import trimesh
 
-    # Between joints at nearly the same place a tube would be a disc, so it is omitted.
+    # A tube between joints at nearly the same place would be a disc, so it is omitted.
     if np.linalg.norm(end - start) <= radius / 2:
         return []
     return [trimesh.creation.cylinder(radius, segment=[start, end], sections=sides)]
 
 
 def triangles(shape: LinkShape) -> Trimesh:
-    """Return the triangles of a shape in the frame of its link."""
+    """Return the triangle mesh of a visual shape (mesh, box, cylinder or sphere) in the frame of its link."""
     from trimesh import Trimesh, creation
 
     # Cylinders have 12 sides and spheres 8 x 10 faces: pages must remain small, and edges are not visible.
