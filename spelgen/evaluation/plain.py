@@ -24,7 +24,7 @@ def listed(values: np.ndarray) -> object:
 
 
 def array(values: object) -> np.ndarray:
-    """Return the array of floats for nested lists from `listed`; None becomes NaN."""
+    """Return the array of floats that `listed` has converted to nested lists; None becomes NaN."""
     return np.array(values, dtype=float)
 
 

@@ -46,7 +46,7 @@ class Subject:
     """
 
     def __init__(self, tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None) -> None:
-        """Initialize from a model, a fit or the folder of a run.
+        """Collect the evaluated model and the data of its fit from a model, a fit or the folder of a run.
 
         arm: arm, or path of its URDF; None: the arm of the fit.
         """
@@ -77,7 +77,10 @@ class Subject:
 
     @property
     def fitted_arm(self) -> Arm | None:
-        """Arm of the fitted baselines; None if there are none. Raises UrdfError, ArmError or SettingsError."""
+        """Arm of the baselines that were fitted to the training logs; None if there are none.
+
+        Raises UrdfError, ArmError or SettingsError.
+        """
         if self.fitted_urdf is None or not self.baselines:
             return None
         return arm_of_spec(self.spec, self.fitted_urdf)

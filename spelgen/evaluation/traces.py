@@ -222,8 +222,8 @@ def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> M
 
 def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory]) -> FrictionTrace:
     q = joined_column(pieces, "q")
-    # The largest speed of a joint's curve is a quantile of the logged speeds and not their maximum, because velocities
-    # that were differentiated from positions often have spikes.
+    # The largest speed of a joint's friction curve is a quantile of the logged speeds and not their maximum, because
+    # velocities that were differentiated from positions often have spikes.
     fast = np.quantile(np.abs(joined_column(pieces, "qd")), 0.995, axis=0)
     # The grid of speeds is finer near zero, where the sign of friction changes.
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)

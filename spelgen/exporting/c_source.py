@@ -151,7 +151,7 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
 def _parameter(model: TrainedModel, name: str, size: str) -> str:
     """Return the C declaration of a parameter `name` of a function, an array.
 
-    Size: number of its entries, a C expression.
+    size: number of entries of the array, a C expression.
     """
     # C has no arrays of length zero: z is a pointer, which may be NULL for a model without bristles.
     return f"double *{name}" if name in FRICTION_STATES else f"{model.name}_real {name}[{size}]"

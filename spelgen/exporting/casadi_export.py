@@ -80,10 +80,10 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
-    """Return the function whose output k is the Jacobian of ``function`` with respect to its input k.
+    """Return the CasADi function of the Jacobians of ``function`` with respect to its inputs, one output per Jacobian.
 
-    entry: entry point of the result; it has at most as many outputs as inputs. function: function with a single output
-    and the inputs of ``entry``.
+    Output k is the Jacobian with respect to input k. entry: entry point of the result; it has at most as many outputs
+    as inputs. function: function with a single output and the inputs of ``entry``.
     """
     arguments = function.mx_in()
     (output,) = function.call(arguments)
@@ -119,7 +119,7 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
 
 
 def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return {name of a symbol in `residual_expressions`: its value as an expression in q and qd}.
+    """Return {name of a residual term, see `residual_expressions`: its value as an expression in q and qd}.
 
     q, qd: symbols, (n, 1) each; qd: None if no term that depends on velocity is needed.
     """

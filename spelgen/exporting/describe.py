@@ -31,6 +31,8 @@ class Trained:
     """A trained model, its arm, and options of the export.
 
     Attributes:
+        model: the trained model.
+        arm: arm of the model.
         entries: names of the functions to export, for formats that consist of functions; empty: all except derivatives.
         intervals: tables of the fitted parameters with 95 % intervals, for the README.
         float32: whether ONNX and torch programs compute in float32; otherwise in float64.

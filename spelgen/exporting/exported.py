@@ -59,10 +59,11 @@ else:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Exported:
-    """A trained model in the format of another tool.
+    """A trained model in the format of another tool: the content of its files.
 
     Attributes:
         to: name of the format.
+        robot: name of the arm.
         files: {path in the folder: content}. For a format that is a single file, the keys are extensions such as
             ``.urdf``, which replace the extension of the file name.
         summary: sentences for the user.

@@ -84,7 +84,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
     random = random_inputs(arm.coordinates, states)
     controls = torques = random["tau"]
     if servos is not None:
-        # The dead zone is omitted, since MuJoCo's position actuators have none.
+        # The dead zone of servos is omitted, since MuJoCo's position actuators have none.
         controls = random["u"]
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)

@@ -99,7 +99,7 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """
     n = matrix.shape[-1]  # `n` is a Python integer, so that tracing unrolls the loop over k
     identity = torch.eye(n, dtype=matrix.dtype)
-    # Either of the matrix and the right-hand side may have no batch dimension.
+    # Either `matrix` or `right` may have no batch dimension.
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
     # The elimination transforms matrix and right-hand side together, as columns of one array.
     rows = torch.cat([matrix.expand(*batch, n, n), right.expand(*batch, *right.shape[-2:])], dim=-1)

@@ -107,7 +107,8 @@ def check_parity(
     for name in names:
         outputs = called(name, inputs)
         expected = _expected(exact, trained, name, inputs)
-        # The outputs are reshaped, since for an arm of one joint some formats return a vector in place of a matrix.
+        # The outputs of the export are reshaped, since for an arm of one joint some formats return a vector in place of
+        # a matrix.
         errors = [relative(outputs[key].reshape(value.shape), value) for key, value in expected.items()]
         differences[name] = float(np.max(errors))  # np.max returns NaN if any error is NaN
     return require_parity(differences, tolerance, states)
@@ -128,7 +129,8 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
         "qd": 0.5 * speed * random.standard_normal(q.shape),
         "qdd": 2.0 * speed * random.standard_normal(q.shape),
         "dq": 0.05 * speed * random.standard_normal(q.shape),
-        # The standard deviation of z has the size of break-away displacements, fractions of a milliradian.
+        # The standard deviation of the friction state z has the size of break-away displacements, fractions of a
+        # milliradian.
         "z": 1e-4 * random.standard_normal((states, memory)),
         # Forward dynamics are linear in tau, so the size of tau has no influence on the relative difference.
         "tau": 10.0 * random.standard_normal(q.shape),
@@ -137,7 +139,10 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
 
 
 def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
-    """Return the URDF's velocity limits, (n,) [rad/s, m/s]; joints without a limit get a nominal speed."""
+    """Return the velocity limits of the joints in the URDF, (n,) [rad/s, m/s], to scale random velocities.
+
+    Joints without a limit get a nominal speed.
+    """
     nominal = {"revolute": TUNING.angular_speed, "prismatic": TUNING.linear_speed}
     return np.array([joint.velocity or nominal[joint.joint_type] for joint in coordinates])
 

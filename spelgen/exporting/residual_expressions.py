@@ -27,7 +27,7 @@ Scalars = TypeVar("Scalars", ca.SX, ca.MX)
 
 
 def residual_symbols(model: TrainedModel) -> Symbols:
-    """Return {name: symbol} of all residual terms; terms that the model does not have are structural zeros."""
+    """Return {name: CasADi symbol} of all residual terms of a model; absent terms are structural zeros."""
     n = model.n
     residuals = model.residuals
     entries, factors = len(residuals.entries), len(residuals.friction)

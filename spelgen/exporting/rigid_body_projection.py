@@ -48,13 +48,16 @@ class NearestFriction(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RigidBodyProjection:
-    """Parameters of an arm of n joints in the form that a URDF and a settings file can contain.
+    """A trained model approximated by rigid bodies, in the form that a URDF and a settings file can contain.
 
     Attributes:
+        arm: arm of the model, with n joints.
         inertias: (bodies, 10), inertial parameters in the frames of the joints.
         armature: (n,) [kg m^2, kg], rotor inertia of the motors.
         motors: C, (n, n), motor velocities = C qd.
+        friction: viscous and Coulomb friction that approximate the model's friction.
         inputs: G at q = 0, (n, n), joint torques = G times motor torques.
+        servos: position servos of the model; None for an arm under torques.
         exact: True if the trained model consists of rigid bodies, which are used; False if rigid bodies were fitted to
             it.
         mass_error, gravity_error: RMS difference between the rigid bodies and the trained model, of M and of the
@@ -76,7 +79,7 @@ class RigidBodyProjection:
 
     @property
     def summary(self) -> tuple[str, str]:
-        """Two sentences about the differences from the trained model: one on rigid bodies, one on friction."""
+        """Two sentences for the user about differences from the trained model: of the rigid bodies, and of friction."""
         bodies = "bodies are those of the model"
         if not self.exact or self.mass_error or self.gravity_error:
             source = "the rigid bodies nearest to the model"

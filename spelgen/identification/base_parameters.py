@@ -83,7 +83,7 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
         for k, weight in parameter.weights:
             combination[row, k] = float(weight)
     drives = np.linalg.lstsq(columns[:, chosen], columns[:, inertial:], rcond=None)[0]
-    # smaller coefficients are rounding errors
+    # coefficients below this bound are rounding errors
     drives[np.abs(drives) < 1e-8 * np.abs(drives).max(initial=1.0)] = 0.0
     combination[:, inertial:] = drives
     base_names = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :].tolist()]
@@ -96,7 +96,8 @@ def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, cou
     count: number of parameters. motors: (n, n) matrix from joint speeds to drive speeds; None: identity.
     """
     n = len(arm.coordinates)
-    shape = (2 * count // n + 1, n)  # at least twice as many equations as parameters
+    # `shape`: random states for at least twice as many equations as parameters
+    shape = (2 * count // n + 1, n)
     q, qd, qdd = np.random.default_rng(0).uniform(-3.0, 3.0, (3, *shape))
     deflection = np.random.default_rng(1).uniform(-1.0, 1.0, (*shape, len(BRISTLES)))
     rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, deflection, motors)], axis=2)

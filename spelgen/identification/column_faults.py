@@ -21,7 +21,7 @@ UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
 
 
 class WrongOrder(Fault):
-    """Kind of fault: the columns of the joints are in another order."""
+    """Kind of fault of a log: the columns of the joints are in another order."""
 
     def __init__(self, code: str, description: str, rows: tuple[int, ...], starts: int = 9) -> None:
         """Define the columns of a log (motion, torques or both) that may belong to other joints.
@@ -154,7 +154,7 @@ class WrongScale(Fault):
 
 
 class JointSense(WrongScale):
-    """Kind of fault: the positions and velocities of a joint have the opposite sense, with or without its torque."""
+    """Kind of fault of a log: positions and velocities of a joint have the opposite sense, with or without torque."""
 
     code = "joint-sense"
 
@@ -175,7 +175,7 @@ class JointSense(WrongScale):
 
 
 class TorqueSense(WrongScale):
-    """Kind of fault: the torques of all joints, or of one joint, have the opposite sense."""
+    """Kind of fault of a log: the torques of all joints, or of one joint, have the opposite sense."""
 
     code = "torque-sense"
     description = "torques of the opposite sense"
@@ -189,7 +189,7 @@ class TorqueSense(WrongScale):
 
 
 class TorqueUnit(WrongScale):
-    """Kind of fault: torques in another unit.
+    """Kind of fault of a log: torques in another unit.
 
     The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`). A
     candidate need not lower the cost much, unlike other faults: the fit without it explains torques that are too small
@@ -202,7 +202,10 @@ class TorqueUnit(WrongScale):
     evidence = "by the URDF's gravity"
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit with each candidate for the factors, and a fit with one factor per joint if it is better."""
+        """Yield least-squares fits of torques that are multiplied by each candidate for factors (n,) on torques.
+
+        A fit with a separate factor for each joint is added if it is better.
+        """
         if self in base.hypothesis.faults or not self.factors:
             return
         fits = list(super().fits(problem, base))
@@ -262,7 +265,7 @@ class TorqueUnit(WrongScale):
 
 
 class PositionUnit(WrongScale):
-    """Kind of fault: positions of all revolute or of all prismatic joints in another unit than in the mapping."""
+    """Kind of fault of a log: positions of all revolute or all prismatic joints in another unit than in the mapping."""
 
     code = "joint-unit"
     rarity = 2

@@ -21,7 +21,7 @@ RIGHT_ANGLE = np.pi / 2
 
 
 class ZeroOffset(Fault):
-    """Kind of fault: the positions of a joint have another zero than in the URDF."""
+    """Kind of fault of a log: the positions of a joint have another zero than in the URDF."""
 
     code = "joint-zero"
     rarity = 2
@@ -95,7 +95,10 @@ class ZeroOffset(Fault):
 
 
 class Delay(Fault):
-    """Kind of fault: the motion, the torque or all signals of a joint, or all torques, are late or early in the log."""
+    """Kind of fault of a log: some signals were logged later or earlier than the others.
+
+    These signals are the motion, the torque or all signals of a joint, or the torques of all joints.
+    """
 
     code = "joint-delay"
     rarity = 2
@@ -164,7 +167,7 @@ class Delay(Fault):
 
 
 class JointClock(Fault):
-    """Kind of fault: some signals have times of another clock, so that their delay changes linearly.
+    """Kind of fault of a log: some signals have times of another clock, so that their delay changes linearly.
 
     These signals are the motion, the torque or all signals of a joint, or the torques of all joints.
     """
@@ -200,7 +203,7 @@ class JointClock(Fault):
     def _best(
         self, problem: GeometryProblem, reading: Hypothesis, start: np.ndarray, signals: np.ndarray
     ) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fit with the best delays (2,) [s] at the start and end of a recording.
+        """Yield the least-squares fit in which some signals have the best delays at the start and end of a recording.
 
         Nothing is yielded if both delays are about equal. start: (2,) [s] initial delays of the descent. signals: (2,
         n) mask of the delayed motions and torques.
@@ -229,7 +232,7 @@ class JointClock(Fault):
         return f"{_late_signals(drift)} of a clock that runs {abs(largest):.2%} {'fast' if largest > 0 else 'slow'}"
 
     def joints(self, correction: Correction) -> list[str]:
-        """Return the names of the joints with signals of another clock."""
+        """Return the names of the joints that have signals with times of another clock."""
         names = np.array(correction.arm.joint_names)
         return list(names[correction.hypothesis.drift.any(axis=0)].tolist())
 
@@ -256,7 +259,7 @@ def _late_signals(delay: np.ndarray) -> str:
 
 
 class Compensation(Fault):
-    """Kind of fault: a controller compensates gravity, entirely or in part, and the logged torques lack this part."""
+    """Kind of fault of a log: a controller compensates gravity, or a part of it, and the torques lack this part."""
 
     code = "gravity-compensated"
     rarity = 3
@@ -290,12 +293,12 @@ class Compensation(Fault):
         return f"torques in which gravity is compensated: {fraction:.2g} times the URDF's gravity remains in all joints"
 
     def robot_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the setting `gravity`: the vector of gravity of the hypothesis [m/s^2]."""
+        """Return the setting `gravity` of the robot: the vector of gravity that the hypothesis assumes [m/s^2]."""
         return {"gravity": [plain_number(x) for x in correction.hypothesis.gravity]}
 
 
 class Gravity(Compensation):
-    """Kind of fault: gravity has another direction than in the settings, since the arm is mounted otherwise."""
+    """Kind of fault of a log: gravity has another direction, since the arm is not mounted as the settings state."""
 
     code = "gravity"
     rarity = 1

@@ -91,7 +91,7 @@ class DriveProblem:
 
     @property
     def bodies(self) -> np.ndarray:
-        """Columns of the regressor that belong to the inertial parameters, (S, n, 10 bodies)."""
+        """Columns of the regressor that belong to the inertial parameters of the bodies, (S, n, 10 bodies)."""
         return self.rows[..., : -len(FRICTION.effects) * len(self.size) - 1]
 
     @property
@@ -101,12 +101,15 @@ class DriveProblem:
         return np.flatnonzero(varying(self.rows[..., -1]) & ((joins | joins.T).sum(axis=0) == 1)).tolist()
 
     def of_torques(self, tau: np.ndarray) -> DriveProblem:
-        """Return the problem with other joint torques, tau (S, n) [Nm, N], for example without a delay."""
+        """Return the least-squares problem with other joint torques, tau (S, n) [Nm, N], e.g. without a delay."""
         rows = np.concatenate([self.rows[..., :-1], tau[..., None]], axis=2)
         return replace(self, rows=rows, products=block_products(rows, self.products.shape[1]))
 
     def in_one_block(self, stride: int) -> DriveProblem:
-        """Return the problem on every `stride`-th sample, in a single block of time: no samples are held out."""
+        """Return the least-squares problem on every `stride`-th sample, in a single block of time.
+
+        No samples are held out, and fewer samples save time.
+        """
         rows = self.rows[::stride]
         return replace(self, samples=self.samples.every(stride), rows=rows, products=block_products(rows, 1))
 
@@ -132,7 +135,7 @@ class DriveProblem:
         return float(errors / self.errors[:, coupling.pair].mean())
 
     def coupled(self, coupling: Coupling) -> DriveProblem:
-        """Return the problem of a model with this coupling.
+        """Return the least-squares problem of a model in which the motors of two joints are coupled.
 
         Only the Gram matrices of both coupled joints are recomputed; `rows` remains the regressor without the coupling.
         """

@@ -116,7 +116,10 @@ class Identification:
         return tuple(Interval(name, value, std, base_unit(name)) for name, value, std in estimates)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the result in JSON form for other programs; `SCHEMA` is the version of the form."""
+        """Return the identified parameters and the residual in JSON form for other programs.
+
+        `SCHEMA` is the version of the form, which is a public contract.
+        """
         joints = list(self.arm.joint_names)
         friction = self.method.friction
         records = []
@@ -145,7 +148,7 @@ class Identification:
         }
 
     def text(self) -> str:
-        """Return the result as text for a terminal of 80 columns."""
+        """Return the identified parameters, the residual and their quality as text for a terminal of 80 columns."""
         residuals, parameters = self.listings()
         definitions = ["where"]
         for name, formula in zip(self.base.names, self.base.formulas(), strict=True):
@@ -160,7 +163,7 @@ class Identification:
         ])  # fmt: skip
 
     def listings(self) -> tuple[Listing, Listing]:
-        """Return two tables for display: the torque residual of each joint, and the base parameters."""
+        """Return two tables of an identification for display: torque residual per joint, and base parameters."""
         joints: list[tuple[str, ...]] = []
         for x, rms, nmse in zip(self.arm.coordinates, self.residual, self.nmse, strict=True):
             joints.append((x.name, f"{rms:.4g}", UNITS[x.joint_type].torque, f"{nmse:.3g}"))
@@ -178,7 +181,7 @@ class Identification:
         return "".join(listing.html() for listing in self.listings())
 
     def heading(self) -> str:
-        """Return a sentence with the numbers of parameters and samples, and the weights of the joints."""
+        """Return a sentence about the identification: numbers of parameters and samples, and weights of the joints."""
         drives = len(self.base) - self.base.bodies
         weighted = _WEIGHTED[self.method.weights]
         return (

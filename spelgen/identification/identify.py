@@ -207,10 +207,10 @@ class _Equations:
 
 
 def _jackknife(products: np.ndarray, solution: Solution, combination: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (r,) of combinations of the fitted parameters, see `jackknife_covariance`.
+    """Return the standard deviations (r,) of base parameters from a jackknife over blocks of samples.
 
-    products: (B, K + 1, K + 1) weighted Gram matrices of regressor and torque per block of samples. combination:
-    (r, k) coefficients of the k fitted parameters in each of the r combinations.
+    See `jackknife_covariance`. products: (B, K + 1, K + 1) weighted Gram matrices of regressor and torque per block of
+    samples. combination: (r, k) coefficients of the k fitted parameters in each of the r base parameters.
     """
     columns = solution.columns
     curvature, target = products[:, columns[:, None], columns], products[:, columns, -1]

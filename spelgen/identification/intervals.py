@@ -64,11 +64,11 @@ class Interval:
 
     @property
     def text(self) -> str:
-        """Value and half the width of the 95 % interval, as in ``1.234 ± 0.056``."""
+        """The estimate and half the width of its 95 % interval, as in ``1.234 ± 0.056``."""
         return f"{self.value:.4g} ± {self.half:.2g}"
 
     def to_dict(self) -> dict[str, object]:
-        """Return the estimate in its JSON form."""
+        """Return the estimate and its interval in JSON form."""
         numbers = {"value": self.value, "deviation": self.std, "low": self.low, "high": self.high}
         finite = {
             name: x if math.isfinite(x) else None for name, x in numbers.items()

@@ -93,7 +93,7 @@ class Fault(ABC):
 
     @abstractmethod
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterable[HypothesisFit]:
-        """Return least-squares fits of hypotheses that correct one more fault of this kind than `base`."""
+        """Return least-squares fits of hypotheses that correct one more fault of this kind in the log than `base`."""
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterable[HypothesisFit]:
         """Return fits of hypotheses whose search takes seconds, such as orders of all joints.
@@ -107,20 +107,23 @@ class Fault(ABC):
         return self.description
 
     def joints(self, correction: Correction) -> list[str]:
-        """Return the names of the joints that have settings to correct the fault; all joints if no joint has."""
+        """Return the names of the joints with the fault, for a message.
+
+        These joints have settings that correct the fault; if no joint has, all joints are returned.
+        """
         names = correction.arm.joint_names
         return [x for k, x in enumerate(names) if self.joint_keys(correction, k)] or list(names)
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the settings of a joint in the group `logs` that correct the fault; {} for a joint without fault."""
+        """Return the settings of a joint, in the group `logs`, that correct a fault of the log; {} without a fault."""
         return {}
 
     def log_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the settings in the group `logs` that correct the fault of all joints, such as `torque_delay`."""
+        """Return the settings in the group `logs`, such as `torque_delay`, that correct a fault of all joints."""
         return {}
 
     def robot_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the settings of the robot, outside the group `logs`, that correct the fault, such as `gravity`."""
+        """Return the settings of the robot, such as `gravity`, that correct a fault of the log."""
         return {}
 
     def minor_code(self, correction: Correction) -> str:

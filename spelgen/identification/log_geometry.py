@@ -37,7 +37,7 @@ class GeometryProblem:
         seconds: float,
         unchanged: Hypothesis | None = None,
     ) -> None:
-        """Define the problem of an arm with n joints.
+        """Define the least-squares problem of the torques in logs of an arm with n joints.
 
         Args:
             arm: arm with its vector of gravity and the inertial parameters of its URDF.
@@ -64,22 +64,26 @@ class GeometryProblem:
         self._chains: dict[Vector3, BodyChain] = {}  # chains of bodies, per vector of gravity
 
     def thinned(self, count: int) -> GeometryProblem:
-        """Return the same problem on at most `count` samples, evenly spaced."""
+        """Return the same least-squares problem on at most `count` samples, evenly spaced, to save time."""
         fewer = copy(self)
         fewer.samples, fewer._equations = self.samples.thinned(count), {}
         return fewer
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
-        """Return the problem that is fitted to some torques only; other torques and their regressor rows become zero.
+        """Return the least-squares problem in which only some of the torques are fitted.
 
-        counted: mask (S, n) of these torques in the unchanged log.
+        The other torques and their regressor rows become zero. counted: mask (S, n) of the fitted torques in the
+        unchanged log.
         """
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
         return fewer
 
     def with_hysteresis(self) -> GeometryProblem:
-        """Return the problem with a friction model whose dry friction has a history, the bristles' deflections."""
+        """Return the same least-squares problem with a friction model with hysteresis.
+
+        Its dry friction depends on the deflections of bristles, which are additional columns of the regressor.
+        """
         extended = copy(self)
         extended._equations, extended._has_hysteresis = {}, True
         added = self.samples.bent.shape[2] * len(self.speeds)
@@ -88,16 +92,17 @@ class GeometryProblem:
         return extended
 
     def with_signs(self, signs: np.ndarray) -> GeometryProblem:
-        """Return the same problem with logged torques that are multiplied by `signs`, (S, n), 1 or -1 each."""
+        """Return the least-squares problem with logged torques that are multiplied by `signs`, (S, n), 1 or -1 each."""
         other, values = copy(self), self.samples.values.copy()
         values[:, :, 3] *= signs[..., None]
         other.samples = self.samples._replace(values=values)
         return other
 
     def without_gravity(self, joint: int) -> GeometryProblem:
-        """Return the problem of the unchanged log with a model in which the torque of one joint contains no gravity.
+        """Return the least-squares problem with a model in which the torque of one joint contains no gravity.
 
-        The comparison of both problems' costs shows whether the logged torque of the joint contains gravity.
+        If it fits the unchanged log better than the problem with gravity, the logged torque of the joint contains no
+        gravity.
         """
         weightless = replace(self.unchanged, gravity=(0.0, 0.0, 0.0))
         rows = self.equations(self.unchanged)[0].copy()
@@ -107,16 +112,16 @@ class GeometryProblem:
         return other
 
     def gravity_torques(self, fit: HypothesisFit) -> tuple[np.ndarray, np.ndarray]:
-        """Return two gravity torques (S, n) [Nm, N]: with the parameters of a fit, and with the URDF's parameters.
+        """Return two gravity torques (S, n) [Nm, N] for comparison: with fitted parameters, and with the URDF's.
 
-        Both are at the positions and with the vector of gravity of the fit's hypothesis.
+        The hypothesis of `fit` determines the positions and the vector of gravity.
         """
         weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
         columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
         return columns @ fit.parameters, columns @ self.prior_mean
 
     def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
-        """Return the standard deviation (S, n) [Nm, N] of the model's torques due to the parameters' covariance."""
+        """Return the standard deviation (S, n) [Nm, N] of a fit's torques due to the covariance of its parameters."""
         rows, _ = self.equations(fit.hypothesis)
         return np.asarray(np.sqrt(np.einsum("snk,kl,snl->sn", rows, fit.covariance, rows, optimize=True)))
 

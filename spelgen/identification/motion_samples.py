@@ -34,16 +34,16 @@ ENDS = 3
 
 
 class MotionSamples(NamedTuple):
-    """S samples of motion and joint torques of n joints.
+    """S samples of motion and joint torques of n joints, with the signals around each sample.
 
     Attributes:
         values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at the E times `OFFSETS` relative to each sample.
-            Before the start and after the end of a recording, the first and last values continue. Samples without their
-            neighbours in time have E = 1.
+            Before the start and after the end of a recording, the first and last values continue. E = 1 if signals are
+            stored only at the samples, and not around them.
         bent: (S, n, K) bristle deflections of the unchanged log, divided by the break-away displacements; K = 0 for
             samples without a history of motion.
         direction: (S, n) direction of dry friction, see `DynamicsSamples`.
-        times: (S,) times of the samples since the start of their recording [s]; 0 for samples without their neighbours.
+        times: (S,) times of the samples since the start of their recording [s]; 0 for E = 1.
     """
 
     values: np.ndarray
@@ -53,7 +53,7 @@ class MotionSamples(NamedTuple):
 
     @classmethod
     def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
-        """Return samples of signals at single times, (S, n) each, without the signals around them (E = 1)."""
+        """Return samples of signals, (S, n) each, that are stored only at the samples, and not around them."""
         values = np.stack([q, qd, qdd, tau], axis=2)[..., None]
         return cls(values, np.zeros((*q.shape, 0)), np.sign(qd), np.zeros(len(q)))
 
@@ -95,7 +95,7 @@ class MotionSamples(NamedTuple):
 
     @property
     def longest_delay(self) -> float:
-        """Longest time [s] after a sample at which its signals are known; 0 for single samples (E = 1)."""
+        """Longest time [s] after a sample at which signals are known; 0 if they are stored only at the samples."""
         return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
 
     def every(self, stride: int) -> MotionSamples:
@@ -126,7 +126,7 @@ class DriveLog:
     """
 
     def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
-        """Create a collector without samples.
+        """Create a collector of samples of the arm's motion and torques, without samples.
 
         Args:
             joint_types: "revolute" or "prismatic" for each of the n joints.

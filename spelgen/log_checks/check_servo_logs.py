@@ -126,7 +126,7 @@ class Following(NamedTuple):
 
 
 def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Following | None:
-    """Return the tracking of the commands of n position servos: delay, correlation, gain and errors over all recordings.
+    """Return the tracking of the commands of n position servos over all recordings: delay, correlation, errors.
 
     None is returned if no recording is long enough. saturation: (n,) [rad, m] distance of a position from its command
     at which the servo's torque is at its limit; infinity if the limit is unknown.

@@ -89,7 +89,7 @@ class JointReport:
     following: JointFollowing | None = None
 
     def largest(self, quantity: str) -> float:
-        """Return the largest magnitude of the signal "q", "qd", "tau" or "u"."""
+        """Return the largest magnitude of a signal of the joint, "q", "qd", "tau" or "u", in all logs."""
         return max(abs(self.low[quantity]), abs(self.high[quantity]))
 
 
@@ -117,17 +117,17 @@ class LogReport:
 
     @property
     def files(self) -> int:
-        """Number of files from which the trajectories were read."""
+        """Number of files from which the logs were read."""
         return len({clock.file for clock in self.trajectories} - {None})
 
     @property
     def samples(self) -> int:
-        """Number of samples of all trajectories."""
+        """Number of samples of all logs."""
         return sum(clock.samples for clock in self.trajectories)
 
     @property
     def duration(self) -> float:
-        """Duration of all trajectories [s]."""
+        """Duration of all logs [s]."""
         return sum(clock.duration for clock in self.trajectories)
 
     @property
@@ -150,7 +150,7 @@ class LogReport:
         }
 
     def heading(self) -> str:
-        """Return one line with the numbers of files, trajectories and samples, and the duration."""
+        """Return one line about the logs: the numbers of files, trajectories and samples, and the duration."""
         files = ""
         if self.files:
             files = f" in {counted(self.files, 'file')}"

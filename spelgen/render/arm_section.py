@@ -157,7 +157,8 @@ def _sweep(arm: Chain) -> AnimatedMotion:
     """Return a motion of 12 s in which each joint moves sinusoidally about the middle of its range."""
     t = np.linspace(0, 12, 121)
     low, high = np.array([x.working_range for x in arm.coordinates]).T
-    # Amplitudes are at most 1.2 rad and 0.3 m: some URDFs have limits of 100 revolutions, too fast for a picture.
+    # Amplitudes of the motion are at most 1.2 rad and 0.3 m: some URDFs have limits of 100 revolutions, too fast for a
+    # picture.
     largest = [0.3 if coordinate.joint_type == "prismatic" else 1.2 for coordinate in arm.coordinates]
     joint = np.arange(len(low))
     # Neighbouring joints have different periods (12, 6 or 4 s), so that their motions can be distinguished. The motion

@@ -89,7 +89,8 @@ def base_table(
     parameters = identified["base_parameters"]
     names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
     nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
-    # A cell is empty if the URDF has no value: it has none for friction and drives, and may have no inertials.
+    # A cell of the URDF's column is empty if the URDF has no value: it has none for friction and drives, and may have
+    # no inertials.
     nominal[base.bodies :] = np.nan
     if not arm.chain.inertials_complete:
         nominal[:] = np.nan

@@ -140,7 +140,7 @@ def render_runs(folders: Sequence[Path]) -> str:
     runs = {}
     results = {}
     for name, folder in zip(_names(folders), folders, strict=True):
-        RunFolder(folder).read_record()  # This call only checks that the folder contains a run.
+        RunFolder(folder).read_record()  # the record is read only to check that the folder contains a run
         run = Run(folder)
         if run.results is None:
             raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
@@ -177,7 +177,8 @@ def _verdict(runs: Mapping[str, Results]) -> str:
 
     runs: {name of a run: its results}.
     """
-    # {label of an error: (value, run, text) of each run}. The value is the first element, so that `min` compares it.
+    # `errors`: {label of an error: (value, run, text) of each run}. The value is the first element, so that `min`
+    # compares it.
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():
         for figure in figures(results):
