@@ -117,10 +117,10 @@ def evaluate(
 def _preprocessing(
     used: Preprocessing | None, chosen: Preprocessing | None, logs: Sequence[Trajectory]
 ) -> Preprocessing:
-    """Return the preprocessing of test logs: `chosen`, else the preprocessing of the fit, else the default.
+    """Return the preprocessing (filter, torque delay) of test logs: `chosen`, or by default the one of the fit.
 
-    used: preprocessing of the fit; None if the model has no fit. chosen: preprocessing that the user passed; None for
-    none.
+    used: preprocessing of the fit; None if the model has no fit. chosen: preprocessing that the user passed; None if
+    the user passed none. Without both, default settings are used.
     """
     if chosen is None and used is not None:
         return used

@@ -116,7 +116,7 @@ def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
 
 
 def identifier(text: str) -> str:
-    """Return a text as an identifier that is valid in all exported languages: ASCII letters, digits and _."""
+    """Return `text` as an identifier that is valid in all exported languages: ASCII letters, digits and _."""
     plain = _letters_and_digits(text)
     if not plain or plain[0].isdigit() or keyword.iskeyword(plain):
         return f"arm_{plain}".rstrip("_")
@@ -197,7 +197,7 @@ def _network(
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
-    """Return {index of a joint: cubic spline of q}; joints whose coefficients are all zero are omitted.
+    """Return the residual splines of joints: {index of a joint: cubic spline of q}, without splines that are zero.
 
     terms: residual terms, for the knots. weights: coefficients of the B-splines of each joint, (n, splines).
     """

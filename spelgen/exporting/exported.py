@@ -14,7 +14,7 @@ from spelgen.labels import printable
 if TYPE_CHECKING:
     from spelgen.exporting.describe import Trained
 
-# The README of every format states these units, since every export has the model's units.
+# The README of every format states the units of the model, which are the units of every export.
 UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 
 

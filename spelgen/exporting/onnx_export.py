@@ -95,7 +95,8 @@ def _cross(a: Tensor, b: Tensor, *, dim: int) -> Tensor:
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Return matrix^-1 right, (..., n, columns), by Gauss-Jordan elimination without pivoting.
 
-    matrix: (..., n, n), positive definite, or triangular with a unit diagonal. right: (..., n, columns).
+    It replaces torch.linalg.solve, which has no ONNX operator. matrix: (..., n, n), positive definite, or triangular
+    with a unit diagonal. right: (..., n, columns).
     """
     n = matrix.shape[-1]  # `n` is a Python integer, so that tracing unrolls the loop over k
     identity = torch.eye(n, dtype=matrix.dtype)
@@ -113,7 +114,8 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 def _solve_triangular(matrix: Tensor, right: Tensor, *, upper: bool, unitriangular: bool) -> Tensor:
     """Return matrix^-1 right, (..., n, columns), for a triangular matrix (..., n, n) with a unit diagonal.
 
-    The values on the diagonal are not used: all calls of the runtime have ``unitriangular=True``.
+    It replaces torch.linalg.solve_triangular, which has no ONNX operator. The values on the diagonal are not used: all
+    calls of the runtime have ``unitriangular=True``.
     """
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
     return _solve(matrix - matrix * identity + identity, right)
@@ -127,8 +129,8 @@ class _Cholesky(NamedTuple):
 def _cholesky_ex(matrix: Tensor) -> _Cholesky:
     """Return the matrix (..., n, n) and info (...): 0 if the matrix is positive definite, otherwise 1.
 
-    The matrix is returned in place of its Cholesky factor: of the results of torch's ``cholesky_ex``, models use only
-    info.
+    It replaces torch.linalg.cholesky_ex, which has no ONNX operator. The matrix is returned in place of its Cholesky
+    factor, since models use only info.
     """
     rows = matrix
     info = torch.zeros(matrix.shape[:-2], dtype=torch.int32)

@@ -91,9 +91,10 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
 
 
 def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
-    """Return the regressor (M, count) of all parameters at random states of the arm, with M > 2 count equations.
+    """Return the regressor (E, count) of all parameters at random states of the arm: E equations of torques.
 
-    count: number of parameters. motors: (n, n) matrix from joint speeds to drive speeds; None: identity.
+    There are more than twice as many equations as parameters. count: number of parameters. motors: (n, n) matrix from
+    joint speeds to drive speeds; None: identity.
     """
     n = len(arm.coordinates)
     # `shape`: random states for at least twice as many equations as parameters

@@ -118,7 +118,10 @@ class Delay(Fault):
         for signals in _delayed_signals(len(reading.offset)):
 
             def delayed(delay: np.ndarray, signals: np.ndarray = signals) -> Hypothesis:
-                """Return the hypothesis that `signals`, a mask (2, n), are delayed by `delay`, (1,) [s]."""
+                """Return the hypothesis that `signals`, a (2, n) mask of motions and torques, have a delay.
+
+                delay: (1,) [s].
+                """
                 return reading.changed(self, delay=reading.delay + delay * signals)
 
             # The descent starts at the best of three delays: a Gauss-Newton step from 0 would be too short for noisy

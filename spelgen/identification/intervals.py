@@ -77,7 +77,7 @@ class Interval:
 
 
 def base_unit(name: str) -> str:
-    """Return the unit of a base parameter from the first letters of its name; "" for friction parameters.
+    """Return the unit of a base parameter, from the first letters of its name; "" for friction parameters.
 
     Masses begin with m, first moments with h, inertias with I, rotor inertias with "armature".
     """
@@ -91,9 +91,10 @@ def interval_listing(title: str, intervals: Sequence[Interval], note: str = "") 
 
 
 def student_scale(blocks: int) -> float:
-    """Return the factor for standard deviations from few blocks that corrects 95 % intervals.
+    """Return the ratio of the 95 % quantiles of Student's t distribution and of the normal distribution.
 
-    After multiplication by this factor, 1.96 standard deviations are half of Student's 95 % interval.
+    Standard deviations that are estimated from few blocks are multiplied by this ratio, so that 1.96 standard
+    deviations are half the width of a 95 % interval.
     """
     return float(stdtrit(blocks - 1, 0.975)) / QUANTILE
 

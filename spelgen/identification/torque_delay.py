@@ -159,7 +159,7 @@ def _estimate(rows: np.ndarray) -> _Estimate:
 
 
 def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the delay [s] with the smallest residual, and the coefficients (K + D,) of this residual.
+    """Return the delay [s] with the smallest torque residual, and the coefficients (K + D,) of this residual.
 
     products: (K + D, K + D) Gram matrix of the K columns of the regressor and of the torques at the D times `OFFSETS`.
     The residual is the sum of these K + D columns times the coefficients. A torque between two of the times is

@@ -275,8 +275,8 @@ class ServoLogs:
         if finding is None:
             return
         check = UNIT if finding.keys else NORMALISED
-        # The reader's warning that degrees of LeRobot may be normalised positions is omitted, since this error states
-        # more.
+        # The warning of the file reader that degrees of LeRobot may be normalised positions is omitted: this error
+        # states more.
         summary.notes[:] = [x for x in summary.notes if UNLESS_NORMALISED not in x.message]
         if check.code not in self._logs[0].accepted:
             summary.add(check, finding.message, "all joints", keys=finding.keys)

@@ -40,12 +40,15 @@ class FlatTops(NamedTuple):
 
     @classmethod
     def of(cls, q: np.ndarray, tau: np.ndarray) -> FlatTops:
-        """Return the flat tops of one trajectory with positions q and torques tau, (T, n) each."""
+        """Return the flat bottoms and tops of one trajectory with positions q and torques tau, (T, n) each."""
         return cls(flat_tops(q)[0], *flat_tops(tau))
 
     @classmethod
     def joined(cls, trajectories: Sequence[FlatTops]) -> FlatTops:
-        """Return the lowest flat bottoms and highest flat tops of several trajectories, and the means of `shares`."""
+        """Return the lowest flat bottoms and the highest flat tops of several trajectories.
+
+        The fractions of the samples at them (`shares`) are means over the trajectories.
+        """
         q, tau, shares = map(np.stack, zip(*trajectories, strict=True))
         sides = SIDES[:, None]
         return cls(

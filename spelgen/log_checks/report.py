@@ -168,7 +168,7 @@ class LogReport:
         return self.listings(20)
 
     def text(self) -> str:
-        """Return the report for a terminal, in 80 columns, without the errors."""
+        """Return the report on logs for a terminal, in 80 columns, without the errors."""
         paragraphs = [self.heading(), *map(Listing.text, self._short_listings())]
         wrapped = partial(textwrap.fill, width=WIDTH, initial_indent="  ", subsequent_indent="    ")
         findings = list(map(wrapped, map(str, self.findings)))

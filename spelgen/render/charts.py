@@ -161,7 +161,10 @@ class Band:
         return np.concatenate([_floats(self.low), _floats(self.high)])
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the outline of the area as an SVG path, clipped to both axes. NaN is drawn at the top."""
+        """Return the outline of the area between two curves as an SVG path, clipped to both axes.
+
+        NaN is drawn at the top.
+        """
         # Quantiles of diverged predictions are NaN or infinite: the band of such times extends to the top of the chart.
         low, high = (np.nan_to_num(_floats(y), nan=np.inf) for y in (self.low, self.high))
         # The outline of the band follows the lower curve, then the upper curve backwards.

@@ -1,4 +1,4 @@
-"""HTML page of a comparison: the result as a sentence and a table, then curves."""
+"""HTML page of a comparison of presets on arms: the result as a sentence and a table, then curves."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 
 @dataclass(frozen=True)
 class SimulatedCurves:
-    """Charts of a simulated arm: validation losses, predictions, and entries of M.
+    """Charts of the runs on a simulated arm: validation losses, predictions, and entries of M.
 
     The charts show only the first run of each preset, as lines of several seeds would overlap.
     """

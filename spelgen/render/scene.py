@@ -59,7 +59,7 @@ class SceneLink:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The links of an arm for the animated picture; parents precede their children.
+    """The links of an arm with their shapes for the animated picture; parents precede their children.
 
     extent: sum of the distances between joints [m]. tubes: sentence about the links that are drawn as tubes.
     """
@@ -171,13 +171,16 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
 
 
 def _axis(joint: UrdfJoint) -> np.ndarray:
-    """Return the unit vector of the joint axis (3,), in the joint frame."""
+    """Return the unit vector of the axis of a URDF joint, (3,), in the joint frame."""
     axis = np.array(joint.axis, dtype=float)
     return axis / (np.linalg.norm(axis) or 1.0)
 
 
 def _rotation(joint: UrdfJoint) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of the joint frame from roll, pitch and yaw about fixed axes [rad]."""
+    """Return the rotation matrix (3, 3) from the frame of a URDF joint to its parent's frame.
+
+    It is computed from roll, pitch and yaw about fixed axes [rad].
+    """
     return np.asarray(Rotation.from_euler("xyz", joint.rpy).as_matrix())
 
 
