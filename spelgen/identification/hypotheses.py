@@ -82,7 +82,7 @@ class Hypothesis:
 
 
 def _per_signal(values: np.ndarray) -> np.ndarray:
-    """Return values (2, n) of motion and torque as values (n, 4) of q, qd, qdd and tau."""
+    """Return values for the signals q, qd, qdd and tau, (n, 4), from values for motion and torque, (2, n)."""
     return values[[0, 0, 0, 1]].T
 
 

@@ -196,7 +196,8 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
         options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
-        # A mapping from the command line, stored in the run folder, has replaced the mapping of the robot's settings.
+        # The command contains a mapping that is stored in the run folder: it has replaced the mapping of the robot's
+        # settings.
         if run.mapping.exists():
             train += f" --mapping RUN/{run.mapping.name}"
         lines.append(train)
