@@ -65,12 +65,12 @@ class TrainingSettings(Group):
 
     @property
     def options(self) -> dict[str, object]:
-        """{name: value} of the options of a fit that are not None, of all objectives."""
+        """{name: value} of all settings that are options of a fit, of any objective, and are not None."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property
     def preprocessing(self) -> dict[str, Any]:
-        """{name: value} of the options of `Preprocessing` that are not None."""
+        """{name: value} of all settings that are options of `Preprocessing` and are not None."""
         return self.model_dump(include=PREPROCESSING, exclude_none=True)
 
 
