@@ -101,7 +101,7 @@ def size_text(size: float) -> str:
 
 
 Magnitude = tuple[str, float, bool]
-"""A sampled number that tests a fact: name, magnitude divided by its scale, and True if it must be nonzero, else 0."""
+"""A sampled number that tests a fact: name, magnitude divided by its scale, and whether it must be nonzero or zero."""
 
 
 @dataclass(frozen=True)

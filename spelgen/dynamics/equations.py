@@ -140,7 +140,8 @@ def unbounded(mass: Tensor) -> Tensor:
 def mass_as_learned(model: nn.Module) -> Iterator[None]:
     """Context manager in which ``DerivedMass`` does not correct an indefinite mass matrix M of the model.
 
-    It shows whether the learned M itself is positive definite. Models with other mass matrices are unchanged.
+    Fits that do not invert M use it: with the correction, gradient descent would stop at the boundary of the positive
+    definite matrices. Models with other mass matrices are unchanged.
     """
     mass = model.mass if isinstance(model, NetworkDynamics) else None
     if not isinstance(mass, DerivedMass):

@@ -147,8 +147,8 @@ class DenseInputDynamics(NetworkDynamics):
 class NetworkFriction(nn.Module):
     """Base class of dissipation matrices D(q, qd), (..., n, n), that are computed by a network.
 
-    D is in units of typical friction / typical speed of the joints: the network's outputs are of the order of
-    one.
+    The outputs of the network are scaled by typical friction and typical speed of the joints, so that they
+    are of the order of one.
     """
 
     prepare: Callable[[], Parameters]  # returns the parameter cache (quantities independent of q and qd)

@@ -1,4 +1,4 @@
-"""Port-Hamiltonian model of an arm of rigid bodies with joint friction; presets without networks use it."""
+"""Port-Hamiltonian model of an arm of rigid bodies with friction, for the presets closed-form and hybrid."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
