@@ -101,7 +101,7 @@ def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
 
 
 def _positions(arm: Chain, rng: np.random.Generator) -> np.ndarray:
-    """Return random joint positions, (n,) [rad, m], in [-pi, pi] or [-1 m, 1 m]."""
+    """Return random joint positions, (n,): in [-pi, pi] rad for revolute, in [-1, 1] m for prismatic joints."""
     # Joint limits are not used, because the structure is valid at every configuration.
     half_range = np.where(np.array(arm.joint_types) == "revolute", np.pi, 1.0)
     return rng.uniform(-half_range, half_range)

@@ -143,9 +143,10 @@ class PositionServo(nn.Module):
         return (kp * beyond(u - q, dead_zone) - kd * qd).clamp(-limit, limit)
 
     def stored_energy(self, u: Tensor, q: Tensor) -> Tensor:
-        """Return the elastic energy sum 1/2 kp d(q - u)^2 of all servos, (...) [J], see the class.
+        """Return the elastic energy 1/2 kp d(q - u)^2 of all servos, summed over the joints, (...) [J].
 
-        u: commanded positions, (..., n) [rad, m]. q: joint positions, (..., n) [rad, m].
+        d(x) is x reduced in magnitude by half the width of the dead zone. u: commanded positions, (..., n)
+        [rad, m]. q: joint positions, (..., n) [rad, m].
         """
         return 0.5 * (self.kp() * beyond(q - u, self.dead_zone.clamp(min=0)) ** 2).sum(dim=-1)
 

@@ -174,9 +174,9 @@ class JointFrictionParameters(NamedTuple):
 class JointFriction(NetworkFriction):
     """A diagonal, positive definite dissipation matrix D(q, qd): viscous and dry friction of each joint.
 
-    The diagonal is viscous + nominal friction * softplus(output) / sqrt(qd^2 + smoothing^2), with the output
-    of a network for each joint and a smoothing velocity, at which dry friction changes its sign smoothly. The
-    inputs of the network are the encoding of q, qd and qd / sqrt(qd^2 + smoothing^2).
+    The diagonal is viscous + typical friction * softplus(output) / sqrt(qd^2 + w^2), with the output of a
+    network for each joint and a trained smoothing velocity w, below which dry friction changes its sign
+    smoothly. The inputs of the network are the encoding of q, qd and qd / sqrt(qd^2 + w^2).
     """
 
     parameter_groups = (
