@@ -46,9 +46,7 @@ class BodyChain(nn.Module):
         gravity: Row,
         parent: Sequence[int],  # index of each body's parent body; -1: the base
         joint: Sequence[int],
-        revolute: Sequence[
-            bool
-        ],  # True: the joint rotates about z of the joint frame; False: it slides along z
+        revolute: Sequence[bool],  # True: rotation about z of the joint frame; False: translation along z
         ratio: Row,  # displacement of a body's joint: ratio * q + offset
         offset: Row,
         placement: Sequence[Rows],  # joint frame in the frame of the parent body: three rows of [R p], p in m
