@@ -95,7 +95,7 @@ def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
         qd = dynamics.jacobian @ rng.normal(size=n)
         qdd = dynamics.jacobian @ rng.normal(size=n)
         by_joint = pin.computeJointTorqueRegressor(dynamics.model, dynamics.data, q, qd, qdd)
-        # Pinocchio returns a vector in place of a matrix for a single joint.
+        # For a single joint Pinocchio returns a vector in place of a matrix: it is reshaped.
         rows.append(dynamics.jacobian.T @ by_joint.reshape(bodies, -1))
     return np.concatenate(rows)
 
@@ -199,9 +199,9 @@ def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]
     axes, loads = [], []
     for configuration in dynamics.configuration(q):
-        # Pinocchio returns a vector in place of a matrix for a single joint.
+        # For a single joint Pinocchio returns a vector in place of a matrix: it is reshaped.
         axes.append(pin.computeJointJacobians(model, data, configuration).reshape(6, -1)[:, columns])
-        # Pinocchio computes only the upper triangle of M.
+        # Pinocchio computes only the upper triangle of M. The sum of both triangles doubles the diagonal entries.
         upper = np.triu(pin.crba(model, data, configuration))
         mass = upper + upper.T
         gravity = pin.computeGeneralizedGravity(model, data, configuration)

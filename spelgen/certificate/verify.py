@@ -159,7 +159,7 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
     count = len(structure.entries) + 6
     rng = np.random.default_rng(seed)
     is_random = structure.assume == "kinematics"
-    # All facts are verified on the same samples: with other samples for each fact, an error could pass by chance.
+    # All facts are verified on the same samples, which are computed once.
     samples = numeric_samples.draw(arm, count, rng, random_inertials=is_random)
     facts = [
         *_entries(structure, samples),
@@ -179,7 +179,7 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
     """Yield checks that compare the chain read by spelgen with Pinocchio's reading of the URDF."""
     try:
         differences = numeric_samples.differences_of_reading(robot, arm, seed)
-    except Exception as problem:  # A failure of Pinocchio is no evidence about the chain.
+    except Exception as problem:  # A failure of Pinocchio is no evidence against the chain: undecided.
         text = " ".join(str(problem).split())[:120]
         result = f"Pinocchio cannot read it ({type(problem).__name__}: {text})"
         yield FactCheck("reading of the file", "the moving bodies", result, "undecided")
@@ -199,7 +199,10 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
 
 
 def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield two facts, with sampled numbers: which entries of M are zero, and on which joints each entry depends."""
+    """Yield the facts which entries of M are zero, and on which joints each entry depends.
+
+    Each fact has the numbers that test it: the entries in `samples`, and their changes if only one joint moves.
+    """
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     # `largest_changes`, (entries, n): largest change of each entry of M when only one joint moves.
     largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()
@@ -220,7 +223,7 @@ def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> I
 
 
 def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact, with sampled numbers, that M = sum_k c_k A_k + sum_j f_j(q) B_j (minimal form).
+    """Return the fact, with the numbers that test it, that M = sum_k c_k A_k + sum_j f_j(q) B_j (minimal form).
 
     c_k are constants, f_j functions (outputs), A_k and B_j constant matrices. Each f_j must depend only on its own
     joints, the c_k on no joint.
@@ -270,9 +273,9 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
 
 
 def _potential(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact, with sampled gravity torques, that V depends on the derived joints only.
+    """Return the fact that V depends on the derived joints only, with the numbers that test it.
 
-    The gravity torque dV/dq must be zero at all other joints, and nonzero at the derived joints.
+    The numbers are gravity torques dV/dq in `samples`: zero at all other joints, nonzero at the derived joints.
     """
     magnitudes = []
     for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):
