@@ -175,7 +175,7 @@ class PreparedModel:
         vars(plain).pop("forward_dynamics", None)
 
         def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-            """Return the rate of the state (q, qd), or the state after dt if dt is given, (2 n,)."""
+            """Return d/dt of the state (q, qd), (2 n,), at the inputs tau (n,); if dt is given, the state after dt."""
             position, speed = state.split(n)
             if dt is None:
                 return torch.cat([speed, plain.forward_dynamics(position, speed, tau, z)])

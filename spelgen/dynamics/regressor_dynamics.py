@@ -195,14 +195,14 @@ def identified_dynamics(
         friction: effects of friction and armature, E in all.
         parameters: (10 B + E n,): inertial parameters, then the coefficients of each effect, in the order of
             ``friction.effects``.
-        drives: input matrix and motor velocities.
+        drives: input matrix G, and the matrix C of the motor velocities C qd.
     """
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)
     reach = reach_of(arm.joint_types).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        """Return the friction torque, (..., n) [Nm, N], at qd, (..., n), and the friction state z, (..., n, K)."""
+        """Return the friction torque, (..., n) [Nm, N], at velocities qd, (..., n), and at the state z, (..., n, K)."""
         deflection = None if z is None or reach is None else z / reach
         return friction.torque(constants, qd, deflection, drives.speeds)
 
