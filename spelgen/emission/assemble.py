@@ -137,7 +137,10 @@ def _model_class(base: str) -> Callable[..., ArmModel]:
 
 
 def _without_state(base: str) -> ArmModel:
-    """Return a new model without attributes, for unpickling: pickle then sets the attributes; base: its base class."""
+    """Return a new model without attributes; pickle calls this function, and then sets the attributes.
+
+    base: name of the class of ``spelgen.runtime`` from which the model is derived.
+    """
     model_class = cast("type[ArmModel]", _model_class(base))
     return model_class.__new__(model_class)
 

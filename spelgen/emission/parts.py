@@ -1,4 +1,6 @@
-"""Conversion of a ``ModelSpec`` to tables of an arm and constructor calls of the classes of ``spelgen.runtime``.
+"""Conversion of a ``ModelSpec`` to tables and constructor calls of the classes of ``spelgen.runtime``.
+
+The tables have the joints and links of the arm, and the functions and constants of M.
 
 Models in memory (`assemble`) and the source of modules (`text`) are both made from these tables and calls.
 """
