@@ -191,7 +191,7 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
             )
     except (LogError, GeneratorExit):
         raise
-    except Exception as error:  # rosbags and its decompressors raise exceptions of many types
+    except Exception as error:  # rosbags raises exceptions of many types: all are caught
         do = "a recording that was not closed may be repaired by `ros2 bag reindex` or `rosbag reindex`"
         got = f"an unreadable ROS bag ({in_one_line(error).rstrip('.')})"
         raise LogError(got, file=path, do=None if isinstance(error, MemoryError) else do) from error

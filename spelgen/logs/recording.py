@@ -127,8 +127,8 @@ def _unwrap(rows: Rows) -> None:
             # Registers of commands and of positions may start in different revolutions. The commands are shifted by
             # whole periods, so that their median difference from the positions is at most half a period.
             result = result - period * np.round(np.median(result - columns["q", joint]) / period)
-        # Signals are shifted by whole periods to a median close to 0. Only angles without a wrap remain unchanged:
-        # their revolution is known.
+        # Other signals are shifted by whole periods to a median close to 0, because registers start in an arbitrary
+        # period. Exception: an angle without wraps whose period is one turn is correct as logged.
         elif count or abs(period - 2 * pi) > 1e-6:
             result = centred(result - offset, period) + offset
         if count:
@@ -245,7 +245,8 @@ def _order_in_time(rows: Rows) -> None:
     Raises LogError for a clock that restarts, and for times that cannot be reconstructed.
     """
     rows.leave_out(_is_timeless(rows.t), "left out, with times far from those of all other rows")
-    # Times that are dates are counted from the first row: the reader does so only if the first row has a time.
+    # Dates are converted to seconds since the first row here, because the reader of a log subtracts the first time only
+    # if the first row has one.
     if len(rows.t) and abs(rows.t[0]) > 1e8:
         rows.t[:] -= rows.t[0]
     late = int(np.count_nonzero(np.diff(rows.t) < 0))

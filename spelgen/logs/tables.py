@@ -81,7 +81,10 @@ class LogTable(NamedTuple):
 
     @classmethod
     def of(cls, table: pa.Table, mapping: LogMapping, **properties: Any) -> Self:
-        """Return the log table for an Arrow table in memory. properties: remarks, header, recording, see `Layout`."""
+        """Return the log table for an Arrow table in memory.
+
+        properties: values of the attributes `remarks`, `header` and `recording`.
+        """
         return cls(table.schema, lambda names: table, mapping, **properties)
 
 
