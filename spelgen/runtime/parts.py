@@ -40,7 +40,7 @@ class Mass(Protocol):
 
 
 class Inputs(Protocol):
-    """Interface of a constant input matrix G of motors that drive several joints, or of passive joints."""
+    """Interface of a constant input matrix G: gears, couplings of motors, and passive joints."""
 
     def gains(self) -> Tensor:
         """Return the input matrix G, (n, n): joint torque per input of a motor."""
