@@ -100,7 +100,7 @@ class PreparedModel:
         return self._model.momentum(self._at(q, qd), qd)
 
     def momentum_rate(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the time derivative of the momenta, (..., n) [Nm, N], under the inputs tau: for momentum observers."""
+        """Return dp/dt, (..., n) [Nm, N], of the momenta p = M(q) qd under the inputs tau, for momentum observers."""
         past = known_past(self._model, z)
         p = self.momentum(q, qd)
         return self._model.port_hamiltonian_rhs(q, p, tau, self._weights, *past)[1]

@@ -117,7 +117,10 @@ def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
 
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
-    """Return a linear combination of terms, (...,) each, with the order of operations of a module's source."""
+    """Return a linear combination of terms, (...,) each, with the order of operations of a module's source.
+
+    sums: pairs (factor, index of a term).
+    """
     # Negative terms are subtracted, as in the module's source, so that rounding errors are equal.
     total: Tensor | float = 0
     for position, (factor, index) in enumerate(sums):

@@ -305,6 +305,7 @@ def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[Constan
     """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], to six digits.
 
     The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero.
+    outputs, constants: terms of M, with the nominal means of the outputs and values of the constants.
     """
     mean = np.zeros((n, n))
     for constant in constants:
