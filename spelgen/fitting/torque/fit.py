@@ -189,7 +189,7 @@ def _not_behind_regression(
     other = torch.from_numpy(regression.held_out) + negligible
 
     def behind(fit: _StagedFit) -> bool:
-        """Return True if the held-out error of `fit` is significantly larger than that of the regression.
+        """Return True if the regression has a significantly smaller held-out error than `fit`.
 
         The errors of the blocks are compared by a t test (p = 0.01).
         """

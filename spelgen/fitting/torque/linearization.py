@@ -88,8 +88,8 @@ class RigidProjection(NamedTuple):
     def orthogonalize(self, joint: int, torque: torch.Tensor) -> torch.Tensor:
         """Return the residuals (T, P) of P torques on a joint, `torque` (T, P), after projection onto the model.
 
-        If such a torque were added to the measured torque, a fit of the rigid-body and friction parameters would leave
-        this residual.
+        If such a torque were added to the measured torque, this would be the torque residual of a refit of the
+        rigid-body and friction parameters.
         """
         jacobian = self.jacobian[joint]
         return torque - jacobian @ (self.posterior_gain[joint] @ (jacobian.mT @ torque))

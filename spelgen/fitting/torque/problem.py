@@ -268,9 +268,9 @@ class TorqueEstimate:
     def on_segments(self, samples: TorqueSamples) -> TorqueEstimate:
         """Return the estimate with the same x on segments of consecutive samples, and with the current covariance.
 
-        The samples of the estimate may be subsampled: from these, the correlation of the torque errors could not be
-        estimated. The segments have a length of `TUNING.segment` and are cut from `samples`. The noise is converted to
-        their sample interval.
+        The estimate may belong to subsampled samples, from which the correlation time of the torque errors cannot be
+        estimated. The segments have a duration of `TUNING.segment` and are cut from `samples`. The noise is converted
+        to the sample interval of the segments.
         """
         jacobian = TorqueJacobian(
             self.problem.jacobian.model, samples.segments(TUNING.segment, TUNING.initial_samples)
