@@ -120,9 +120,10 @@ def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
 def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
     """Return a mask (m,) of m parameters, True for parameters that the logs distinguish from all other parameters.
 
-    A parameter is distinguished if an upper bound of its variance inflation factor is below
-    `ServoTuning.variance_inflation`. Example: dead zone and dry friction of a joint without gravity load are not
-    distinguished, since the derivatives of the errors with respect to both are proportional.
+    A parameter is distinguished if its variance inflation factor is below `ServoTuning.variance_inflation`: the
+    posterior variance of the parameter, divided by its variance if all other parameters were known. Example: dead zone
+    and dry friction of a joint without gravity load are not distinguished, since the derivatives of the errors with
+    respect to both are proportional.
 
     Args:
         blocks: normal equations of B blocks with respect to all k parameters, (B, k, k) and (B, k).

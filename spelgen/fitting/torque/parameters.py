@@ -287,7 +287,8 @@ def prior_covariance(
 ) -> torch.Tensor:
     """Return the prior covariance (K, K) of the flattened parameters.
 
-    parameters: {name: values}, K values in total. groups: {name: parameter group}.
+    parameters: {name: values}, K values in total. groups: {name: parameter group}. widths: prior standard deviations of
+    the groups, and of the factors common to all joints.
     """
     count = sum(x.numel() for x in parameters.values())
     matrix, friction, first = torch.zeros(count, count).double(), torch.zeros(count).double(), 0
