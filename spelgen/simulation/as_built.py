@@ -139,9 +139,10 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
 def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
     """Return the URDF without friction, visuals and collisions, and with perturbed inertials.
 
-    Per link, mass and inertia about the centre of mass are scaled by independent factors exp(error N(0, 1)); the centre
-    of mass is shifted by error N(0, 1) times the body's radius of gyration, along each axis of the link frame. An
-    inertia tensor that no body can have is replaced by a physically consistent one.
+    Per link, the mass and the ratio of the inertia about the centre of mass to the mass are scaled by independent
+    factors exp(error N(0, 1)); the centre of mass is shifted by error N(0, 1) times the body's radius of gyration,
+    along each axis of the link frame. An inertia tensor that no body can have is replaced by a physically consistent
+    one.
 
     Args:
         robot: URDF or xacro file, which was read before.

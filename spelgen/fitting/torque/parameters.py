@@ -198,8 +198,8 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
     factor, factor_change = perturbed.real, perturbed.imag / epsilon
     relative = torch.linalg.solve_triangular(factor, factor_change, upper=True)
     added = relative + relative.mT
-    # After an overflow, no fraction can be computed. The whole step is returned: its cost is not finite, so that the
-    # solver rejects it.
+    # After an overflow, the fraction cannot be computed. The whole step is returned; the solver rejects it because of
+    # its cost.
     if not added.isfinite().all():
         return raw + step
     min_eigenvalue = torch.linalg.eigvalsh(added)[:, 0]
