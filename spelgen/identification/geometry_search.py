@@ -59,9 +59,9 @@ def kinds_of_faults(
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
     """Return the fit of the unchanged log, then the fits of hypotheses about faults that fit significantly better.
 
-    These are the best fit and at most two others of about the same cost, the best one first. The result has only the
-    fit of the unchanged log if no hypothesis fits significantly better; a fault with other evidence than the cost needs
-    no significant decrease. faults: kinds of faults; each kind and combinations are tested.
+    At most three hypotheses of about the same cost are returned, the best one first. The result has only the fit of the
+    unchanged log if no hypothesis fits significantly better; a fault with other evidence than the cost needs no
+    significant decrease. faults: kinds of faults; each kind and combinations are tested.
     """
     # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)
