@@ -216,8 +216,8 @@ def _column(
 ) -> Iterator[tuple[Body, Element]]:
     """Yield (ancestor, entry of M) for a body itself, and then for each of its ancestors.
 
-    The entry is in the row of the body's joint and the column of the ancestor's joint, in the mass matrix of all joints,
-    before mimic joints are eliminated.
+    The entry is in the row of the body's joint and the column of the ancestor's joint, in the mass matrix of all
+    joints, before mimic joints are eliminated.
 
     Args:
         arm: the arm.
