@@ -62,8 +62,8 @@ class LiveTuning:
     changed: float = 15.0
     changed_after: float = 1.0
     # The hypotheses "changed load" and "contact" are dropped after `dropped_after` [s] of motion. They are dropped
-    # after `changed_after` [s] if "changed load" is unlikely: if its log likelihood minus the larger one of "contact" and "no
-    # change" is below `unlikely` [1].
+    # after `changed_after` [s] if "changed load" is unlikely: if its log likelihood minus the larger one of "contact"
+    # and "no change" is below `unlikely` [1].
     unlikely: float = -8.0
     dropped_after: float = 4.0
 
