@@ -138,7 +138,7 @@ class PinocchioDynamics:
         return configuration
 
     def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
-        """Return the results of an algorithm of Pinocchio, such as `rnea`, for each state of a batch.
+        """Return the results of a joint-space algorithm of Pinocchio, such as `rnea`, for each state of a batch.
 
         states: arguments of the algorithm after model and data, (..., nq) or (..., nv).
         """

@@ -1,4 +1,4 @@
-"""Conversion of a ``ModelSpec`` to tables of an arm and constructor calls of the classes of ``spelgen.runtime``.
+"""Conversion of a ``ModelSpec`` to the tables JOINTS and LINKS of a module and to calls of runtime classes.
 
 Models in memory (`assemble`) and the source of modules (`text`) are both made from these tables and calls.
 """

@@ -270,11 +270,10 @@ class GeometryProblem:
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the penalty for negative rotor inertias, and for friction that drives the motion on average.
 
-        A violation adds half of its squared standard score to the cost, up to a bound. Without a bound, one violation
-        could exclude the right hypothesis: a drive may compensate friction, and errors of the friction model may
-        resemble inertia. Fits of the right hypothesis to recorded arms have one of the two violations (joint 6 of one
-        arm of benchmarks/recordings.py: friction that drives the motion; another arm: a negative rotor inertia), but
-        none has both.
+        Each of both violations adds half of its squared standard score to the cost, up to a bound. The bound is needed,
+        since the right hypothesis may have one violation: a drive may compensate friction, and errors of the friction
+        model may resemble inertia. Of the arms of benchmarks/recordings.py, one has friction that drives the motion
+        (joint 6), another one has a negative rotor inertia, and none has both.
 
         Args:
             x: (K,) parameters.

@@ -296,7 +296,7 @@ class ResidualDynamics(RigidBodyDynamics):
         return energy if self.residuals is None else energy + self.residuals.energy(cache.residual)
 
     def gravity(self, q: Tensor | RigidConfiguration) -> Tensor:
-        """Return the gravity torque and residual torque dV/dq, (..., n) [Nm, N]."""
+        """Return dV/dq, (..., n) [Nm, N]: the sum of the gravity torque and of the residual terms' torque."""
         cache: RigidConfiguration = self.at(q)
         if self.residuals is None:
             return cache.gravity

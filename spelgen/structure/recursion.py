@@ -61,10 +61,10 @@ class _Inertia(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """The pose of a joint frame in the frame of the parent body, or the motion of a joint at its current position.
+    """A rotation and a translation: of a joint frame in the frame of the parent body, or due to a joint's position.
 
-    rotation: rows of the rotation matrix. Elements 0, 1 and -1 of rotation and translation are Python integers, with
-    which products are skipped.
+    rotation: rows of the rotation matrix. Elements 0, 1 and -1 of rotation and translation are Python integers, so that
+    products with them are recognized and not computed.
     """
 
     rotation: tuple[Vector, ...]
@@ -149,7 +149,7 @@ def coefficients(
 
 
 def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
-    """Return the motion of the joint of each body at ``positions``: a rotation about z, or a translation along z."""
+    """Return the rotation about z, or the translation along z, of the joint of each body at ``positions``."""
     bases = base_denominators(arm)
     motions = []
     for body in arm.bodies:
@@ -216,13 +216,13 @@ def _column(
 ) -> Iterator[tuple[Body, Element]]:
     """Yield (ancestor, entry of M) for a body itself, and then for each of its ancestors.
 
-    The entry is in the row of the body's joint and the column of the ancestor's joint, in a mass matrix of all joints,
-    of which mimic joints are not eliminated.
+    The entry is in the row of the body's joint and the column of the ancestor's joint, in the mass matrix of all
+    joints, before mimic joints are eliminated.
 
     Args:
         arm: the arm.
         poses: pose of each joint frame in the frame of the parent body.
-        motions: motion of each joint at its current position.
+        motions: rotation or translation of each joint due to its position.
         index: index of the body in `arm.bodies`.
         inertia: composite inertia of the body and all its descendants.
     """
