@@ -48,8 +48,7 @@ class PredictedMotion(DrawnMotion):
     """A measured motion and its prediction, (T, n) each: a predicted window of a log, or a replayed log.
 
     Attributes:
-        start: Time of the first sample of the window since the start of the gap-free segment of the log that contains
-            the window [s]; None for a replayed log.
+        start: Time t of the first sample of the window in the log [s]; None for a replayed log.
         predicted_q: Predicted positions, (T, n) [rad, m].
         qd: Measured velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         predicted_qd: Predicted velocities, (T, n) [rad/s, m/s]; None for a replayed log.

@@ -194,7 +194,7 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
     motions = []
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
         motion = predicted_motion(piece.name, predictions.windows, predictions.states[MODEL], k)
-        start = number(piece.t[first] - piece.t[0])
+        start = number(piece.t[first])
         motions.append(replace(thinned(motion, TUNING.curve_samples), start=start, error=number(error)))
     return typical_and_worst(motions)
 
