@@ -220,6 +220,15 @@ def test_the_same_run_and_logs_give_the_same_file(run):
     assert shown[0]["error"] <= shown[1]["error"]
 
 
+def test_predicted_windows_start_at_a_time_of_the_log(run):
+    logs = read_logs([run.parent / "logs"], JOINTS, role="test")
+    logs = [replace(log, t=log.t + 100.0) for log in logs]
+    for shown in evaluate(run, logs).traces.trajectories:
+        log = next(log for log in logs if log.name == shown.trajectory)
+        np.testing.assert_allclose(shown.q[0], log.q[np.abs(log.t - shown.start).argmin()], atol=1e-4)
+        assert shown.start >= 100.0
+
+
 def test_what_could_not_be_done_is_said(run):
     result = evaluated(run, run.parent / "logs" / "train.parquet", seconds=(5.0,))
     assert {x.code: x.message for x in result.diagnostics} == {

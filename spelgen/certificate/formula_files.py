@@ -24,10 +24,10 @@ _PYTHON_WIDTH = 100
 _HEAD = '''"""Closed forms of a serial arm's mass matrix M(q) and potential energy V(q), by spelgen.
 
 q: the joints' positions [rad, m]. entries: {(row, column): entry of M}, counted from 1, lower triangle.
-M: the whole matrix, V: the energy [J] up to a constant; both where nothing is missing.
-base_parameters: what each stands for, m being a mass [kg], h = m c a first moment [kg m] and I a tensor
-[kg m2] about the joint's origin, in a frame whose z is the joint's axis.
-values: what the URDF gives them, where it has inertials.
+M: the whole matrix, V: the energy [J] up to a constant; each only if all its expressions are included.
+base_parameters: definition of each base parameter, with masses m [kg], first moments h = m c [kg m] and
+inertia tensors I [kg m2] about the joint's origin, in a frame whose z axis is the axis of the joint.
+values: values of the base parameters in the URDF, if it has the inertials.
 """
 '''
 
@@ -74,7 +74,7 @@ def _notes(formulas: Formulas) -> list[str]:
     for row in writable[:1]:
         option = ",".join(map(str, row.entry))
         notes.append(
-            f"Omitted here: --entry {option} shows {row.name} alone, and -o FILE.py writes all entries for SymPy."
+            f"Omitted here: --entry {option} shows only {row.name}, and -o FILE.py writes all entries for SymPy."
         )
     return notes
 

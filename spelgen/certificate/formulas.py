@@ -62,7 +62,7 @@ class Formula:
         """Text with the reason why the entry has no expression, for users."""
         if self.terms is None:
             return "too many terms to be expanded"
-        return f"{self.terms} terms, not written out"
+        return f"{self.terms} terms, omitted"
 
 
 @dataclass(frozen=True, repr=False)

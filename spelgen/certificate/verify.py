@@ -138,10 +138,12 @@ class _DerivedFact:
         if differences:
             return FactCheck(self.fact, self.derived, shortened(differences, 4), verdict)
         largest = max((value for _, value in zeros), default=0.0)
-        result = f"what should be zero is at most {size_text(largest)} of its scale"
+        result = f"numbers that should be zero are at most {size_text(largest)} of its scale"
         if nonzeros:
             smallest = min(value for _, value in nonzeros)
-            result = f"what should not be zero is at least {size_text(smallest)} of its scale, {result}"
+            result = (
+                f"numbers that should not be zero are at least {size_text(smallest)} of its scale, {result}"
+            )
         return FactCheck(self.fact, self.derived, result, "agrees")
 
 
@@ -192,9 +194,9 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
         verdict: Verdict = "agrees"
         if difference.difference > allowed or (difference.rounding > allowed and not is_rounded):
             verdict = "differs"
-        result = f"at most {size_text(difference.difference)} of their size apart"
+        result = f"at most {size_text(difference.difference)} of their magnitude apart"
         if is_rounded:
-            result += f"; the reported roundings move them by {size_text(difference.rounding)}"
+            result += f"; the reported roundings change them by {size_text(difference.rounding)}"
         yield FactCheck(f"{difference.quantity} in the file", "as Pinocchio reads them", result, verdict)
 
 

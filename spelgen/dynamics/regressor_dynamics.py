@@ -195,7 +195,7 @@ def identified_dynamics(
         friction: effects of friction and armature, E in all.
         parameters: (10 B + E n,): inertial parameters, then the coefficients of each effect, in the order of
             ``friction.effects``.
-        drives: input matrix G, and the matrix C of the motor velocities C qd.
+        drives: input matrix (n, n), and matrix (n, n) from joint velocities to motor velocities.
     """
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)

@@ -45,8 +45,9 @@ def make_spec(
 ) -> ModelSpec:
     """Return the specification of the model of an arm, from which a model or a module is made.
 
-    module: path of the module; the specification contains the path of the URDF relative to it. None: the specification
-    contains only the file name of the URDF. Other arguments and errors as for ``build``.
+    module: path of the module; the specification then contains the path of the URDF relative to the module's folder.
+    None: the specification contains only the file name of the URDF.
+    Other arguments and errors as for ``build``.
     """
     # `derive_spec` is imported here, because commands that have a specification do not need it.
     from spelgen.emission.plan import derive_spec

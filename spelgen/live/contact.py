@@ -117,8 +117,9 @@ class ContactObserver:
             torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline
         )
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
-        # Measured torques that lag behind the motion cause an error of the residual if dp/dt changes. The residual is
-        # filtered, so its variance contains the low-pass filtered `jerk`, too.
+        # Measured torques that lag behind the motion cause an error of the residual, which is proportional to the
+        # change `jerk` of dp/dt. This error passes the observer's low-pass filter and persists for its time constant:
+        # the variance of the residual therefore contains `jerk` and its low-pass filtered square.
         self.jerk = self.jerk + gain * (jerk**2 - self.jerk)
         variance = TUNING.jerk**2 * (jerk**2 + self.jerk) + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)

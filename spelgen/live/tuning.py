@@ -62,9 +62,9 @@ class LiveTuning:
     # "changed load" exceeds the log likelihoods of "no change" and of "contact" by more than `changed` [1].
     changed: float = 15.0
     changed_after: float = 1.0
-    # The hypotheses of a changed load and of a contact are dropped after `dropped_after` [s] of motion, or after
-    # `changed_after` if "changed load" is unlikely: its log likelihood minus the larger log likelihood of "no change"
-    # and "contact" is below `unlikely` [1].
+    # The hypotheses "changed load" and "contact" are dropped after `dropped_after` [s] of motion. They are dropped
+    # after `changed_after` [s] if "changed load" is unlikely: if its log likelihood minus the larger one of "contact"
+    # and "no change" is below `unlikely` [1].
     unlikely: float = -8.0
     dropped_after: float = 4.0
 

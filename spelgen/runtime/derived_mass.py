@@ -170,7 +170,7 @@ class DerivedMass(LinearMass):
         # For a batch with an indefinite matrix, cholesky would raise an error; cholesky_ex reports which
         # matrices are indefinite.
         indefinite = torch.linalg.cholesky_ex(mass - self.smallest).info != 0
-        # `norm` is |M - C| / (1 - margin), see the class.
+        # `norm` is |M - C| / (1 - margin), see ``DerivedMass``; `unit` contains the divisor.
         norm = torch.linalg.vector_norm(self.unit * (mass - self.center), dim=(-2, -1))
         return torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(norm)).clamp(min=1.0)), 1.0)
 

@@ -40,7 +40,10 @@ class Mass(Protocol):
 
 
 class Inputs(Protocol):
-    """Interface of a constant input matrix G: gears, couplings of motors, and passive joints."""
+    """Interface of a constant input matrix G: joint torques = G tau, with the inputs tau of the motors.
+
+    G differs from the identity if motors drive several joints, or if joints are passive (without motor).
+    """
 
     def gains(self) -> Tensor:
         """Return the input matrix G, (n, n): joint torque per input of a motor."""

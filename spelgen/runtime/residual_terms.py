@@ -297,7 +297,7 @@ class ResidualDynamics(RigidBodyDynamics):
         return energy if self.residuals is None else energy + self.residuals.energy(cache.residual)
 
     def gravity(self, q: Tensor | RigidConfiguration) -> Tensor:
-        """Return dV/dq, gravity torque plus torque of the residual terms of V, (..., n) [Nm, N]."""
+        """Return dV/dq, (..., n) [Nm, N]: the sum of the gravity torque and of the residual terms' torque."""
         cache: RigidConfiguration = self.at(q)
         if self.residuals is None:
             return cache.gravity

@@ -61,10 +61,10 @@ class _Inertia(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """The pose of a joint's frame in the frame of the parent body, or the transform due to a joint's position.
+    """A rotation and a translation: of a joint frame in the frame of the parent body, or due to a joint's position.
 
     rotation: rows of the rotation matrix. Elements 0, 1 and -1 of rotation and translation are Python integers, so that
-    products with them are recognised and skipped.
+    products with them are recognized and not computed.
     """
 
     rotation: tuple[Vector, ...]
