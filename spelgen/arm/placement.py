@@ -170,7 +170,7 @@ class Placement:
             else:
                 # A revolute joint that is not locked at zero rotates the frames of all later links by a constant angle.
                 turn = rotation_about(axis, rounded_angle(value, self._rounding.tolerance))
-            frame = self._placed(frame, offset, turn)
+            frame = self._displaced(frame, offset, turn)
         self.frames[joint.child] = frame
 
     def move(self, joint: UrdfJoint) -> tuple[int, np.ndarray, np.ndarray]:
@@ -199,7 +199,7 @@ class Placement:
             self._segments.append(((np.eye(3), IDENTITY),))
             composed = aligning.T
         self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)
-        return frame.body, rotation, self._seen_from_both(rotation, frame.position)
+        return frame.body, rotation, self._without_rounding_errors(rotation, frame.position)
 
     def inertia(self, link: UrdfLink, inertial: Inertial) -> TenVector:
         """Return the inertial parameters (m, m c, I) of a link in the frame of its body, (10,) [kg, kg m, kg m2].
@@ -208,7 +208,7 @@ class Placement:
         """
         where = f"link {link.name!r} inertial origin"
         origin = self._rounding.origin(inertial.com, inertial.rpy, where, inertial.line)
-        frame = self._placed(self.frames[link.name], *origin)
+        frame = self._displaced(self.frames[link.name], *origin)
         mass, center = exact(inertial.mass), frame.position
         tensor = frame.rotation @ self._rounding.tensor(link, inertial) @ frame.rotation.T
         tensor = tensor + mass * (center @ center * IDENTITY - np.outer(center, center))
@@ -216,9 +216,9 @@ class Placement:
 
     def _joint_origin(self, joint: UrdfJoint) -> Frame:
         origin = self._rounding.origin(joint.xyz, joint.rpy, f"joint {joint.name!r} origin", joint.line)
-        return self._placed(self.frames[joint.parent], *origin)
+        return self._displaced(self.frames[joint.parent], *origin)
 
-    def _placed(self, frame: Frame, offset: np.ndarray, turn: np.ndarray | None) -> Frame:
+    def _displaced(self, frame: Frame, offset: np.ndarray, turn: np.ndarray | None) -> Frame:
         """Return a new frame: ``frame``, translated by ``offset`` (3,) [m] and then rotated by ``turn`` (3, 3).
 
         offset and turn are relative to the axes of ``frame``. turn: None for no rotation.
@@ -229,7 +229,7 @@ class Placement:
         composed = frame.composed @ turn
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
-    def _seen_from_both(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    def _without_rounding_errors(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
         """Return a joint's position (3,) [m] in the parent body, with rounding errors in both frames replaced by 0.
 
         A position may have components that should be 0 in the frame of the parent body, or in the joint's own frame.

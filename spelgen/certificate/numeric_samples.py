@@ -147,8 +147,8 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, len(arm.coordinates)))
     gravity = tuple(map(float, arm.gravity))
     as_written = make_arm(robot, joints=arm.joint_names, angle_tolerance=0.0, gravity=gravity)
-    theirs = _reading(dynamics, arm, q)
-    written, ours = (_reading(_arm_dynamics(variant), arm, q) for variant in (as_written, arm))
+    theirs = _compared_values(dynamics, arm, q)
+    written, ours = (_compared_values(_arm_dynamics(variant), arm, q) for variant in (as_written, arm))
     if all(body.inertia is None for body in arm.bodies):
         del written["masses and inertias"]
     differences = []
@@ -189,7 +189,7 @@ def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
     return arm_dynamics(replace(arm, bodies=tuple(bodies)), Settings())
 
 
-def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
+def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
     """Return {quantity: values} of the B moving bodies of an arm at S positions q, (S, n), for a comparison.
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",

@@ -121,19 +121,19 @@ class _DerivedFact:
     # [1] Sampled numbers, divided by their scales, count as zero up to this value: they may be rounding errors.
     rounding: float = 1e-12
 
-    def check(self, is_fine: bool) -> FactCheck:
+    def check(self, has_tiny_numbers: bool) -> FactCheck:
         """Return the verification of the fact by the sampled numbers.
 
-        is_fine: True if numbers of the arm are so small that nonzero results may be lost in rounding errors (see
-        `_is_fine`). If a number that should be nonzero counts as zero, the verdict is then "undecided" instead of
-        "differs".
+        has_tiny_numbers: True if numbers of the arm are so small that nonzero results may be lost in rounding errors
+        (see `_has_tiny_numbers`). If a number that should be nonzero counts as zero, the verdict is then "undecided"
+        instead of "differs".
         """
         zeros = [(name, value) for name, value, is_nonzero in self.magnitudes if not is_nonzero]
         nonzeros = [(name, value) for name, value, is_nonzero in self.magnitudes if is_nonzero]
         differences = [
             f"{name} is {size_text(value)} of its scale" for name, value in zeros if value > self.rounding
         ]
-        verdict: Verdict = "undecided" if is_fine and not differences else "differs"
+        verdict: Verdict = "undecided" if has_tiny_numbers and not differences else "differs"
         differences += [f"{name} is not seen" for name, value in nonzeros if value <= self.rounding]
         if differences:
             return FactCheck(self.fact, self.derived, shortened(differences, 4), verdict)
@@ -170,8 +170,8 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
         _potential(structure, samples),
         _rank("base parameters", numeric_samples.regressor(arm, rng), structure.base_parameter_count),
     ]
-    is_fine = _is_fine(arm, structure)
-    checks = [fact.check(is_fine) for fact in facts]
+    has_tiny_numbers = _has_tiny_numbers(arm, structure)
+    checks = [fact.check(has_tiny_numbers) for fact in facts]
     inertials = "inertial values of its own" if is_random else "the URDF's inertial values"
     means = f"{numeric_samples.ENGINE} at {count} random configurations, each with {inertials}"
     return Verification(means, count, seed, (*checks, *_reading_checks(robot, arm, seed)))
@@ -309,7 +309,7 @@ def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
     return _DerivedFact(fact, str(rank), magnitudes)
 
 
-def _is_fine(arm: Chain, structure: Structure) -> bool:
+def _has_tiny_numbers(arm: Chain, structure: Structure) -> bool:
     """Return True if the arm has nonzero numbers below 1e-3, whose products may be lost in rounding errors.
 
     The numbers are the entries of the rotations between joint frames and, if the structure depends on inertials, the

@@ -65,7 +65,7 @@ def _inputs(spec: ModelSpec) -> Call:
     # `mask` is True for gains (entries of G) that are trained; known gear ratios are constants.
     trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
     mask = tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
-    return call("MotorInputs", matrix, **_unless({"trained": mask}, trained=not trained))
+    return call("MotorInputs", matrix, **_without_defaults({"trained": mask}, trained=not trained))
 
 
 def base_class(spec: ModelSpec) -> str:
@@ -75,7 +75,7 @@ def base_class(spec: ModelSpec) -> str:
     return "DenseInputDynamics" if spec.design.input == "dense-3n" else "NetworkDynamics"
 
 
-def _unless(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
+def _without_defaults(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
     """Return ``fields`` without arguments that have their default values, so that the rows of a module are short.
 
     fields: {name of a keyword argument: value}. is_default: True for names of arguments with their default values.
@@ -91,7 +91,7 @@ def _joint(joint: JointSpec) -> Call:
         limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
     fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
     fields |= {"armature": joint.armature, "gear": joint.gear}
-    statements = _unless(
+    statements = _without_defaults(
         fields | {"typical_range": typical}, gear=joint.gear == 1, typical_range=typical == limits
     )
     return call("Joint", joint.name, joint.joint_type, **statements)
@@ -111,7 +111,7 @@ def _link(spec: ModelSpec, link: LinkSpec) -> Call:
         "offset": link.offset,
         "joint_type": link.joint_type,
     }
-    statements = _unless(
+    statements = _without_defaults(
         fields,
         rotation=np.array_equal(link.rotation, np.eye(3)),
         ratio=link.ratio == 1,
@@ -254,7 +254,7 @@ def _network(
         "min_units": min_units,
     }
     kind = "MaskedKAN" if spec.design.net == "kan" else "MaskedMLP"
-    return call(kind, GENERATOR, JOINTS, **_unless(options, min_units=min_units == 1))
+    return call(kind, GENERATOR, JOINTS, **_without_defaults(options, min_units=min_units == 1))
 
 
 def units(spec: ModelSpec) -> int:
