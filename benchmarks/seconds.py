@@ -26,7 +26,7 @@ GOALS = {"train closed-form": 2.0, "train hybrid": 4.0, "evaluate": 3.0, "report
 
 
 def main() -> None:
-    """Print each ratio and its goal."""
+    """Print the median time of each command, its ratio to `identify`, and the goal of the ratio."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--repeats", type=int, default=5)
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def spelgen(*words: str | Path) -> float:
-    """Run a command; return its processor time [s]."""
+    """Run a spelgen command in a process; return its processor time [s]."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-m", "spelgen", *map(str, words)], check=True, capture_output=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
