@@ -38,7 +38,7 @@ def from_group(joint_types: Sequence[str], elements: Sequence[torch.Tensor]) -> 
 
 
 class GroupModel(Protocol):
-    """The methods of an emitted module that the equations need; see its docstrings for shapes."""
+    """Methods of an emitted module that the equations on SO(3)^k x R^3^l use; its docstrings state the shapes."""
 
     joint_types: tuple[str, ...]
 
@@ -90,7 +90,7 @@ def group_rates(
     moving = model.input_matrix(q) @ tau.unsqueeze(-1) - model.dissipation(q, qd) @ qd.unsqueeze(-1)
     rates, forces = [], []
     for i, (part, slope) in enumerate(zip(parts, slopes, strict=True)):
-        turning = part.dim() == p.dim()  # one axis more than a position has
+        turning = part.dim() == p.dim()  # a rotation (..., 3, 3) has one axis more than a position (..., 3)
         rate, force = (_turning if turning else _sliding)(part, slope, p[..., i, :], velocity[..., i, :])
         rates.append(rate)
         forces.append(force + torch.nn.functional.pad(moving[..., i, :], (2, 0)))
@@ -100,7 +100,7 @@ def group_rates(
 def _turning(
     rotation: torch.Tensor, slope: torch.Tensor, p: torch.Tensor, velocity: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """R' and the torque that H makes."""
+    """Return dR/dt, (..., 3, 3), and the torque of H on a turning joint, (..., 3); see `group_rates`."""
     rate = torch.linalg.cross(rotation, velocity.unsqueeze(-2).expand_as(rotation), dim=-1)
     torque = torch.linalg.cross(p, velocity, dim=-1) + torch.linalg.cross(rotation, slope, dim=-1).sum(dim=-2)
     return rate, torque
@@ -109,5 +109,5 @@ def _turning(
 def _sliding(
     position: torch.Tensor, slope: torch.Tensor, p: torch.Tensor, velocity: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """r' and the force that H makes."""
+    """Return dr/dt and the force of H on a sliding joint, (..., 3) each; see `group_rates`."""
     return velocity, -slope

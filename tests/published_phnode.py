@@ -58,7 +58,7 @@ class Published(nn.Module):
         state = state if state.requires_grad else state.requires_grad_()
         rotation, zeta = state.split((9 * self.n, 3 * self.n), dim=-1)
         p = torch.linalg.solve(self.inverse_mass(rotation), zeta.unsqueeze(-1)).squeeze(-1)
-        # from here on R and p are independent, so that H is differentiated in each with the other held
+        # from here on R and p are independent variables, so that each partial derivative of H keeps the other constant
         rotation, p = torch.cat([rotation, p], dim=-1).split((9 * self.n, 3 * self.n), dim=-1)
         inverse = self.inverse_mass(rotation)
         kinetic = 0.5 * (p * (inverse @ p.unsqueeze(-1)).squeeze(-1)).sum(dim=-1)
@@ -86,7 +86,7 @@ class Published(nn.Module):
 
 
 class ByJvp(Published):
-    """The same rate as a user who knows torch writes it: dM^-1/dt is one derivative along the motion."""
+    """PHNODE with one change by a user who knows torch: dM^-1/dt is one derivative along the motion."""
 
     def _rate(self, inverse: Tensor, rotation: Tensor, rotation_rate: Tensor) -> Tensor:
         rate: Tensor = jvp(self.inverse_mass, (rotation,), (rotation_rate,))[1]

@@ -35,9 +35,8 @@ HISTORY = re.compile(
     r"|earlier release|not taken|was tried)\b",
     re.IGNORECASE,
 )
-SLOW = {"tutorial_servo.md"}  # a fit of half a minute: only `pytest --update` runs it
-# Without the rows of the table of control.md that it does not assert, with shorter motions, above all without an
-# estimator.
+SLOW = {"tutorial_servo.md"}  # a fit takes half a minute: only `pytest --update` runs the page
+# replacements in the code of pages, to shorten their runs: fewer rows of a table, shorter motions, no estimator
 SHORTER = {
     "control.md": {
         '("estimator", "learned", "URDF"):': '("estimator", "learned"):',
@@ -86,7 +85,7 @@ def tree(folder: Path) -> dict[Path, bytes]:
 
 
 def cell(text: str, block: str, output: str = "") -> str:
-    """The block with its output: from the text if it is there, or else the correct one."""
+    """Return a block of code with its output: the one in the text, if the text has this block, else the actual one."""
     for match in CELL.finditer(text):
         if match[1] == block:
             return match[0]
@@ -127,7 +126,7 @@ def test_the_tables_of_settings_are_up_to_date(path, request):
 
 
 def run_commands(block: str, folder: Path) -> str:
-    """The correct block: each command with its output."""
+    """Run the commands of a console block; return the block with the actual output of each command."""
     told = []
     for command in re.findall(r"^\$ (.*)$", block, re.MULTILINE):
         program, *arguments = shlex.split(command)
@@ -156,7 +155,7 @@ def test_links_lead_somewhere(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_is_short_and_has_no_history(page):
-    """A page has at most 2,500 words; former versions and trials are described in docs/decisions.md only."""
+    """A page has at most 2,500 words, and only docs/decisions.md describes former versions and trials."""
     text = page.read_text(encoding="utf-8")
     assert len(text.split()) <= 2500
     if page.name != "decisions.md":
@@ -174,12 +173,12 @@ def test_files_that_are_named_exist(page):
         assert any((folder / name).exists() for folder in (ROOT, ROOT / "spelgen")), name
 
 
-# Position of the code among the arguments of functions that make messages.
+# position of the code among the arguments of functions that make messages
 CODE_ARGUMENTS = {"Diagnostic": 1, "warn": 1, "Check": 0, "_warning": 0, "_note": 0, "_remark": 0}
 
 
 def codes_of_messages() -> set[str]:
-    """The codes of all remarks, warnings and accepted errors in the source text of the package."""
+    """Return the codes of all remarks, warnings and accepted errors that the source text of the package contains."""
     constants: dict[str, ast.expr] = {}
     codes = set(get_args(Accepted))
     for path in sorted((ROOT / "spelgen").rglob("*.py")):
