@@ -84,7 +84,7 @@ def test_load_dependent_friction_is_smooth_at_right_angles():
 
 
 def test_bristles_are_passive():
-    """Bristles are passive: supplied power minus the change of stored energy, the dissipated power, is never negative."""
+    """Bristles are passive: supplied power minus the rate of stored energy, the dissipation, is never negative."""
     laws = FrictionLaws(JOINTS, breakaway={"revolute": REACH[0], "prismatic": REACH[1]})
     with torch.no_grad():
         for weight in laws.parameters():

@@ -39,7 +39,7 @@ def first_state(problem):
 
 
 def test_the_minimum_of_the_rosenbrock_function_is_found():
-    """The solver finds the minimum: no step raises the cost, each step is reported, and at the minimum it takes none."""
+    """The solver finds the minimum: no step raises the cost, each is reported, and at the minimum it takes no step."""
     problem, states = Rosenbrock(), [first_state(Rosenbrock())]
     result = levenberg_marquardt(
         problem, states[0], max_steps=100, min_decrease=1e-20, callback=states.append
