@@ -239,7 +239,7 @@ def test_the_command_fails_where_logs_cannot_be_trained_on(spelgen, robots, arm,
     assert (strict.exit_code, strict.stderr) == (1, "3 warnings, and --strict allows none\n")
 
 
-def test_what_logs_do_not_need_does_not_refuse_them(spelgen, robots, arm, log, tmp_path):
+def test_settings_that_logs_do_not_need_may_have_errors(spelgen, robots, arm, log, tmp_path):
     """Neither settings of other steps, nor inertials, nor a transmission that says nothing."""
     text = (robots / "rpr.urdf").read_text()
     text = re.sub(r"<inertial>.*?</inertial>", "", text, flags=re.DOTALL)
@@ -452,7 +452,7 @@ def test_commands_on_round_levels_are_not_quantised(samples_held):
     assert quantisation_step(np.repeat(np.round(swing[::5]), 5)) == 1.0
 
 
-def test_no_coupling_is_found_by_luck(loaded, log):
+def test_no_coupling_is_found_by_chance(loaded, log):
     """Torques that no parameters explain: of all couplings one is the best, and none is told."""
     for seed in range(10):
         noise = np.random.default_rng(seed).standard_normal(log.tau.shape).cumsum(axis=0)
@@ -461,7 +461,7 @@ def test_no_coupling_is_found_by_luck(loaded, log):
         assert find_coupling(drive_problem(body_chain(loaded.chain), alone, samples)) is None
 
 
-def test_of_many_trajectories_an_even_part_is_filtered(monkeypatch):
+def test_only_an_even_part_of_many_trajectories_is_filtered(monkeypatch):
     """A long log is read in chunks: to filter each of them for every delay took minutes of a log of 10^7 samples."""
     filtered = []
 

@@ -123,7 +123,7 @@ def test_a_closed_form_model_is_fitted_to_a_coupled_wrist(wrist):
     assert (np.square(found - tau).mean(axis=0) / tau.var(axis=0)).max() < 2e-3
 
 
-def test_the_fit_knows_that_a_motor_moves_both_joints(wrist):
+def test_derivatives_are_right_for_coupled_motors(wrist):
     """With coupled motors, derivatives of the fit with respect to every parameter equal finite differences."""
     module, arm = wrist
     motion = [x[::40] for x in moved(module, 4.0)]

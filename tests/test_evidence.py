@@ -51,7 +51,7 @@ def recording(model, name: str, seconds: float, seed: int, correlation: float = 
 
 
 @pytest.mark.parametrize("coefficient", [0.0, 0.8])
-def test_errors_are_as_correlated_as_the_noise(coefficient):
+def test_the_correlation_of_the_noise_is_restored(coefficient):
     """`RigidProjection.errors` restores the correlation time of the noise from the residual of a fit.
 
     The residual of a fit of 60 parameters is itself smaller and less correlated than the noise.

@@ -316,7 +316,7 @@ def test_npz_never_unpickles(tmp_path):
         read_logs([tmp_path], JOINTS)
 
 
-def test_arrays_that_are_not_asked_for_are_not_looked_at(tmp_path):
+def test_arrays_that_are_no_columns_are_not_read(tmp_path):
     """Members of an archive that are no columns of the log are not read.
 
     One inflates to 2 GB of zeros, one is no array, one is pickled.

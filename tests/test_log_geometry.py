@@ -340,7 +340,7 @@ def test_torques_that_were_logged_as_magnitudes_are_named(arm, of_all):
     np.testing.assert_array_equal(named, unsigned & (share > 0.1))
 
 
-def test_torques_of_one_direction_by_nature_are_believed(robots, tmp_path):
+def test_torques_of_one_direction_by_gravity_are_accepted(robots, tmp_path):
     """Torques that never change sign, since gravity loads both joints to one side throughout, are accepted."""
     arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
     upright = replace(arm, chain=replace(arm.chain, gravity=(0.0, -9.81, 0.0)))

@@ -89,7 +89,7 @@ class TestTrajectory:
         assert "&lt;script&gt;" in hostile._repr_html_() and "<script>" not in hostile._repr_html_()
 
 
-def test_recordings_are_told_apart_wherever_their_rows_lie(tmp_path):
+def test_alternating_rows_of_recordings_are_separated(tmp_path):
     """Alternating rows of 3000 recordings are separated, in time and memory that grow with the number of rows only."""
     names = [f"r{k % 3000}" for k in range(12_000)]
     t, values = np.arange(12_000) // 3000 * 0.1, np.arange(12_000.0)
