@@ -51,7 +51,7 @@ SIMULATED = (
         truth.PANDA, number=1_000_002, arm="random", friction="stribeck", urdf_error=np.inf, seconds=20.0
     ),
     replace(truth.PANDA, number=118, arm="realman_rm_75", springs=True, seconds=10.0),
-    # gravity loads no wrist joint
+    # an arm whose wrist joints carry no gravity load
     replace(truth.PANDA, number=1_000_004, arm="niryo_ned3pro", friction="load"),
     replace(
         truth.PANDA, number=1_000_005, seconds=20.0, errors=draw_errors(np.random.default_rng(1_000_005))

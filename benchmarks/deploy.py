@@ -95,7 +95,7 @@ def parity() -> None:
 
 def _largest(found: Parity) -> float:
     """Return the largest relative difference over all entry points except the ones of the tip."""
-    # the forward kinematics that tip poses are compared with round to single precision
+    # tip poses are omitted: the forward kinematics that they are compared with have single precision
     return max(value for name, value in found.differences.items() if not name.startswith("tip_"))
 
 

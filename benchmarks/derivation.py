@@ -26,7 +26,7 @@ def median_seconds(work: Callable[[], object], repeats: int = 5) -> float:
     work()
     times = []
     for _ in range(repeats):
-        derive.cache_clear()  # else the structure that an earlier call derived would be returned
+        derive.cache_clear()  # each repeat derives the structure again, which would otherwise be cached
         start = time.process_time()
         work()
         times.append(time.process_time() - start)

@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def holds(source: str, deviation: float, seed: int) -> bool:
-    """Return whether M is positive definite and qdd finite at all states, for parameters of this standard deviation."""
+    """Return True if M is positive definite and qdd finite at all states, for parameters of this standard deviation."""
     generator = torch.Generator().manual_seed(seed)
     model = spelgen.load_module(source)
     with torch.no_grad():

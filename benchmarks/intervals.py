@@ -13,7 +13,8 @@ from spelgen.fitting.posterior import Posterior
 
 QUANTITIES = ("base", "friction", "mass", "gravity")
 QUANTILE = 1.96
-NEGLIGIBLE = 1e-6  # relative to the largest true value of a quantity
+# [1] error below which a true value of zero is omitted, relative to the quantity's largest true value
+NEGLIGIBLE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)

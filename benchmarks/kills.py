@@ -30,7 +30,8 @@ from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"
 ADAMW = ["--set", "optimizer=adamw", "--set", "batch=8", "--set", "momentum_steps=0"]
-LONGEST, SHORTER = 6.0, 2.0  # [s] at most from the first write of a process to its kill; of fits of servos
+# [s] longest time from a process's first write to its kill: of trainings, and of fits of servos
+LONGEST, SHORTER = 6.0, 2.0
 
 
 def main() -> None:
@@ -51,7 +52,8 @@ def main() -> None:
         source = generate(arm, "closed-form") if asked.servos else generate(arm, "spel", width=4, depth=1)
         (folder / "module.py").write_text(source)
         options = ["--set", "progress=false", "--robot", str(urdf)] + ([] if asked.servos else ADAMW)
-        epochs = str(20 + 16 * kills)  # of about 0.2 s each: more than a run completes before its last kill
+        # enough epochs, of about 0.2 s each, that the training does not end before the last kill
+        epochs = str(20 + 16 * kills)
         always = [] if asked.servos else ["--set", f"epochs={epochs}", "--set", f"patience={epochs}"]
 
         def command(run: Path, *, resume: bool) -> list[str]:

@@ -70,7 +70,7 @@ from spelgen.logs.trajectory import Trajectory
 SECONDS: tuple[float, ...] = (3.0, 5.0, 10.0, 20.0, np.inf)
 RIDGES = tuple(10.0**k for k in range(-9, 3))
 RIDGE_FOLDS = 5
-# [s] training part of the one recording
+# [s] duration of the training part, of arms with a single recording
 TRAINED_FIRST = {"panda": 12.0, "xmate3": 12.0, "ar5": 36.0, "tx40": 5.4}
 AIRBOT_TRAINING = ("ps_N7T25QR-5", "ps_N7T25QR-6_again")
 
@@ -167,7 +167,7 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
 
     tau = np.concatenate([x.tau for x in samples])
     scale = np.maximum(tau.std(axis=0), 1e-3 * tau.std(axis=0).max())[:, None]
-    # (T, n, K): torque per parameter, by the torque's range
+    # regressor (T, n, K), each joint divided by the range of its torque
     rows = np.concatenate([*map(columns, samples)]) / scale
     length = np.sqrt(np.square(rows).sum(axis=(0, 1)))
     length[length == 0] = 1.0
@@ -180,7 +180,8 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
         return np.linalg.solve(gram[:-1, :-1] + penalty * np.eye(len(length)), gram[:-1, -1])
 
     def held_out_error(penalty: float) -> float:
-        share = (RIDGE_FOLDS - 1) / RIDGE_FOLDS  # part of the squared column length that training blocks have
+        # share of the samples that are in training blocks, by which the penalty is scaled
+        share = (RIDGE_FOLDS - 1) / RIDGE_FOLDS
         error = 0.0
         for block, gram in zip(blocks, grams, strict=True):
             parameters = solution(grams.sum(axis=0) - gram, share * penalty)
@@ -257,7 +258,7 @@ def recordings_of(folder: Path, urdf: Path) -> dict[str, Trajectory]:
 
 
 def splits(name: str, urdf: Path, logs: Mapping[str, Trajectory]) -> Iterator[Fold]:
-    """Yield the documented splits of an arm's recordings; Shanghai has one split per recording that is left out."""
+    """Yield the documented splits of an arm's recordings; Shanghai has one split per recording, which is its test."""
 
     def chosen(names: Iterable[str]) -> tuple[Trajectory, ...]:
         return tuple(logs[x] for x in names)
@@ -378,7 +379,7 @@ def by_rivals(options: argparse.Namespace) -> list[Row]:
 
 
 def missing(options: argparse.Namespace, rows: Sequence[Row]) -> Iterator[Row]:
-    """Fit what the options request and `rows` do not contain; yield the new results, fold by fold."""
+    """Fit the requested folds, durations and methods that `rows` do not contain; yield the results, fold by fold."""
     done = {(row["fold"], row["seconds"], row["method"]) for row in rows}
     for fold in folds(folder_of(options.folder)):
         if not any(x in fold.name for x in options.only):

@@ -57,13 +57,13 @@ def _median(values: Sequence[float]) -> str:
 
 
 def ratio_to_best(errors: Mapping[str, float]) -> float | None:
-    """Return the default's error divided by the smallest error of `REFERENCES`; None if there is no such error."""
+    """Return the error of `hybrid` divided by the smallest error of `REFERENCES`; None if one of them is absent."""
     best = min((errors[name] for name in REFERENCES if name in errors), default=None)
     return None if best is None or DEFAULT not in errors else errors[DEFAULT] / best
 
 
 def summary(cells: Mapping[Cell, Mapping[str, float]]) -> list[str]:
-    """Return lines on the default's error divided by the best reference's: quantiles per group, and the worst cells."""
+    """Return lines on the error of the preset `hybrid` divided by the smallest of `REFERENCES`, and the worst cells."""
     ratios = {cell: x for cell, errors in cells.items() if (x := ratio_to_best(errors)) is not None}
     if not ratios:
         return []

@@ -10,7 +10,7 @@ the sense of a joint's position, torque or both, an order of all columns or of t
 torque or all signals of a joint logged 40 to 140 ms late or early, and a joint's clock that runs 0.4 to 1.4 % fast or
 slow.
 
-A reading is a hypothesis of what the columns of a log mean (`Hypothesis`); the right reading undoes the fault. A fault
+A reading is a hypothesis on the meaning of a log's columns (`Hypothesis`); the right reading undoes the fault. A fault
 is `named` if the first reading that `spelgen logs` lists is the right one, `with others` if a later one is, `wrong` if
 all are wrong. If no reading is listed, it is `missed`, or `invisible` if the evidence for the right reading is below
 the threshold even with the inertials of the true arm: a vertical first axis, a symmetric wrist.
@@ -155,7 +155,7 @@ def compared(problem: GeometryProblem) -> list[HypothesisFit]:
 
 
 def is_same(one: Hypothesis, other: Hypothesis) -> bool:
-    """Return whether two readings agree up to the tolerances `NEAR` of angles and `NEAR_DELAY` of delays."""
+    """Return True if two readings of a log's columns agree up to the tolerances `NEAR` and `NEAR_DELAY`."""
     turn = np.angle(np.exp(1j * (one.offset - other.offset)))
     gravity = np.array(one.gravity) - np.array(other.gravity)
     return bool(
@@ -169,7 +169,7 @@ def is_same(one: Hypothesis, other: Hypothesis) -> bool:
 
 
 def result_of(arm: Arm, true: Arm, logs: Sequence[Trajectory], kind: str, right: Hypothesis) -> str:
-    """Return how `spelgen logs` finds the fault of a kind that the reading `right` undoes: one of `RESULTS`."""
+    """Return the result of `spelgen logs` for the fault that the reading `right` undoes: one of `RESULTS`."""
     drives, chain, ideal = arm.actuation.drives(), arm.chain, true.chain
     if kind == "gravity":  # the fault is in the settings, which state another gravity; the log is right
         chain, ideal = replace(chain, gravity=right.gravity), replace(ideal, gravity=right.gravity)

@@ -78,7 +78,8 @@ def numbers(content: bytes, delimiter: str | None = ",", skiprows: int = 0) -> n
 UR10E_JOINTS = [
     f"{x}_joint" for x in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ]
-UR10E_GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])  # [Nm/A], as the authors identified them
+# [Nm/A] drive gains that the authors of the logs identified
+UR10E_GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])
 UR10E_LOGS = {  # path of a log without "ur-" and suffix: its rows that the authors use
     "identification_data/19_12_23_free": slice(None),
     "identification_data/20_01_13-load_2600": slice(None),

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from spelgen.logs.dynamics_samples import FREQUENCY
 
-LAGS = (0.02, 0.1, 0.2, 0.5, 1.0)  # [s] of the autocorrelation
+LAGS = (0.02, 0.1, 0.2, 0.5, 1.0)  # [s] lags of the autocorrelation
 # [Hz] edges of frequency bands, up to the cutoff of the torque's filter
 BANDS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
 SEGMENT = 400  # samples of a periodogram (4 s), so that the band below 0.5 Hz contains two frequencies

@@ -41,7 +41,7 @@ Method = Callable[["Problem"], Prediction]
 WIDTHS, DECAYS = (32, 128), (1e-4, 1e-1)  # candidates for networks: units per hidden layer, weight decay
 EPOCHS, PATIENCE, BATCH = 400, 30, 512
 SMOOTHING = 0.02  # [rad/s] width of tanh(qd / width), the Coulomb friction of networks and Gaussian processes
-SYSID_SAMPLES = 600  # few, as MuJoCo computes inverse dynamics one sample at a time
+SYSID_SAMPLES = 600  # samples for MuJoCo's sysid: few, as it computes inverse dynamics one sample at a time
 # samples of the Gaussian process; samples, steps and learning rate of the fit of its hyperparameters
 GP_SAMPLES, GP_TRAINING, GP_STEPS, GP_RATE = 1500, 300, 100, 0.05
 
@@ -100,7 +100,7 @@ def mujoco_sysid(problem: Problem) -> Prediction:
         def set_drive(changed: Any, parameter: Any, name: str = name) -> None:
             joint = changed.joint(name)
             damping, joint.frictionloss, joint.armature = parameter.value
-            joint.damping = [damping, 0.0, 0.0]  # the coefficients of |qd| and qd^2 are zero
+            joint.damping = [damping, 0.0, 0.0]  # damping coefficients of qd, |qd| and qd^2
 
         parameters.add(
             sysid.Parameter(
@@ -141,7 +141,7 @@ def _set_inertia(body: Any, parameters: np.ndarray) -> None:
     about_center = inertia - mass * (center @ center * np.eye(3) - np.outer(center, center))
     body.explicitinertial = True
     body.mass, body.ipos, body.iquat = mass, center, (1.0, 0.0, 0.0, 0.0)
-    body.inertia[:] = 0.0  # diagonal inertia is unused: `fullinertia` replaces it
+    body.inertia[:] = 0.0  # MuJoCo requires that the diagonal inertia is zero if `fullinertia` is set
     body.fullinertia[:] = about_center[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].reshape(body.fullinertia.shape)
 
 
@@ -306,7 +306,8 @@ class DeepLagrangian(nn.Module):
         super().__init__()
         rows, columns = torch.tril_indices(joints, joints)
         entries = torch.eye(joints * joints).double()[rows * joints + columns]
-        self.entries = entries.unflatten(-1, (joints, joints))  # matrices of the entries of the factor of M
+        # (entries, n, n): matrix with a one at the place of each entry of the factor of M
+        self.entries = entries.unflatten(-1, (joints, joints))
         self.factor = mlp(2 * joints, joints * (joints + 1) // 2, width, nn.Softplus)
         self.potential = mlp(2 * joints, 1, width, nn.Softplus)
         self.viscous, self.coulomb = (nn.Parameter(torch.zeros(joints).double()) for _ in range(2))

@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def compare_fits() -> None:
-    """Print time and memory of fits to torques, and the growth with samples and with joints beside the goals."""
+    """Print time and memory of fits to torques, and their growth with samples and joints compared with the goals."""
     costs = {}
     for joints, samples in ((6, 10_000), (6, 1_000_000), (8, 20_000), (16, 20_000)):
         command = [sys.executable, __file__, "--fit", str(joints), str(samples)]
@@ -155,7 +155,8 @@ def _step(model: ArmModel, windows: Windows) -> None:
 def _rate(model: ArmModel, batch: int) -> float:
     """Return the number of windows per second of a training step with `batch` windows, by the median time."""
     windows, times = _windows(model, batch), []
-    clock = time.perf_counter if windows.q.is_cuda else time.process_time  # not affected by other processes
+    # processor time, which other processes do not affect; on a GPU wall time
+    clock = time.perf_counter if windows.q.is_cuda else time.process_time
     for _ in range(REPEATS + 1):
         since = clock()
         _step(model, windows)

@@ -3,8 +3,8 @@
     python benchmarks/servo_creep.py ARM.urdf --train LOGS... --test LOGS... [--preset hybrid]
 
 A hold begins two seconds after a joint's command became constant and lasts a minute at most; other joints may move.
-Holds in which the measured position leaves one encoder step are omitted. Creep is the largest displacement from the
-position at the beginning of the hold; motions of other joints cause a little of it, measured and predicted.
+Holds in which the measured position moves by more than one encoder step are omitted. Creep is the largest displacement
+from the position at the beginning of the hold; motions of other joints cause a little of it, measured and predicted.
 `measured at rest`: the largest predicted creep over holds in which the measured joint does not move at all, and their
 number. `beyond measured`: the largest difference between predicted and measured creep. The model is fitted to the
 training logs and predicts each log, training and test, from its first state.

@@ -40,14 +40,17 @@ if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
 STEP = 5e-4  # [s] integration step of the simulated robot
-HARD = [2e-3, 1.0]  # solref of its stiff constraints: time constant [s], and damping ratio, without rebound
-# of the joint that models backlash: armature relative to its drive's armature [1], damping relative to kp [s]
+# solref of stiff constraints of the simulated robot: time constant [s] and damping ratio (no rebound)
+HARD = [2e-3, 1.0]
+# joint that models backlash: armature relative to its drive's armature [1], damping relative to kp [s]
 SHARE, DAMPING = 0.02, 2e-4
 # [s] largest integration step of fitted actuators; twice it is the time constant of frictionloss
 FIT_STEP = 5e-3
-WINDOWS, ITERATIONS = 60, 8  # of the fit of actuators, which then takes half a minute
+# number of windows and of solver steps of the fit of actuators, which takes half a minute
+WINDOWS, ITERATIONS = 60, 8
 DIFFERENCE = 1e-4  # finite-difference step of the unknowns of the fit
-LOG_RANGE, OFFSET_RANGE, MAX_DELAY = 4.0, 0.3, 0.4  # bounds: change of log drives; [rad, m]; [s]
+# bounds of the fit: change of log drives; offset [rad, m]; delay [s]
+LOG_RANGE, OFFSET_RANGE, MAX_DELAY = 4.0, 0.3, 0.4
 
 
 def arm_with_servos(
@@ -187,7 +190,7 @@ class PositionActuators:
                 range=coordinate.limits or (0, 0),
                 armature=armature,
                 frictionloss=frictionloss,
-                # stiffness of the constraint of frictionloss, together with the joint's inertia
+                # with the joint's inertia, these determine the stiffness of the constraint of frictionloss
                 solref_friction=(2 * FIT_STEP, 1),
                 solimp_friction=EXPORT_TUNING.friction_impedance,
             )

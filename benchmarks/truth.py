@@ -69,7 +69,7 @@ ARMS = (
 )  # folder of URDFs next to the checkout; without it all arms are random chains
 FRICTIONS = ("none", "coulomb", "stribeck", "bristles", "load", "asymmetric")
 FINE = 1000.0  # [Hz] rate of the simulation, of whose samples logs are a subset
-POSITION_NOISE = 1e-5  # [rad, m] standard deviation, as of an encoder with 18 bits
+POSITION_NOISE = 1e-5  # [rad, m] standard deviation of encoder noise, as of an encoder with 18 bits
 SHARE = (0.03, 0.15)  # [1] Coulomb friction relative to the rigid torque's standard deviation, log-uniform
 TINY = 1e-9
 FIRST_REALISTIC = 10_000
@@ -96,7 +96,7 @@ class Case:
     seconds: float
     sample_rate: float
     noise: float
-    delay: float  # [s] of the torques
+    delay: float  # [s] delay of the logged torques
     errors: RealErrors | None = None
 
 

@@ -142,7 +142,7 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
         elif "residuals.raw" in name:
             parameter.data = 0.3 * draw
         elif "network" in name or "potential." in name or "residuals.mass." in name:
-            # a Kolmogorov-Arnold network has a grid of parameters per input, so its number of inputs is the product
+            # a Kolmogorov-Arnold network has a grid of parameters per input: both count as inputs in the scale
             inputs = parameter[0].numel() if parameter.dim() == 3 else parameter.shape[-1]
             parameter.data = draw * inputs**-0.5
 

@@ -90,7 +90,8 @@ def group_rates(
     moving = model.input_matrix(q) @ tau.unsqueeze(-1) - model.dissipation(q, qd) @ qd.unsqueeze(-1)
     rates, forces = [], []
     for i, (part, slope) in enumerate(zip(parts, slopes, strict=True)):
-        turning = part.dim() == p.dim()  # a rotation (..., 3, 3) has one axis more than a position (..., 3)
+        # a turning joint has a rotation (..., 3, 3), a sliding joint a position (..., 3)
+        turning = part.dim() == p.dim()
         rate, force = (_turning if turning else _sliding)(part, slope, p[..., i, :], velocity[..., i, :])
         rates.append(rate)
         forces.append(force + torch.nn.functional.pad(moving[..., i, :], (2, 0)))

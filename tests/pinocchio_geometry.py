@@ -61,7 +61,7 @@ class Seen:
         return np.abs(axis @ down if self.slides(joint) else np.cross(axis, down)).max() < NOTHING
 
     def commute(self, mover: int, others: list[int]) -> bool:
-        """Return whether the motion of joint `mover` changes no axis of `others`: lines, or directions if sliding."""
+        """Return True if the motion of joint `mover` changes no axis of `others`: lines, or directions if sliding."""
         for q in self.configurations:
             moved = q + 0.7 * np.eye(self.n)[mover - 1]
             before, after = self._places(q), self._places(moved)

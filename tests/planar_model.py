@@ -62,7 +62,7 @@ class Model(PortHamiltonian):
         super().__init__([Joint(name, "revolute", -3.0, 3.0, 5.0, 1.0, 0.0) for name in JOINTS])
         generator = torch.Generator().manual_seed(seed)
         noise = 0.01 * torch.randn(5, generator=generator, dtype=torch.float64)
-        # inertia: b, log d, log e of the class's M
+        # initial b, log d and log e, the parameters of M
         self.inertia = nn.Parameter(torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64) + noise[:3])
         self.weight = nn.Parameter(noise[3:].clone())
         self.friction = Damping()

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 
 def killed(training: Callable[[], object], write: int, *, before: bool) -> bool:
-    """Run a training in a fork that dies at its n-th write of a file; return whether it died before its end.
+    """Run a training in a fork that dies at its n-th write of a file; return True if it died before its end.
 
     write: number n of the write, from 1. before: die just before the write, otherwise just after it.
     """

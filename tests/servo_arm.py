@@ -36,7 +36,7 @@ class Servos:
 
 
 def write_servo_arm(folder: Path, settings: str = "input: position\n") -> Path:
-    """Write the URDF with its settings file."""
+    """Write the URDF of the two-link arm and its settings file; return the path of the URDF."""
     links = [
         LINK.format(name=name, com=com, mass=mass, inertia=inertia)
         for name, com, mass, inertia in zip(("upper", "lower"), COM, MASS, INERTIA, strict=True)

@@ -49,7 +49,7 @@ def test_every_robot_here_has_an_arm_as_built(name, robots, tmp_path):
 
 
 def is_consistent(inertia):
-    """Return whether the pseudo-inertia matrix of ten inertial parameters about the joint is positive semidefinite."""
+    """Return True if the pseudo-inertia matrix of ten inertial parameters about the joint is positive semidefinite."""
     m, hx, hy, hz, ixx, ixy, ixz, iyy, iyz, izz = inertia
     tensor = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
     pseudo = np.zeros((4, 4))

@@ -50,7 +50,7 @@ def moved(q, qd, matrix_of):
     return torch.func.jvp(matrix_of, (q,), (qd,))[1]
 
 
-# without rpr, whose inertias are not physically consistent and are therefore changed
+# rpr is omitted: one of its bodies is not physically consistent, and the model uses the nearest consistent one
 @pytest.mark.parametrize("robot", [x for x in ROBOTS if x != "rpr"])
 def test_untrained_it_is_the_urdfs_rigid_arm(emitted, robots, robot):
     module, arm = emitted[robot]
@@ -134,7 +134,7 @@ def test_any_batch_shape(emitted, batch):
 def test_backpropagation_reaches_every_weight(emitted):
     model = drawn(emitted["rpr"][0], seed=0, deviation=0.3)
     q, qd, _, tau = states(3)
-    z = 0.3 * model.memory(qd)  # friction states between the ones of both directions of motion
+    z = 0.3 * model.memory(qd)  # friction states that are not saturated, so that all derivatives are nonzero
     model.forward_dynamics(q, qd, tau, z * torch.rand_like(z)).square().sum().backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad.abs().max() > 0, name

@@ -155,7 +155,7 @@ def test_figures_of_a_run_agree_with_one_another(results):
         assert sizes["smallest eigenvalue of M / mean"] > 0
     labels = [f"outputs of {matrix}" for matrix in "MDGV"]
     assert [results["hybrid"].simulated.sizes[label] for label in labels] == [1, 2, 0, 1]
-    # the numbers of outputs and inputs of the paper
+    # phnode has the numbers of outputs and inputs of its paper
     sizes = results["phnode"].simulated.sizes
     assert [sizes[label] for label in labels] == [21, 21, 6, 1]
     assert sizes["inputs of M"] == 4
@@ -373,7 +373,7 @@ def kill_two(folder: Path, killed: list[int]) -> None:
     killed: receives the process ids.
     """
     waiting = {"a": signal.SIGKILL, "b": signal.SIGTERM}
-    # up to some minutes, as workers start slowly on a loaded machine
+    # wait up to some minutes, as workers start slowly on a loaded machine
     for _ in range(30_000):
         for lock in folder.glob("runs/*/*/.lock"):
             try:
@@ -401,7 +401,7 @@ def test_runs_of_killed_workers_are_resumed_and_end_with_the_same_weights(listed
     assert sorted(result.arm for result in study.results.values()) == ["a", "b"]
     assert not study.failures
     assert len(list(folder.glob("runs/*/*/result.json"))) == 2
-    # other runs of the same logs, killed at different times, have equal weights
+    # a second comparison, whose workers are killed at different times, gives equal weights
     a, b = (torch.load(next((folder / "runs" / x).glob("*/model.pt"))) for x in "ab")
     assert all(torch.equal(a[name], b[name]) for name in a)
 

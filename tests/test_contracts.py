@@ -25,13 +25,13 @@ ALL_ROBOTS = ("hybrid", "minimal", "closed-form")
 WITH_FRICTION_STATE = ("hybrid", "closed-form")
 THREE = ("two_link", "rpr", "six_dof")
 URDFS = {"mimic": FOLLOWED, "gantry": GANTRY}  # generated arms, tested like the robots of the repository
-# Standard deviations of random parameters; None: as `randomise` scales them. With 1.0 the bound of M is active.
+# Standard deviations of random parameters; None: the scales of `randomise`. With 1.0 the bound of M is active.
 DEVIATIONS = {"minimal": (None, 1.0), "closed-form": (0.5,)}
 LARGE = {
     "phnode": None,
     "phnode-kan": None,
     "closed-form": 1.5,
-}  # scale of parameters at which M stays positive definite; at 3.0 phnode would invert an ill-conditioned matrix
+}  # largest scale of parameters: at 3.0 phnode would invert an ill-conditioned matrix
 
 each_case = pytest.mark.parametrize(
     ("variant", "robot"),
@@ -129,7 +129,7 @@ def test_explicit_derivatives_equal_automatic_ones(variant, robot, random_model)
 @each_case
 def test_forward_and_inverse_dynamics_are_inverses(variant, robot, random_model):
     model = random_model(variant, robot, 3, DEVIATIONS.get(variant, (None,))[0])
-    # without the input network of phnode, whose random gains may be almost zero and not invertible
+    # the input network of phnode is constant, as its random gains may be almost zero and not invertible
     if variant.startswith("phnode"):
         torch.nn.init.zeros_(model.input_network.weights[-1])
     q, qd, _, tau = states(model.n, 25)
@@ -185,7 +185,7 @@ def test_states_may_have_any_batch_shape_and_single_precision(variant, robot, mo
 def test_backpropagation_reaches_every_parameter(variant, dtype, random_model):
     model = random_model(variant, "rpr", 0, 0.3).to(dtype)
     q, qd, _, tau = (x.to(dtype) for x in states(3, 20))
-    # friction states between the ones of both directions of motion
+    # friction states that are not saturated, so that all derivatives are nonzero
     state = [0.3 * z * torch.rand_like(z) for z in friction_state(variant, model, qd)]
     loss = model.forward_dynamics(q, qd, tau, *state).square().sum() + model.hamiltonian(q, qd, *state).sum()
     loss.backward()

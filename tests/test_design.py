@@ -40,7 +40,7 @@ def test_what_is_refused_names_the_two_options():
             second = rest.partition(";")[0]
             named = dict(part.split(": ") for part in (first, second))
             assert len(named) == 2 and named.items() <= values.items()
-    # 96 combinations of networks only; and rigid bodies with and without friction state, and with and without networks
+    # accepted: 96 combinations of networks only, and rigid bodies with or without friction state and networks
     assert len(COMBINATIONS) - len(refused) == 96 + 2 * 2
 
 
@@ -77,7 +77,8 @@ def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
     options = load_module(source).spec.options
     assert (options.preset, options.design.dissipation) == ("mine", "dense-3n")
     (tmp_path / "module.py").write_text(source, encoding="utf-8")
-    (tmp_path / "mine.yaml").unlink()  # without the file of the preset, as the module states its own design
+    # the module states its own design, so that the file of the preset is not needed
+    (tmp_path / "mine.yaml").unlink()
     assert check(tmp_path / "module.py", robots / "rpr.urdf").reasons == ()
 
 

@@ -51,7 +51,7 @@ TUTORIALS = sorted((ROOT / "docs").glob("tutorial_*.md"))
 @pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
 def test_examples(page, tmp_path, monkeypatch, request):
     shutil.copytree(ROOT / "robots", tmp_path / "robots")
-    if page in TUTORIALS:  # as a notebook that is opened in docs/
+    if page in TUTORIALS:  # the working folder is docs/, as for a notebook that is opened there
         shutil.copytree(ROOT / "docs", tmp_path / "docs")
     folder = tmp_path / "docs" if page in TUTORIALS else tmp_path
     files = tree(tmp_path)
@@ -194,7 +194,7 @@ def codes_of_messages() -> set[str]:
                 place = CODE_ARGUMENTS.get(getattr(node.func, "attr", getattr(node.func, "id", "")))
                 found += [] if place is None else node.args[place : place + 1]
             elif isinstance(node, ast.Yield) and len(getattr(node.value, "elts", ())) == 4:
-                found += node.value.elts[:1]  # findings of spelgen/urdf/lint.py
+                found += node.value.elts[:1]  # codes of findings of spelgen/urdf/lint.py
         resolved = [constants.get(x.id, x) if isinstance(x, ast.Name) else x for x in found]
         codes |= {x.value for x in resolved if isinstance(x, ast.Constant) and isinstance(x.value, str)}
     return codes

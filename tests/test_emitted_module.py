@@ -124,7 +124,8 @@ def test_energy_is_conserved_without_input_and_dissipation(robot, tmp_path):
     """Without input and dissipation, H drifts by less than 1e-8 in 2 s of Runge-Kutta steps of 1.6 ms."""
     model = frictionless(random_model(robot, tmp_path, seed=0))
     for weight in model.residuals.parameters(recurse=False):
-        weight.data.zero_()  # without ripple of 66 periods per revolution, which would need shorter steps
+        # torque ripple of 66 periods per revolution is removed, as it would need shorter steps
+        weight.data.zero_()
     at, qd, _, _ = (0.25 * x for x in states(model.n, 4))
     with torch.no_grad():
         prepared, q, p = model.prepare(), at, model.momentum(at, qd)

@@ -175,7 +175,7 @@ def evaluated(run, logs, **options):
 def test_the_true_model_is_perfect_and_its_baseline_is_not(run):
     result = evaluated(run, run.parent / "logs")
     assert [(x.name, x.steps, x.windows) for x in result.horizons] == [
-        # each prediction starts at the third sample, for predictors that use two earlier ones
+        # windows begin two samples before a prediction, for predictors that use earlier samples
         ("1 step", 1, 4 * 22),
         ("10 steps", 10, 4 * 13),
         ("1 s", 20, 4 * 3),
@@ -244,7 +244,7 @@ def test_a_model_that_runs_away_has_no_error_but_null(run, tmp_path):
     copy.mkdir()
     for path in run.iterdir():
         (copy / path.name).write_bytes(path.read_bytes())
-    # gravity torques of about 1e12 Nm, which make the rollout diverge; large damping would not
+    # the network of V gives gravity torques of about 1e12 Nm, so that the rollout diverges
     name = "potential.weights.1"
     torch.save(weights | {name: torch.full_like(weights[name], 1e12)}, copy / "model.pt")
     result = evaluated(copy, run.parent / "logs")
@@ -285,7 +285,7 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
 
 
 def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
-    """A model in memory is evaluated on arrays and beside other dynamics, without a run folder or files.
+    """A model in memory is evaluated on arrays and compared with other dynamics, without a run folder or files.
 
     The low-pass filter of the evaluation applies to torques too.
     """
@@ -364,13 +364,15 @@ class Torques:
 def test_torque_errors_by_the_protocol():
     (samples,) = dynamics_samples([moving()])
     exact = torque_errors(Torques(lambda q, qd, qdd: torch.stack([qdd[:, 0], 0 * qdd[:, 1]], -1)), [samples])
-    assert exact.joint_nmse[0] < 1e-3  # up to errors of the filter at the ends of the log
+    # not exactly zero, because of errors of the filter at the ends of the log
+    assert exact.joint_nmse[0] < 1e-3
     assert exact.joint_nmse[1] is None  # nMSE is undefined for a torque that never varies
     tau = torch.from_numpy(samples.tau)
     offset = torque_errors(Torques(lambda q, qd, qdd: tau + torch.tensor([1.0, 2.0])), [samples])
     np.testing.assert_allclose(offset.rmse, [1.0, 2.0], rtol=1e-12)
     np.testing.assert_allclose(offset.joint_nmse[0], 1 / samples.tau[:, 0].var(), rtol=1e-12)
-    constant = np.where(samples.tau[:, :1] > 0, 0.1 + 0.2, 0.3)  # a constant torque up to rounding
+    # the torque of joint 2 is constant up to rounding
+    constant = np.where(samples.tau[:, :1] > 0, 0.1 + 0.2, 0.3)
     rounded = replace(samples, tau=np.concatenate([samples.tau[:, :1], constant], axis=1))
     assert torque_errors(Torques(lambda q, qd, qdd: tau), [rounded]).joint_nmse == (0.0, None)
     infinite = torque_errors(Torques(lambda q, qd, qdd: tau / 0), [samples])
@@ -405,7 +407,7 @@ def test_steps_of_dry_friction_are_filtered_as_the_torque_is(robots):
     model = build(robots / "two_link.urdf", preset="closed-form")
     model.friction.memoryless.fill_(1.0)
     with torch.no_grad():
-        model.friction.raw_coulomb += 1.0  # more Coulomb friction, so that most of the torque are steps
+        model.friction.raw_coulomb += 1.0  # more Coulomb friction, so that steps are most of the torque
     t = np.arange(2000) / 200
     frequencies = 2 * np.pi * np.array([0.4, 0.7])
     phase = frequencies * t[:, None]
@@ -414,7 +416,7 @@ def test_steps_of_dry_friction_are_filtered_as_the_torque_is(robots):
         tau = model.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
     samples = dynamics_samples([Trajectory(t, q, qd, tau)], reach=bristle_reach(model))
     error = torque_errors(model, samples).mean_nmse
-    # 8e-7; with steps at samples of 100 Hz instead of the log's sample times it would be 5e-6
+    # the error is 8e-7; if friction reversed at samples of 100 Hz instead of the log's times it would be 5e-6
     assert error < 2e-6
     unfiltered = [replace(x, direction=None) for x in samples]
     assert torque_errors(model, unfiltered).mean_nmse > 10 * error

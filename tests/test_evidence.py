@@ -58,7 +58,7 @@ def test_the_correlation_of_the_noise_is_restored(coefficient):
     """
     rng, count, joints = np.random.default_rng(0), 1000, 8
     noise = lfilter([1.0], [1.0, -coefficient], rng.normal(size=(count, joints)), axis=0)
-    # columns that vary slowly, as the regressor of an arm does
+    # regressor columns that vary slowly, as the ones of an arm do
     smooth = [lfilter([1.0], [1.0, -0.97], rng.normal(size=(count, 60)), axis=0) for _ in range(joints)]
     jacobian = tuple(map(torch.from_numpy, smooth))
     gain = tuple(torch.linalg.inv(x.mT @ x) for x in jacobian)
@@ -235,7 +235,7 @@ def test_held_out_errors_are_those_of_fits_without_the_block(robots):
         weighted = rows[:, kept] / noise[:, None, None] ** 2
         curvature = torch.einsum("jtk,jtl->kl", weighted, rows[:, kept]) + precision
         gradient = torch.einsum("jtk,jt->k", weighted, residual[:, kept]) - precision @ offset
-        # minus the remaining step of the whole problem, as the estimate is stationary only to the solver's tolerance
+        # the step of the whole problem is subtracted, since the estimate is stationary only to the solver's tolerance
         whole = torch.einsum("jtk,jt->k", rows / noise[:, None, None] ** 2, residual) - precision @ offset
         step = torch.linalg.solve(curvature, gradient - whole)
         expected.append((residual[:, ~kept] - rows[:, ~kept] @ step).square().sum(dim=1))

@@ -144,7 +144,7 @@ def test_a_run_without_its_robot_is_refused(tmp_path):
 
 @pytest.mark.parametrize("robot", ["rpr", "panda"])
 def test_exported_bodies_have_the_models_base_parameters(robot, tmp_path):
-    """Exported bodies have the model's base parameters, whatever values single parameters get."""
+    """Exported bodies have the model's base parameters, although single inertial parameters may differ."""
     run, model = run_of(robot, tmp_path, "closed-form", heavier)
     export(run.path, "urdf", tmp_path / "learned.urdf")
     arm = load_arm(ROBOTS / f"{robot}.urdf")

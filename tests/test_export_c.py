@@ -62,7 +62,7 @@ def test_c_equals_the_model(case, program, flags, compiled):
     options = [f"-D{model.name.upper()}_FLOAT"] if flags else []
     source = folder / f"{model.name}.c"
     library = compile_library(source, program, *options)
-    # a name per compiler and flags, as ctypes caches libraries by name
+    # each library has its own name, as ctypes caches libraries by name
     library = library.rename(folder / f"{program}{len(flags)}.so")
     kind, tolerance = (np.float32, 1e-5) if flags else (np.float64, 1e-12)
     called = called_by_c(library, c_functions(model, trained.entry_points), kind)

@@ -13,7 +13,7 @@ from spelgen.exporting.export import export
 
 def test_programs_are_self_contained():
     """Exported programs contain their parameters, and equal the model for another batch size than at the export."""
-    # a preset whose M and G are networks of all joints, the hardest one to trace
+    # phnode's M and G are networks of all joints: the preset that is hardest to trace
     model = moved_model("two_link", "phnode")
     found = export(model, "torch", arm=arm_of("two_link"), entries=("forward_dynamics",))
     program = torch.export.load(io.BytesIO(found.files["forward_dynamics.pt2"])).module()

@@ -37,7 +37,7 @@ def places(thing: str) -> list[str]:
 
 
 def stands_in(thing: str, module) -> bool:
-    """Return whether docs/extending.md names the file of a module for this extension, and at most one more file."""
+    """Return True if docs/extending.md names the file of a module for this extension, and at most one more file."""
     named = places(thing)
     return str(Path(inspect.getfile(module)).relative_to(ROOT)) in named and len(named) <= 2
 
@@ -66,7 +66,7 @@ def test_a_preset(robots, tmp_path, monkeypatch):
         torch.nn.init.normal_(parameter)
     q = torch.zeros(1, 2, dtype=torch.float64)
     assert model.spec.options.preset == "toy"
-    # joints 1 and 2 are coupled, which friction per joint would not do
+    # the dissipation couples joints 1 and 2, which friction per joint would not do
     assert model.dissipation(q, q)[0, 0, 1] != 0
 
 
@@ -100,7 +100,7 @@ def test_a_baseline(robots, monkeypatch, log):
     monkeypatch.setattr(registry, "BASELINES", (*registry.BASELINES, stands_still))
     results = spelgen.evaluate(spelgen.build(load_arm(robots / "two_link.urdf"), "spel", width=4), log)
     error = results.horizons[-1].errors["stands still"].mean_relative_rms
-    # relative to the motion, a prediction of no motion has the error 1
+    # the predictor "stands still" has the error 1 relative to the motion
     assert error == pytest.approx(1, rel=0.2)
     assert "stands still" in results.text()
 

@@ -155,7 +155,7 @@ def test_torques_are_fitted_predicted_and_scored():
     assert found.score(test) > 0.9999
     tau = found.predict(test)
     assert tau.shape == test.tau.shape
-    inner = slice(100, -100)  # without the ends of the log, at which the filter has transients
+    inner = slice(100, -100)  # the ends of the log are omitted, at which the filter has transients
     assert np.abs(tau - test.tau)[inner].max() < 0.02 * test.tau.std()
     result = spelgen.evaluate(found, [test])
     assert result.torque["model"].mean_nmse == pytest.approx(1 - found.score([test]), rel=1e-6)
@@ -179,7 +179,7 @@ def test_the_filter_reaches_torques():
 def test_predictions_at_gaps_are_not_numbers():
     log = swings(0)
     t = log.t.copy()
-    t[1:] += 1.0  # a gap after the first sample, which then is a segment of its own
+    t[1:] += 1.0  # the log has a gap after its first sample, which is then a segment of its own
     found = spelgen.fit(Model(), [swings(1), swings(2)], TorqueFit(evaluations=20))
     tau = found.predict(Trajectory(t, log.q, log.qd, log.tau, "gap"))
     assert np.isnan(tau[0]).all() and np.isfinite(tau[1:]).all()
@@ -209,7 +209,7 @@ def test_a_torque_fit_states_its_error(tmp_path):
 @pytest.mark.parametrize("samples, preset", [(4, "spel"), (4, "closed-form"), (22, "phnode")])
 def test_both_solvers_agree(tmp_path, samples, preset, monkeypatch):
     """Predictions and gradients of the rk4 and the dopri5 solver agree."""
-    # tighter than the default: near the onset of sliding of bristles, steps of 1e-7 have gradients of 1e-3
+    # tighter tolerances than the default: near the onset of sliding, steps of 1e-7 have gradients of 1e-3
     monkeypatch.setitem(SOLVER, "rtol", 1e-9)
     monkeypatch.setitem(SOLVER, "atol", 1e-11)
     model = random_model("two_link", tmp_path, seed=0, preset=preset)

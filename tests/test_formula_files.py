@@ -194,7 +194,7 @@ def test_too_large_entries_are_not_expanded():
 
 
 EVIL = {
-    # declares the encoding of a Python file, PEP 263
+    # a name that declares the encoding of a Python file, PEP 263
     "rpr": "coding: utf_7&#10;import os; os.mkdir(&quot;taken&quot;)#",
     "joint1": "&quot;&quot;&quot; + open('taken', 'w') #",
     "joint2": r"\end{align*}\input{taken}%",

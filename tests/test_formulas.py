@@ -110,7 +110,7 @@ def test_sympy_proves_each_expression(robot):
         for each in found.base:
             polynomial = expansion.polynomial(element, each.index)
             for powers, share in polynomial.terms():
-                if row.entry != "V" or any(powers):  # without the constant of V, which is arbitrary
+                if row.entry != "V" or any(powers):  # the constant of V is omitted, as it is arbitrary
                     monomial = sympy.prod(x**power for x, power in zip(generators, powers, strict=True))
                     expanded += (
                         sympy.Rational(int(share.p), int(share.q))

@@ -47,7 +47,7 @@ def test_one_pass_over_positions_solves_the_differential_equation():
     model.friction.reach = reach = torch.tensor(REACH).double()
     z = torch.zeros(2, 3).double()
     qd = q.diff(dim=0)
-    for moved in qd:  # explicit Euler, with steps far below the smallest break-away displacement
+    for moved in qd:  # reference: explicit Euler, with steps far below the smallest break-away displacement
         z = z + model.memory_rate(z, moved)
     found = bristles_along(q[::1000].numpy(), BristleReach(np.array(REACH)))[-1]
     # coarse samples may skip a reversal between them, fine samples do not
@@ -78,7 +78,7 @@ def test_load_dependent_friction_is_smooth_at_right_angles():
     slopes = [torch.func.jacrev(dry)(x * still).diagonal() for x in (-1e-13, 0.0, 1e-13)]
     torch.testing.assert_close(slopes[0], slopes[2], rtol=0, atol=1e-9)
     assert slopes[1].abs().max() < 1e-9
-    # far from zero load, the derivative with respect to the load has the magnitude of the load dependence
+    # far from zero load, the derivative of friction with respect to the load has the magnitude of the load dependence
     far = torch.func.jacrev(dry)(-5 * still).diagonal()
     torch.testing.assert_close(far, -constants.load_dependence, rtol=1e-3, atol=0)
 

@@ -210,7 +210,7 @@ def test_times_of_a_coarse_clock_are_an_error_where_rows_are_not_evenly_spaced(t
     refused = pytest.raises(LogError, match=r"with the time of another row, but another state.*sample_rate")
     with refused:
         read_logs(tmp_path / "log.csv", JOINTS)
-    # a clock whose steps would mean a sample rate that no arm has
+    # the steps of this clock would mean a sample rate that no arm has
     pa.csv.write_csv(columns_of(np.arange(400) // 10 * 1e-5), tmp_path / "log.csv")
     with refused:
         read_logs(tmp_path / "log.csv", JOINTS)

@@ -114,7 +114,7 @@ def excited(arm, seconds=20.0, seed=0, noise=0.0, friction=None):
     added = np.concatenate([np.full(n, drives[effect]) for effect in friction.effects])
     x = np.concatenate([urdf_parameters(arm), added])
     tau = columns(arm, friction, q, qd, qdd) @ x
-    # noise that differs per joint, from 0.2 to 2 times the given level
+    # noise with a standard deviation per joint, from 0.2 to 2 times the given level
     scale = noise * tau.std(0) * np.linspace(0.2, 2.0, n)
     return DynamicsSamples("known", q, qd, qdd, tau + scale * rng.normal(size=tau.shape)), x
 
@@ -227,7 +227,7 @@ def test_pseudo_inertia_is_pinocchios(seed):
 
 
 def test_an_impossible_body_is_replaced_by_the_nearest_possible_one():
-    # Izz > Ixx + Iyy, which no physical body has
+    # a tensor with Izz > Ixx + Iyy, which no physical body has
     factor, possible = reference_factor(np.array([1.0, 0, 0, 0, 0.1, 0, 0, 0.1, 0, 0.5]))
     assert not possible
     ten = parameters_of(factor @ factor.T)

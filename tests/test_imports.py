@@ -14,7 +14,7 @@ RUNTIME = [
 ]
 CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 
-# A folder (or a file of the top level) may import only from itself and from those before it in this list.
+# A folder (or a file of the top level) may import only from itself and from folders before it in this list.
 ROWS = """
 version errors labels listing tasks templates runtime files
 urdf settings arm design spec
@@ -38,13 +38,14 @@ OURS = {f"spelgen.{name}" for name in LAYERS}
 
 # Modules that a file may not import, neither directly nor through others.
 SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
-PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmetic of its folder
+# allowed everywhere: it computes G from the files, without the exact arithmetic of its folder
+PLAIN = {"spelgen.arm.actuation"}
 DERIVING = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
-# its functions compute G from the files, without the exact arithmetic of the folder `arm`
+# the modules of `emission` that make models in memory, and so import torch
 MODELS = {f"emission.{name}" for name in ("assemble", "build")}
 DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x not in MODELS]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "scene")}
-# these fit least squares as well, whose base parameters are exact
+# modules that fit least squares as well, whose base parameters are exact
 LEAST_SQUARES = ("fitting.fit", "fitting.train")
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.")) and x not in LEAST_SQUARES]
 NEVER = {

@@ -60,7 +60,7 @@ def write_bag(folder, messages):
 def test_joints_in_two_messages_are_joined(joints, topics, clocks, tmp_path):
     rng = np.random.default_rng(sum(map(ord, clocks + topics[0])) + len(joints))
     signals = motion(int(rng.integers(1000)), len(joints))
-    # [ms] between the two topics
+    # [ms] time between the messages of both topics
     steps = {"equal": (10, 10), "shifted": (10, 10), "of different rates": (4, 10)}[clocks]
     shift = 0 if clocks == "equal" else 3
     messages = []
@@ -101,7 +101,7 @@ def test_topics_in_rows_of_one_file_are_joined(joints, form, tmp_path):
     """A table with the rows of several topics, as plot tools export it, is joined; other topics' cells are empty."""
     rng = np.random.default_rng(len(joints))
     signals = motion(3, len(joints))
-    # times of q and qd, and times of torques
+    # sample times of q and qd, and sample times of torques
     times = [np.arange(0.0, 4.0, 0.01), np.arange(0.002, 4.0, 0.005)]
     t = np.concatenate(times)
     rows = np.full((3, len(t), len(joints)), np.nan)
@@ -121,7 +121,7 @@ def test_topics_in_rows_of_one_file_are_joined(joints, form, tmp_path):
     assert log.repairs == (
         "signals in separate rows or messages: interpolated at the times of the rarest one",
     )
-    # torques only in every third row
+    # only every third row has torques
     kept = np.arange(len(times[0])) % 3 == rng.integers(3)
     columns = {"t": times[0]}
     for name, values in zip(FIELDS, signals(times[0]), strict=True):

@@ -209,7 +209,7 @@ def test_outliers_of_any_size_are_named_and_dropped_on_request(arm, tmp_path, fo
         columns = motion(arm, int(random.integers(1000)))
         joint = joints[random.integers(len(joints))]
         rows = np.sort(random.choice(np.arange(25, 1970, 20), 4, replace=False))
-        # outliers at the first and the last sample, too
+        # some recordings have outliers at the first or the last sample, too
         rows[[0, -1]] = random.choice([[0, 1999], [1, 1970], [25, 1998]])
         name = f"{quantity}_{joint}"
         wrong = columns | {name: columns[name].copy()}
@@ -300,7 +300,7 @@ def test_quick_but_sound_signals_have_no_jumps():
     random = np.random.default_rng(0)
     steps = np.repeat(random.uniform(-1, 1, 60), 50)
     q = np.zeros_like(t)
-    for k in range(1, len(t)):  # a servo that reaches a step of its command within some samples
+    for k in range(1, len(t)):  # the simulated servo reaches a step of its command within some samples
         q[k] = q[k - 1] + 0.4 * (steps[k - 1] - q[k - 1])
     counts = 2 * np.pi / 4096
     q = np.round(q / counts) * counts

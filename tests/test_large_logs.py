@@ -24,7 +24,7 @@ from spelgen.settings.fits import Rollout
 
 JOINTS = ("shoulder", "elbow")
 MOTORS = ("joint1", "joint2")
-ROW = 8 * 7  # [bytes] of a row: t, and q, qd, tau of two joints
+ROW = 8 * 7  # [bytes] size of a row: t, and q, qd, tau of two joints
 SEGMENT = 50
 
 
@@ -205,5 +205,5 @@ def test_memory_is_bounded_by_the_largest_file_and_the_kept_samples(tmp_path, fo
         peaks[function] = int(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
     largest = (tmp_path / f"0.{format}").stat().st_size
     assert peaks["read_bounded_logs"] < 3 * largest + 4 * kept
-    # without the bound the measured peak contains all samples
+    # without the bound, the measured peak memory contains all samples
     assert peaks["read_logs"] > 8 * 22 * rows * files

@@ -26,7 +26,7 @@ def delayed(log, k, delay, motion, torque):
 @pytest.mark.parametrize(("motion", "torque"), [(True, False), (False, True), (True, True)])
 def test_the_delay_of_one_joint_is_named_and_mended(arm, motion, torque, tmp_path):  # noqa: F811
     rng = np.random.default_rng(len(arm.chain.name) + 2 * motion + torque)
-    # of joints 1 and 2 only, as the delay of a light link may have no visible effect
+    # the delayed joint is joint 1 or 2, as the delay of a light link may have no visible effect
     k, delay = int(rng.integers(2)), float(rng.uniform(0.06, 0.14) * rng.choice([1, -1]))
     log = recorded(arm, int(rng.integers(1000)), excitation, noise=0.01)
     wrong = delayed(log, k, delay, motion, torque)
@@ -38,7 +38,7 @@ def test_the_delay_of_one_joint_is_named_and_mended(arm, motion, torque, tmp_pat
     inner = (read.t > 0.2) & (read.t < log.t[-1] - 0.2)
     for name in ("q", "qd"):
         expected = np.stack([np.interp(read.t, log.t, x) for x in getattr(log, name).T], axis=1)
-        # at most the motion within 15 ms
+        # the corrected log differs by at most the motion within 15 ms
         bound = 0.015 * np.abs(np.gradient(expected, read.t, axis=0)).max(axis=0) + 1e-6
         assert (np.abs(getattr(read, name) - expected)[inner].max(axis=0) <= bound).all()
     assert check_logs([read], again).errors == ()
@@ -62,7 +62,7 @@ def test_the_clock_of_one_joint_that_runs_fast_or_slow_is_named(arm, rate, torqu
         return values
 
     tau = stamped(log.tau) if torque else log.tau
-    # without the end of the log, at which the joint with the slow clock has no values
+    # the log ends earlier, since the joint with the slow clock has no values at the end
     wrong = replace(log, q=stamped(log.q), qd=stamped(log.qd), tau=tau)[: int(0.97 * len(log))]
     error = told(arm, wrong)
     assert f"joint {arm.chain.joint_names[k]!r}: got" in error and "--accept joint-clock" in error

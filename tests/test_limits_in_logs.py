@@ -36,7 +36,7 @@ def test_the_joints_with_clipped_torques_are_named_with_their_limits(arm, motion
     limit = 0.6 * np.abs(log.tau).max(axis=0)
     found = clipped_joints(arm, replace(log, tau=np.clip(log.tau, -limit, limit)))
     share = (np.abs(log.tau) > limit).mean(axis=0)
-    # only joints that are at the limit less than 40 % of the time, as others have too few other samples
+    # joints that are at the limit for more than 40 % of the time have too few other samples to be named
     assert {names[k] for k in np.flatnonzero((share > 0.05) & (share < 0.4))} <= found.keys()
     assert found
     assert all(

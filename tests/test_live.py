@@ -169,7 +169,7 @@ def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
     found = estimator.torque(log.q[k], log.qd[k], qdd[k])
     bare = model.inverse_dynamics(*numbers(log.q[k], log.qd[k], qdd[k])).numpy()
     assert np.abs(found - expected).max() < 0.25 * np.abs(bare - expected).max()
-    # predictions of more than 0.3 s do not include the disturbance
+    # predictions of more than 0.3 s ahead do not include the disturbance
     later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
     np.testing.assert_allclose(found - later, estimator.drift.x[:, 1], atol=1e-9)
 
@@ -249,7 +249,7 @@ def test_delayed_torques_are_compared_with_the_motion_of_their_time():
 
     def external_torques(delay):
         states = Estimator(fit, levels=levels.model_copy(update={"delay": delay})).replay(log[3500:])
-        # after the first three seconds, in which the friction state is unknown
+        # the first three seconds are omitted, in which the friction state is unknown
         torques = [x.contact.external_torque / levels.observer for x in states[600:]]
         return np.sqrt(np.mean(np.square(torques), axis=0))
 
@@ -425,7 +425,7 @@ def test_thresholds_keep_the_rate_of_alarms_after_short_logs(levels, minutes):
         # expected alarms per minute: probability that a peak exceeds its threshold, times peaks per minute
         alarms.append(60 / TUNING.window * np.exp(-(thresholds - 1.0)).sum())
     assert np.mean(alarms) < 1.0
-    # and thresholds are not arbitrarily high; without estimation errors they would be log(720) + 1 = 7.6
+    # thresholds are not arbitrarily high; without estimation errors they would be log(720) + 1 = 7.6
     assert np.median(thresholds) < 25.0
 
 
@@ -460,7 +460,7 @@ def test_thresholds_hold_in_a_log_that_differs(levels):
     random = np.random.default_rng(1)
     logs = [1.0 + random.exponential(size=(100, 6)) for _ in range(4)]
     found = levels.model_copy(update=held_out_tail([logs[0], logs[1], 2 * logs[2]], levels))
-    # in 50 s at most one alarm
+    # at most one alarm in 50 s
     assert ((2 * logs[3] > found.thresholds(1.0)).any(axis=1)).sum() <= 1
     alike = levels.model_copy(update=held_out_tail(logs[:3], levels))
     assert ((2 * logs[3] > alike.thresholds(1.0)).any(axis=1)).sum() > 3

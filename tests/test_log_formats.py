@@ -102,7 +102,7 @@ def test_prismatic_counts_are_metres(tmp_path):
 
 
 def test_velocities_are_differentiated_only_where_that_is_asked(tmp_path):
-    # gaps after 0.5 s and before the last sample
+    # the times have gaps after 0.5 s and before the last sample
     t = np.concatenate([np.arange(50) * 0.01, 5 + np.arange(50) * 0.01, [20.0]])
     log = {"t": t, "q_a": np.sin(t), "tau_a": t}
     path = parquet(tmp_path / "x.parquet", log)
@@ -786,7 +786,7 @@ def test_output_of_ros2_topic_echo_is_read(tmp_path):
     np.testing.assert_allclose(log.t - log.t[0], 0.01 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.q[:, 1], -0.02 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.tau[:, 0], 5.0 + 0.1 * np.arange(50), atol=1e-9)
-    # joints that the arm does not have, such as a gripper, are omitted
+    # columns of joints that the arm does not have, such as a gripper, are omitted
     (arm_alone,) = read_logs([tmp_path / "log.csv"], ("a",))
     assert arm_alone.q.shape == (50, 1)
 

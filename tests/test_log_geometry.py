@@ -27,7 +27,7 @@ RATE, SECONDS = 100.0, 20.0
 @pytest.fixture(scope="module", params=ROBOTS)
 def arm(request, robots, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
-    # without effort limits, from which the unit of torques could be found
+    # the URDF has no effort limits, which would show the unit of torques
     path = robots / f"{request.param.replace('four', 'six')}.urdf"
     text = re.sub(r'effort="[^"]*"', 'effort="0"', path.read_text())
     if request.param == "four_dof":
@@ -47,7 +47,7 @@ def excitation(arm, rng):
 
 def pick_and_place(arm, rng):
     t = np.arange(0.0, SECONDS, 1 / RATE)
-    s = np.clip((t % 2.0) / 1.6, 0.0, 1.0)[:, None]  # per motion 1.6 s, then 0.4 s of rest
+    s = np.clip((t % 2.0) / 1.6, 0.0, 1.0)[:, None]  # each motion takes 1.6 s, followed by 0.4 s of rest
     stops = rng.uniform(-1.0, 1.0, (round(SECONDS / 2) + 1, len(arm.chain.coordinates)))
     number = (t // 2.0).astype(int)
     return t, stops[number] + (10 * s**3 - 15 * s**4 + 6 * s**5) * (stops[number + 1] - stops[number])
@@ -79,7 +79,7 @@ def flipped(log, k, motion, torque):
 
 
 def drawn_joint(log, rng, first=0):
-    # without the last joint, as its link may be symmetric, so that its sense and its zero have no effect
+    # the last joint is not drawn, as its link may be symmetric, so that its sense and its zero have no effect
     return int(rng.integers(first, log.q.shape[1] - 1))
 
 
@@ -187,7 +187,7 @@ def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
     write_logs(tmp_path / "log.csv", [log], arm.chain.joint_names)
     error = told(arm, log)
     lines = re.findall(r"'gravity: \[(.*?)\]'", error)
-    # for rpr on a ceiling, another reading with a joint of the opposite sense is equivalent, but the line is listed
+    # for rpr on a ceiling, an equivalent reading with a joint of opposite sense may be listed first
     assert lines, error
     np.testing.assert_allclose(list(map(float, lines[0].split(","))), gravity, atol=0.3)
 
@@ -221,7 +221,7 @@ def test_another_unit_is_offered_as_gain(arm):
 def test_a_link_with_a_mistyped_mass_is_named(arm):
     """A link whose mass in the URDF is six times too large is named; its tensor about the centre of mass is right."""
     moments = [np.linalg.norm(np.array(body.inertia[1:4], dtype=float)) for body in arm.chain.bodies]
-    # not joint 1, which is vertical in these arms: its body's first moment has no effect
+    # body 1 is not drawn: joint 1 of these arms is vertical, so that the body's first moment has no effect
     k = 1 + int(np.argmax(moments[1:]))
     body = arm.chain.bodies[k]
     heavy = replace(body, inertia=(*(6 * float(x) for x in body.inertia[:4]), *body.inertia[4:]))
@@ -271,7 +271,7 @@ def test_a_line_keeps_what_the_mapping_states(arm):
 def test_a_slow_arm_with_right_torques_is_not_refused(arm):
     """A slow arm with right torques is accepted, although its accelerations are differences of noisy positions.
 
-    The log has 12.5 Hz, and the motion an eighth of the usual speed.
+    The log has 12.5 Hz, and the motion an eighth of the speed of the other tests.
     """
     log = recorded(arm, 9)
     t, qd = 8.0 * log.t, log.qd / 8.0

@@ -488,12 +488,12 @@ def test_the_filter_has_no_delay_and_takes_out_noise():
     noisy = Trajectory(clean.t, *(x + e for x, e in zip((clean.q, clean.qd, clean.tau), noise, strict=True)))
     smooth = low_pass(noisy, 5.0)
     np.testing.assert_array_equal(smooth.t, clean.t)
-    middle = slice(50, -50)  # not at the ends, at which the filter has neighbours on one side only
+    middle = slice(50, -50)  # the ends are omitted, at which the filter has neighbours on one side only
     for quantity in ("q", "qd", "tau"):
         error = getattr(smooth, quantity)[middle] - getattr(clean, quantity)[middle]
         assert (
             np.sqrt(np.mean(error**2)) < 0.045
-        )  # expected from the filter: 0.1 sqrt(2 cutoff / rate) = 0.032; a delay of 1 ms would add 0.009
+        )  # the expected error is 0.1 sqrt(2 cutoff / rate) = 0.032; a delay of 1 ms would add 0.009
     np.testing.assert_allclose(low_pass(clean, 8.0).q[middle], clean.q[middle], atol=2e-5)
 
 

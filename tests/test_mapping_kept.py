@@ -16,7 +16,7 @@ from spelgen.emission.build import build
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.run_facts import commands
 
-GAINS = np.array([1.6, 0.7, 1.4])  # true joint torque per logged torque; GAINS[1] is not used
+GAINS = np.array([1.6, 0.7, 1.4])  # true joint torque per logged torque, of joints 1 and 3
 SIDECAR = """torque: motor
 joints: {joint1: {gear: 1, gain: trained}, joint2: {gear: 1}, joint3: {gear: 1, gain: trained}}
 """
@@ -91,7 +91,7 @@ def test_the_lines_that_reproduce_a_run_give_the_same_model(folder, monkeypatch)
     run = RunFolder(folder / "run")
     (work := folder / "again").mkdir()
     monkeypatch.chdir(work)
-    # no predictions over seconds, to save time
+    # states are not predicted for seconds ahead, to save time
     monkeypatch.setattr("spelgen.evaluation.evaluate.SECONDS", ())
     for line in commands(run, run.read_spec(), run.read_record()):
         program, *words = shlex.split(

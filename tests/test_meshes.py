@@ -186,10 +186,10 @@ def bounds() -> Iterator[None]:
     yield
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert in_time(after.ru_utime + after.ru_stime - used.ru_utime - used.ru_stime, 10)
-    # peak memory [kB] is the largest of all children so far, and a child begins as a copy of this process
+    # the peak memory [kB] is the largest of all children so far, and a child begins as a copy of this process
     copied = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert after.ru_maxrss <= max(used.ru_maxrss, copied, 1_100_000)
-    # wall time as well, as a process that waits for a pipe uses no processor time
+    # a bound of wall time too, as a process that waits for a pipe uses no processor time
     assert time.monotonic() - begin < 60
 
 

@@ -115,7 +115,7 @@ def test_a_diverged_window_affects_no_other():
     solver = Solver(model, windows)
     sound = solver(windows)
     disturbance = torch.zeros_like(windows.q[:, 0])
-    disturbance[3] = 1e12  # a torque at which the rollout diverges
+    disturbance[3] = 1e12  # a disturbance torque at which the rollout diverges
     q, qd = solver(windows, disturbance)
     others = torch.arange(len(windows)) != 3
     assert q[3].isnan().all() and qd[3].isnan().all()

@@ -51,7 +51,8 @@ def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
     arm = load_arm(urdf)
     exact = base_parameters(arm.chain, FrictionModel(), arm.actuation.drives().speeds)
     count = 10 * len(arm.chain.bodies) + len(arm.chain.coordinates)
-    common = exact.columns < count  # without base parameters of friction and offsets, which come last
+    # base parameters of friction and offsets, which come last, are not compared
+    common = exact.columns < count
     model = build(arm, "closed-form")
     names, combination = base_combinations(model.chain, motors_of(model))
     assert names == tuple(np.array(exact.names)[common])
@@ -111,7 +112,7 @@ def logged(model, seconds, seed, correlation=0.98, noise=0.05):
 def test_intervals_hold_the_truth_if_errors_last_longer_than_the_fit_assumes(robots, monkeypatch):
     """Reported intervals contain the truth even if torque errors are correlated longer than the fit assumes.
 
-    With errors correlated over 0.5 s, intervals of the posterior covariance alone, which assumes 0.2 s, are too narrow.
+    With errors correlated over 0.5 s, intervals of the posterior covariance, which assumes 0.2 s, are too narrow.
     """
     # errors divided by half intervals, of reported intervals and of intervals by the posterior covariance
     estimates, ratios, ratios_by_posterior = [], [], []
@@ -131,7 +132,7 @@ def test_intervals_hold_the_truth_if_errors_last_longer_than_the_fit_assumes(rob
             for interval, value in zip(intervals, base_values(true), strict=True):
                 result.append(abs(interval.value - value) / interval.half)
     print(np.quantile(ratios, (0.9, 0.95, 1)), np.quantile(ratios_by_posterior, (0.9, 0.95, 1)))
-    # the 95 % quantile shows that intervals are wide enough, and not much too wide
+    # intervals are wide enough, and not much too wide
     assert 0.4 < np.quantile(ratios, 0.95) < 1.0
     assert np.max(ratios_by_posterior) > 1.0 > 0.9 * np.max(ratios)
 
@@ -153,7 +154,7 @@ def test_least_squares_counts_friction_that_changes_during_a_log(robots):
     assert interval.low < 1.0 < interval.high
     assert interval.std == pytest.approx(
         of_ten, rel=0.4
-    )  # it would be 0.018 with the errors of constant friction
+    )  # with the standard deviation of constant friction it would be 0.018
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +225,7 @@ def test_torque_intervals_hold_the_torques_of_another_motion(fitted):
     result, logs = fitted
     tau, std = result.predict(logs[2], std=True)
     np.testing.assert_allclose(tau, result.predict(logs[2]), rtol=1e-9)
-    # without transients of the low-pass filter, which the measured torque passes, too
+    # the ends are omitted: the low-pass filter of the measured torque has transients there
     inner = slice(100, -100)
     measured = low_pass(logs[2], result.preprocessing.acceleration_cutoff).tau[inner]
     held = np.abs(measured - tau[inner]) <= QUANTILE * std[inner]

@@ -97,7 +97,7 @@ def test_rollout_is_steps_and_converges_to_the_fourth_order():
     q, qd = (
         torch.tensor([0.3, -0.5]).double(),
         torch.tensor([2.0, 1.5]).double(),
-    )  # at speeds at which friction is smooth
+    )  # initial velocities at which friction is smooth
     tau = torch.zeros(4, 2, dtype=torch.float64)
     found = prepared.rollout(q, qd, tau, 0.01)
     assert found.q.shape == found.qd.shape == (5, 2)

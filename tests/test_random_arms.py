@@ -22,7 +22,7 @@ pin = pytest.importorskip(
     "pinocchio", reason="Pinocchio (pip install spelgen[simulate]) reads the other side"
 )
 
-# relative to the largest value: above SOMETHING a value counts as not zero, below NOTHING as zero
+# relative to the largest value: above SOMETHING a value is not zero, below NOTHING it is zero
 SOMETHING, NOTHING = 1e-8, 1e-11
 
 

@@ -107,7 +107,7 @@ def _steady(values: np.ndarray) -> bool:
 Check = Callable[[Seen, list[int], list[int]], bool]
 
 # per reason, with # for a joint and ## for several: function of the arm, of the joints in the statement, and of the
-# joints in the reason, which returns whether the reason holds; M32 in a statement counts as joints 3 and 2
+# joints in the reason, which is True if the reason holds; M32 in a statement counts as joints 3 and 2
 CHECKS: dict[str, Check] = {
     "it moves the whole arm as one rigid body": lambda s, about, _: about == [1],
     "gravity does no work in a rotation about an axis parallel to it": lambda s, about, _: (
@@ -191,7 +191,7 @@ CHECKS: dict[str, Check] = {
 
 
 def holds(seen: Seen, fact: Fact) -> bool:
-    """Return whether a fact's reason is one of CHECKS and holds for the arm."""
+    """Return True if a fact's reason is one of CHECKS and holds for the arm."""
     about = [int(digit) for digit in re.findall(r"\d", fact.statement)]
     named = [int(number) for number in re.findall(r"\d+", fact.reason)]
     some = r"joints? \d+(?:, \d+)*(?: and \d+)?"

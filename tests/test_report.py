@@ -36,7 +36,7 @@ def traces(name):
     wave = [[math.sin(3 * x)] * 3 for x in t]
     near = [[y[0] + 0.05 * x] * 3 for x, y in zip(t, wave, strict=True)]
     both, one = {"model": wave, "URDF": near}, [row[0] for row in wave]
-    entries = [one] * 4 + [[0.0] * len(one), one]  # entries of M: M32 is always zero
+    entries = [one] * 4 + [[0.0] * len(one), one]  # the entries of M, of which M32 is always zero
     grown = {"low": [0.1, 0.1], "median": [0.2, 0.3], "high": [0.4, None]}
     covered = {"low": -1.0, "high": 1.0, "counts": [1] * 24}
     return {

@@ -101,7 +101,7 @@ def test_every_inertial_is_one_of_a_real_body(robot):
         assert inertial.mass > 0
         smallest, middle, largest = np.linalg.eigvalsh(symmetric(inertial.tensor))
         assert smallest > 0
-        assert largest <= smallest + middle + 1e-12  # with equality for a flat body such as link 3 of rpr
+        assert largest <= smallest + middle + 1e-12  # equality holds for a flat body, such as link 3 of rpr
 
 
 def test_the_sidecar_fits_and_names_its_sources(robot):

@@ -218,7 +218,7 @@ def test_states_that_are_not_finite_end_in_damping(arm, mode, bad):
     controller.update(START, qd)
     before = controller.text("state")
     tau = controller.update([bad, START[1]], qd)
-    # damping at the last valid position of the joint, with valid velocities
+    # the controller damps at the last valid position of the joint, with valid velocities
     np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], -5 * qd), rtol=1e-12)
     tau = controller.update(START, [bad, -0.1])
     np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], [0, 0.5]), rtol=1e-12)
@@ -233,7 +233,7 @@ def test_a_state_that_stays_invalid_is_latched_until_the_next_activation(arm):
     for _ in range(int(0.1 / PERIOD) + 2):
         tau = controller.update([np.nan, np.nan], [np.nan, np.nan])
         np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], [0, 0]), rtol=1e-12)
-    # after the next valid state: damping at this state
+    # after the next valid state, the controller damps at this state
     tau = controller.update(START + np.array([0.01, 0.02]), [0.1, -0.2])
     expected = torques(arm[0], START + np.array([0.01, 0.02]), [0, 0], [-0.5, 1.0])
     np.testing.assert_allclose(tau, expected, rtol=1e-12)
@@ -274,8 +274,8 @@ def test_an_arm_at_rest_and_a_slow_encoder_are_not_frozen(arm):
     controller, _ = started(arm)
     random = np.random.default_rng(0)
     for cycle in range(2000):
-        noise = 0.02 * random.standard_normal(2) + [0.03, 0.0]  # noise and an offset of the velocity
-        q = START + np.floor(cycle / 50) * 1e-3  # a motion at 0.02 rad/s, in encoder steps of 1 mrad
+        noise = 0.02 * random.standard_normal(2) + [0.03, 0.0]  # the velocity has noise and an offset
+        q = START + np.floor(cycle / 50) * 1e-3  # the joints move at 0.02 rad/s, in encoder steps of 1 mrad
         controller.update(q if cycle < 1000 else START + 0.02, noise + (0.02 if cycle < 1000 else 0))
         assert controller.text("state") == "gravity_compensation"
 
@@ -389,7 +389,7 @@ def test_joints_without_effort_limits_need_a_parameter(tmp_path):
     with pytest.raises(ValueError, match="torque_limits: got 0 for joint wrist, expected 1e-06 to 100000"):
         Controller(library, 3, measured_effort=False)
     controller = Controller(library, 3, measured_effort=False, torque_limits=[50.0, 50.0, 9.0])
-    turns = 4 * np.pi  # a continuous joint: whole turns between reference and position are no error
+    turns = 4 * np.pi  # the wrist is continuous: whole turns between reference and position are no error
     controller.set("mode", "computed_torque")
     controller.reference([0.1, 0.2, 0.3 + turns])
     controller.update([0.1, 0.2, 0.3], [0, 0, 0])

@@ -22,7 +22,8 @@ pytestmark = pytest.mark.skipif(
 
 N, PERIOD = 6, 2e-3
 STIFF = {"mode": "computed_torque", "kp": [400.0] * N, "kd": [40.0] * N, "max_position_error": [1.0] * N}
-MASS, CENTER = 2.5, np.array([0.02, -0.03, 0.06])  # [kg] and [m], in the frame of the last link
+# mass [kg] and centre [m] of the load, in the frame of the last link
+MASS, CENTER = 2.5, np.array([0.02, -0.03, 0.06])
 START = np.array([0.0, -1.2, 1.4, -0.8, 1.2, 0.3])
 FREQUENCIES = 2 * np.pi * np.array([0.21, 0.17, 0.25, 0.33, 0.29, 0.37])
 LOAD = f"""<link name="load"><inertial><origin xyz="{" ".join(map(str, CENTER))}"/><mass value="{MASS}"/>
@@ -119,9 +120,9 @@ def test_without_a_payload_none_is_published_and_a_push_is_a_contact(ur10e):
     library, free, _ = ur10e
     free.start(START)
     controller = Controller(library, N, measured_effort=True, joint_prefix="left_", **STIFF)
-    controller.commands = np.full(N, np.nan)  # commands do not exist before the first cycle
+    controller.commands = np.full(N, np.nan)  # there are no earlier commands before the first cycle
     tip = tip_kinematics(load_arm(ROBOTS / "ur10e.urdf"))
-    force = np.array([30.0, -20.0, -60.0])  # [N] at the tip, in the root frame
+    force = np.array([30.0, -20.0, -60.0])  # [N] force at the tip, in the root frame
     contacts, external = [], []
     for cycle in range(2500):
         t = cycle * PERIOD

@@ -90,7 +90,7 @@ USES = {
 
 @pytest.mark.parametrize("use", USES)
 def test_a_module_in_a_run_folder_is_neither_read_nor_executed(plain, start, tmp_path, use):
-    """A module in a run folder is neither read nor executed, even beside a valid specification."""
+    """A module in a run folder with a valid specification is neither read nor executed."""
     run, mark = copied(plain, tmp_path / "run"), tmp_path / "mark"
     (run / "module.py").write_text(f"open({str(mark)!r}, 'w').close()\n")
     if use == "export":  # an export needs the URDF
@@ -344,7 +344,7 @@ def test_a_specification_of_another_content_is_refused(plain, tmp_path, case):
 def test_a_huge_file_is_not_read(plain, start, tmp_path):
     run = copied(plain, tmp_path)
     with (run / "notes.bin").open("wb") as file:
-        file.truncate(40 * 10**9)  # a sparse file, which occupies no disk space
+        file.truncate(40 * 10**9)  # the file is sparse, and occupies no disk space
     begin = time.process_time()
     render_report(run)
     assert in_time(time.process_time() - begin, 10)

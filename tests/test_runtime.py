@@ -29,7 +29,8 @@ from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
 from spelgen.runtime.rows import Constant, Joint, Link, vector
 
 NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
-FIRST_STAGE = (  # formulas of friction now, and of the first release: |gravity torque|, tanh and exp
+# replacements that restore the first release's formulas of friction: |gravity torque|, tanh and exp
+FIRST_STAGE = (
     ("load = 0.01 * torch.where", "load = 0.0 * torch.where"),
     ("torch.rsqrt(velocity * velocity + width**2)", "(velocity / width).tanh() / velocity"),
     ("slow.square().square().square()", "(-((qd / self.stribeck_velocity) ** 2)).exp()"),

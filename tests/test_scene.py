@@ -59,7 +59,7 @@ def test_the_shapes_of_the_file_are_drawn_where_all_are_there(tmp_path):
     assert not found.tubes and [len(link.shape.faces) for link in found.links] == [12, 12]
     np.testing.assert_allclose(np.ptp(found.links[1].shape.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-3)
     path.write_text(text.replace("BOX", mesh))
-    found = scene(path, ["j"])  # the link without its mesh is a tube, the other one its box
+    found = scene(path, ["j"])  # link b, without its mesh, is drawn as a tube, the other link as its box
     assert found.tubes == " Drawn as tubes, since meshes were not read: b (not_there.stl)."
     assert len(found.links[0].shape.faces) == 12 and len(found.links[1].shape.faces) > 12
 
@@ -70,7 +70,7 @@ def test_tubes_are_closed_and_look_outward():
     for face in shape.faces:
         first, *rest = shape.vertices[list(face)]
         volume += sum(first @ np.cross(a, b) / 6 for a, b in pairwise(rest))
-    # the volume would be negative if faces were inside out
+    # the volume would be negative if the faces were inside out
     assert volume == pytest.approx(2 * 0.5**2 * np.pi, rel=0.1)
 
 

@@ -250,7 +250,8 @@ def test_the_first_noise_is_that_of_least_squares(correlation):
     count, deviations = 400, torch.tensor([0.5, 0.01]).double()
     x = torch.randn(count, 3, generator=draw).double()
     measured = deviations * torch.randn(count, 2, generator=draw).double()
-    measured[:, 0] += 7.0 * x[:, 1]  # this part of the torque is a multiple of a column, and no noise
+    # this part of the torque is a multiple of a regressor column, and so no noise
+    measured[:, 0] += 7.0 * x[:, 1]
     jacobian = object.__new__(torque_jacobian.TorqueJacobian)
     slopes = ((0, torch.arange(3), x, measured[:, 0]), (1, torch.arange(0), x[:, :0], measured[:, 1]))
     jacobian.joint_rows = lambda _: slopes

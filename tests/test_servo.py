@@ -131,7 +131,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
         laws = fitted.model.friction.prepare()
     assert laws.stribeck[0] < 0.15 * TRUTH.coulomb[0]
     assert float(laws.stribeck[1]) == pytest.approx(TRUTH.stribeck[1], rel=0.3)
-    # the model's Stribeck curve has another form than the simulator's, so the curves are compared, relative to kp
+    # the curves are compared relative to kp: the model's Stribeck velocity belongs to another form of the curve
     speeds = torch.tensor([0.05, 0.1, 0.2, 0.4]).double()
     with torch.no_grad():
         dry = laws.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double())
@@ -155,7 +155,7 @@ def test_intervals_count_correlated_errors_once():
         found.append(float(step))
     assert np.mean(told) == pytest.approx(
         np.var(found), rel=0.15
-    )  # with independent samples it would be a fiftieth
+    )  # the variance would be a fiftieth if all errors of a window were independent
 
 
 def test_blocks_of_intervals_are_whole_motions():
@@ -227,7 +227,7 @@ def test_reported_intervals_cover_the_truth(fitted):
             ("static_error", TRUTH.coulomb[k] / TRUTH.kp[k] + TRUTH.dead_zone[k]),
         ):
             assert joint[what]["determined"]
-            # up to the different Stribeck curves: the simulator's falls as a Gaussian, the model's has another form
+            # tolerance for the different Stribeck curves: only the simulator's falls as a Gaussian
             assert joint[what]["value"] == pytest.approx(truth, rel=0.03 if k == 0 else 0.04), what
             assert joint[what]["low"] < truth < joint[what]["high"], what
     # small gravity of the elbow does not separate dry friction from a dead zone
@@ -320,13 +320,13 @@ def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
             "ur10e",
             (tuple(range(6)),),
             {("armature", 0), ("armature", 1)},
-        ),  # as for motors of this arm in Khalil and Dombre, ch. 12
+        ),  # the identifiable ratios agree with those for motors of this arm in Khalil and Dombre, ch. 12
         ("sliders", ((0,), (1,)), {("armature", 0), ("armature", 1)}),
     ],
 )
 def test_identifiable_ratios_of_servo_logs(robots, tmp_path, robot, groups, left):
     path = tmp_path / "sliders.urdf" if robot == "sliders" else robots / f"{robot}.urdf"
-    if robot == "sliders":  # two prismatic joints at right angles, whose motions do not interact
+    if robot == "sliders":  # the arm has two prismatic joints at right angles, whose motions do not interact
         path.write_text(SLIDERS)
     found = servo_rank(spelgen.load_arm(path).chain)
     assert found.groups == groups and {*found.open} == left
@@ -433,7 +433,7 @@ def test_joints_by_themselves_move_as_the_arm_does(arm):
     windows = replace(servo_windows(moved(model, 3.0), Preprocessing()), steps=24)
     rollouts = ServoRollouts.of(model, windows)
     x = rollouts.parameters.prior_mean
-    # with all friction effects, which the simulated logs have
+    # all friction effects are active, as in the simulated logs
     x = replace(x, active=torch.ones_like(x.active))
     for _ in range(2):
         rollouts = rollouts.linearized(x, rollouts.predicted_motion(x))

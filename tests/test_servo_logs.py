@@ -45,7 +45,7 @@ def test_the_report_of_logs_of_a_servo_arm(arm, logs):
     assert shoulder.steps["u"] is None
     assert shoulder.low["u"] == min(x.u[:, 0].min() for x in logs)
     assert shoulder.high["u"] == max(x.u[:, 0].max() for x in logs)
-    assert 0.05 < shoulder.following.lag < 0.15  # [s] the delay plus kd/kp
+    assert 0.05 < shoulder.following.lag < 0.15  # the lag is the delay plus kd/kp [s]
     assert shoulder.following.saturated < 0.02 and elbow.following.saturated is None
     # the command never stays constant, so that no steady state exists
     assert shoulder.following.steady_state_error is None
@@ -162,7 +162,8 @@ DEGREES = LogMapping.model_validate({"input": "position", "units": {"q": "deg"}}
 
 @pytest.mark.parametrize("seed", range(4))
 def test_normalised_positions_that_are_declared_as_degrees_are_told_by_their_steps(arm, logs, seed):
-    counts = np.random.default_rng(seed).integers(1100, 2600, 2)  # counts of each motor's calibrated range
+    # encoder counts of each motor's calibrated range
+    counts = np.random.default_rng(seed).integers(1100, 2600, 2)
     step = np.radians(200 / counts)
     wrong = changed(logs, q=lambda x: np.round(x.q / step) * step, mapping=lambda x: DEGREES)
     (error,) = spelgen.check_logs(wrong, arm).errors
@@ -205,7 +206,7 @@ def test_a_unit_of_servos_that_is_stated_wrongly_is_named_with_the_line(arm, log
     errors = [str(error) for error in spelgen.check_logs(small, arm).errors]
     if (
         stated == "rad" and counts is None
-    ):  # positions without encoder steps show a wrong unit by their many turns
+    ):  # without encoder steps, a wrong unit of positions is found by their many turns
         assert all("jump" in error or f"units: {{q: {logged}" in error for error in errors)
         return
     assert any(f"write 'units: {{q: {logged}}}' under 'logs'" in error for error in errors), errors

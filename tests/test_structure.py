@@ -101,6 +101,6 @@ def test_edo_by_singular_values(shared):
     sizes = np.linalg.svd(changes, compute_uv=False)
     sizes /= sizes[0]
     assert sizes[9] > 1e-2
-    # far above rounding errors, and just below the tolerance of the reference data
+    # the eleventh singular value is far above rounding errors, and just below the tolerance of the reference data
     assert 1e-11 < sizes[10] < 1e-9
     assert sizes[11] < 1e-15

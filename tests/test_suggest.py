@@ -43,7 +43,8 @@ def written(path, head, rows):
 def require_same(found, rtol=1e-9, qd=QD):
     for values, expected in ((found.q, Q), (found.qd, qd), (found.tau, TAU)):
         np.testing.assert_allclose(values, expected, rtol=rtol, atol=1e-9)
-    np.testing.assert_allclose(found.t - found.t[0], T, atol=1e-6)  # the resolution of a double at 1.7e9 s
+    # the tolerance is the resolution of a double at 1.7e9 s
+    np.testing.assert_allclose(found.t - found.t[0], T, atol=1e-6)
 
 
 def test_lists_of_joint_states_with_times_in_milliseconds(scara, tmp_path):

@@ -57,7 +57,7 @@ def test_penalised_parameters_stay(tmp_path):
 
 
 def test_blocks_equal_a_single_batch(tmp_path, monkeypatch):
-    """The loss and its gradient over blocks of samples equal those of a single batch.
+    """The loss and its gradient over blocks of samples equal the loss and gradient of a single batch.
 
     A whole fit is not compared, as many steps would amplify rounding errors.
     """

@@ -260,7 +260,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
 
 
 def equal(first, second) -> bool:
-    """Return whether two nested states are bitwise equal."""
+    """Return True if two nested states are bitwise equal."""
     if isinstance(first, torch.Tensor):
         return torch.equal(first, second)
     if isinstance(first, dict):
@@ -274,7 +274,8 @@ def equal(first, second) -> bool:
 def test_resuming_drops_epochs_after_the_checkpoint(module, logs, tmp_path):
     train(module, [logs], tmp_path / "run", QUICK)
     with (tmp_path / "run" / "metrics.jsonl").open("a") as file:
-        file.write('{"epoch": 7, "step')  # an incomplete line, as of a process that was killed while writing
+        # the last line is incomplete, as of a process that was killed while writing
+        file.write('{"epoch": 7, "step')
     train(module, [logs], tmp_path / "run", QUICK, options=RunOptions(resume=True))
     assert [record["epoch"] for record in lines(tmp_path / "run")] == [1, 2, 3, 4, 5, 6]
 
@@ -358,11 +359,12 @@ def test_early_stop_and_time_limit(module, logs, tmp_path):
 
 
 def until_a_signal(module: Path, logs: Path, folder: Path) -> None:
-    """Run a training without end until a signal stops it, and write its status to the file `told` beside the folder.
+    """Run a training without end until a signal stops it, and write its status to the file `told` next to the folder.
 
     It is run in a process of its own.
     """
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # the process may inherit that SIGINT is ignored
+    # the tests may run with SIGINT ignored, which the process inherits
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with folder.with_name("told").open("w") as told:
         os.dup2(told.fileno(), 2)
         config = Rollout(epochs=100000, batch=32, patience=100000, momentum_steps=0, optimizer="adamw")

@@ -113,7 +113,7 @@ class TestValues:
     def test_values_equal_those_of_yourdfpy(self, shared):
         """Limits, axes, mimic relations and masses equal the ones of yourdfpy.
 
-        Its origins are matrices, and its absent inertias are 1.0, so these are not compared.
+        Its origins are matrices, and its absent inertias are 1.0: both are not compared.
         """
         yourdfpy = pytest.importorskip("yourdfpy")
         options = {"load_meshes": False, "build_scene_graph": False}

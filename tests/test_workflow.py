@@ -74,7 +74,7 @@ def test_a_tip_in_the_settings_applies_to_every_command(robots, tmp_path, monkey
 
 
 def test_the_commands_of_the_readme_work(robots, tmp_path, monkeypatch):
-    """The block of commands in the README runs unchanged, with arm.urdf and two folders of logs of the reader."""
+    """The block of commands in the README runs unchanged, with the user's files: arm.urdf and two folders of logs."""
     settings = yaml.safe_load((robots / "two_link.yaml").read_text())
     settings |= {"simulation": SHORT | {"duration": 10.0}, "training": FEW_STEPS}
     (tmp_path / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())

@@ -13,7 +13,7 @@ REFERENCE = 0.04  # [s] duration of ``_loop`` on the reference machine
 
 
 def in_time(seconds: float, bound: float) -> bool:
-    """Return whether ``seconds`` of processor time are less than ``bound`` seconds of the reference machine."""
+    """Return True if ``seconds`` of processor time are less than ``bound`` seconds of the reference machine."""
     return seconds < bound or seconds < bound * slowness()
 
 
