@@ -37,7 +37,7 @@ Estimates = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 def main() -> None:
-    """Fit all recordings, and print the shares of the differences that lie inside the intervals."""
+    """Fit recordings separately, and print the shares of differences between fits that lie inside the intervals."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,4 @@
-"""95 % intervals of a fitted arm, compared with the truth of a simulated arm."""
+"""95 % intervals of a fitted arm, compared with the true values of the simulated arm that made its logs."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ class Fold:
 
     @property
     def durations(self) -> tuple[float, ...]:
-        """Return the durations of `SECONDS` that are shorter than the training recordings, and infinity for all."""
+        """Return the training durations [s]: the ones of `SECONDS` that the recordings exceed, and infinity for all."""
         total = sum(log.duration for log in self.training)
         return tuple(x for x in SECONDS if x < 0.95 * total or np.isinf(x))
 
@@ -118,12 +118,12 @@ class Problem:
             raise LogError("no moving samples", expected="motion faster than 0.02 rad/s")
 
     def samples_of(self, logs: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
-        """Return the samples that `train` and `evaluate` take from logs."""
+        """Return the filtered torque samples of logs, as `train` and `evaluate` use them."""
         return dynamics_samples(logs, pauses=pauses, preprocessing=self.preprocessing, reach=self.reach)
 
     @cached_property
     def tests(self) -> dict[str, list[DynamicsSamples]]:
-        """Samples of the test recordings by group, pauses included."""
+        """Test samples of the fold, with pauses, by the name of the group of recordings."""
         return {group: self.samples_of(logs, pauses=True) for group, logs in self.fold.tests.items()}
 
     def figures(self, prediction: Prediction) -> Row:
@@ -193,7 +193,10 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
 
 
 def by_least_squares(*, memory: bool) -> Method:
-    """Return the method of `identify` with Coulomb friction or with bristle states, joints weighted by range."""
+    """Return the method least squares, as `identify` has it, with Coulomb friction or (`memory`) with bristle states.
+
+    Joints are weighted by the range of their torque.
+    """
     method = LeastSquares("range", friction=FrictionModel(memory=memory))
 
     def fitted(problem: Problem) -> Prediction:
@@ -203,7 +206,7 @@ def by_least_squares(*, memory: bool) -> Method:
 
 
 def by_preset(preset: str) -> Method:
-    """Return the method of `spelgen train` with a preset and without options."""
+    """Return the method that fits a preset as `spelgen train` does without options."""
 
     def fitted(problem: Problem) -> Prediction:
         model = spelgen.build(problem.fold.urdf, preset)
@@ -234,7 +237,7 @@ METHODS: dict[str, Method] = {
 
 
 def folds(folder: Path) -> Iterator[Fold]:
-    """Yield all folds, the documented splits first."""
+    """Yield all folds of the folder of recordings: the documented splits first, then single motions."""
     motions: list[Fold] = []
     for name in ("ur10e", "airbot", "shanghai"):
         urdf = folder / name / f"{name}.urdf"

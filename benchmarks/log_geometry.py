@@ -12,8 +12,8 @@ slow.
 
 A reading is a hypothesis on the meaning of a log's columns (`Hypothesis`); the right reading undoes the fault. A fault
 is `named` if the first reading that `spelgen logs` lists is the right one, `with others` if a later one is, `wrong` if
-all are wrong. If no reading is listed, it is `missed`, or `invisible` if the evidence for the right reading is below
-the threshold even with the inertials of the true arm: a vertical first axis, a symmetric wrist.
+all are wrong. If no reading is listed, the fault is `invisible` if the evidence for the right reading is below the
+threshold even with the inertials of the true arm (a vertical first axis, a symmetric wrist); otherwise it is not found.
 
 Results are appended to a file of JSON lines; a run continues where it stopped, and the tables include all rows.
 """
@@ -191,7 +191,7 @@ def result_of(arm: Arm, true: Arm, logs: Sequence[Trajectory], kind: str, right:
 
 @dataclass(frozen=True)
 class Row:
-    """Result of one random fault, or of the clean log (kind "clean"), of one arm and log."""
+    """Result for one random log of an arm, with a random fault or without one (kind "clean")."""
 
     arm: str
     number: int

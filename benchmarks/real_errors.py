@@ -77,7 +77,7 @@ class ErrorProcess:
     """Errors of a simulated arm with n joints, from their levels and random phases, periods and factors per joint."""
 
     def __init__(self, errors: RealErrors, dry: np.ndarray, rng: np.random.Generator) -> None:
-        """dry: (n,) nominal dry friction [Nm, N]."""
+        """Draw the phases, periods and factors of the errors per joint; dry: (n,) nominal dry friction [Nm, N]."""
         n = len(dry)
         self.errors = errors
         self.gain = np.exp(errors.gain * rng.normal(size=n))

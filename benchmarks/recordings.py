@@ -375,7 +375,10 @@ SOURCES = {
 
 
 def reader(repository: Repository, clones: Path) -> Read:
-    """Return a function that reads files of a repository at its commit; it is cloned if it is absent."""
+    """Return a function that reads a file of a repository by its path, at the repository's commit.
+
+    The repository is cloned into the folder `clones` if it is absent.
+    """
     clone = clones / repository.name
     if not clone.exists():
         command = [

@@ -1,9 +1,9 @@
-"""Processor time of the commands, as ratios to `identify --friction memory` in the same run: medians of five.
+"""Processor time of the commands, divided by the time of `identify --friction memory` in the same run: medians of five.
 
     python benchmarks/seconds.py [FOLDER] [--repeats 5]
 
 FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings; the
-arm is its UR10e, 100 s of training logs and three tests.
+arm is its UR10e, with 100 s of training logs and three test logs.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ def creep(log: spelgen.Trajectory, q: np.ndarray, step: float) -> list[tuple[int
 
 
 def main() -> None:
-    """Fit the model, replay every log, and print the creep per joint."""
+    """Fit the model, predict every log from its commands, and print the creep per joint."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

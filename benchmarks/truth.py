@@ -124,7 +124,7 @@ def draw_case(number: int, arms: Sequence[str]) -> Case:
 
 
 class Truth:
-    """The simulated arm: rigid bodies of its URDF, and friction, drives, springs and errors of this benchmark."""
+    """The simulated arm of a case: the URDF's rigid bodies, and friction, drives, springs and errors of the case."""
 
     def __init__(self, case: Case, urdf: Path, rng: np.random.Generator) -> None:
         self.case = case
@@ -479,7 +479,7 @@ class Fitted:
 
 
 def fit_hybrid(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
-    """Fit the default model to torques as `spelgen train` does."""
+    """Fit the preset `hybrid` to torques, as `spelgen train` does."""
     fit = spelgen.fit(spelgen.build(urdf, "hybrid"), logs, spelgen.TorqueFit(), arm=urdf)
     model = fit.model.requires_grad_(False)
     return Fitted(model, model.inertial_parameters.numpy(), model.armature.numpy(), fit.posterior)

@@ -1,4 +1,4 @@
-"""Tables of the results of `truth.py`: errors, the default relative to least squares, intervals, residuals."""
+"""Tables of the results of `truth.py`: errors, `hybrid` relative to least squares, intervals, residual statistics."""
 
 from __future__ import annotations
 

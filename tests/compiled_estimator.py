@@ -1,4 +1,4 @@
-"""The exported C estimator, compiled and run along a log."""
+"""The exported C estimator of payload, friction drift and contacts, compiled and run along logs."""
 
 from __future__ import annotations
 

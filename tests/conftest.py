@@ -1,4 +1,4 @@
-"""Shared by all tests: one thread for tiny matrices, the order of files, common fixtures."""
+"""Settings and fixtures of all tests: one thread for tiny matrices, the order of test files, folders, short fits."""
 
 import gc
 import os
@@ -70,13 +70,13 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(scope="session")
 def robots() -> Path:
-    """The folder of the project's own robots."""
+    """Return the folder of the project's own robots."""
     return ROOT / "robots"
 
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of reference data next to the checkout; tests that read it skip if it is absent."""
+    """Return the folder of reference data next to the checkout; tests that read it skip if it is absent."""
     folder = ROOT.parent / "shared"
     if not folder.is_dir():
         pytest.skip("the reference data (../shared) is not on this machine")

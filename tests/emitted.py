@@ -84,7 +84,7 @@ def closed_forms(robots: Iterable[str], folder: Path) -> dict[str, tuple[ModuleT
 
 
 def printed_without_structure(code: str, path: Path) -> str:
-    """Return the output of `code`, with `path` as argument, if nothing that derives structure can be imported."""
+    """Run Python code with `path` as argument, in a process that cannot import the derivation; return its output."""
     blocked = ("sympy", "flint", "spelgen.structure", "spelgen.emission.plan", "spelgen.arm.arm")
     program = f"import sys\nfor name in {blocked}:\n    sys.modules[name] = None\n{code}"
     run = subprocess.run(
@@ -103,7 +103,7 @@ def built(
     *,
     standalone: bool = False,
 ) -> tuple[str, Structure]:
-    """Return the source of a module, and the structure, of one of the robots that come with spelgen."""
+    """Derive one of the project's robots; return the text of its emitted module, and its structure."""
     arm = _loaded(robot)
     spec = derive_spec(arm, Options(preset=preset, design=design, assume=assume))
     return module_text(spec, standalone=standalone), derive(arm.chain, assume)

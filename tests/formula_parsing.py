@@ -1,4 +1,4 @@
-"""Closed forms parsed from the written text and compared with Pinocchio."""
+"""Parsers of written closed forms (text, LaTeX), and their comparison with Pinocchio."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""The paper's equations on SO(3)^k x R^3^l: rotation matrices in, rates of all three axes of each joint out.
+"""The port-Hamiltonian equations of the paper on SO(3)^k x R^3^l, with three axes per joint.
 
-The emitted module integrates one number for each joint. This file has the equations of the paper
-(Wang, Chen, Ding, Sci Rep 15:33179, 2025), to compare with models that are trained so and to show that nothing
-is lost.
+The emitted module integrates one coordinate per joint. This file has the equations of the paper (Wang, Chen, Ding,
+Sci Rep 15:33179, 2025), from rotation matrices to rates, to show that both are equal.
 """
 
 from __future__ import annotations
@@ -14,7 +13,10 @@ import torch
 
 
 def to_group(joint_types: Sequence[str], q: torch.Tensor) -> list[torch.Tensor]:
-    """Return, per joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3) [m], if prismatic, of q, (..., n)."""
+    """Convert q (..., n) to positions on the group, one per joint.
+
+    They are R in SO(3), (..., 3, 3), for a turning joint, and r in R^3, (..., 3) [m], for a sliding one.
+    """
     zero, one = torch.zeros_like(q), torch.ones_like(q)
     rows = [q.cos(), -q.sin(), zero, q.sin(), q.cos(), zero, zero, zero, one]
     rotations = torch.stack(rows, dim=-1).reshape(*q.shape, 3, 3)
@@ -27,7 +29,7 @@ def to_group(joint_types: Sequence[str], q: torch.Tensor) -> list[torch.Tensor]:
 
 
 def from_group(joint_types: Sequence[str], elements: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Return q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+    """Return q, (..., n), with angles in [-pi, pi], from the positions of `to_group`."""
     values = []
     for kind, element in zip(joint_types, elements, strict=True):
         if kind == "revolute":

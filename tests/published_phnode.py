@@ -25,7 +25,7 @@ def _mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
 
 
 class _Cholesky(nn.Module):
-    """L L^T + eps I, where a network gives the lower triangle L."""
+    """Positive definite matrix L L^T + eps I, with the lower triangle L from a network."""
 
     def __init__(self, inputs: int, width: int, size: int, epsilon: float) -> None:
         super().__init__()
@@ -41,9 +41,10 @@ class _Cholesky(nn.Module):
 
 
 class Published(nn.Module):
-    """The rate of (R, zeta), (..., 12 n), of n turning joints: eq. 18 of the paper, over all axes.
+    """Rates of the states (R, zeta), (..., 12 n), of n turning joints by PHNODE: eq. 18 of the paper, over all axes.
 
-    Every derivative is automatic: dH/dR and dH/dp in one call, and dM^-1/dt one entry at a time.
+    R: rotation matrix, zeta: twist. Every derivative is automatic: dH/dR and dH/dp in one call, and dM^-1/dt one entry
+    at a time.
     """
 
     def __init__(self, joints: int, width: int, potential_width: int) -> None:

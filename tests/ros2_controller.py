@@ -73,7 +73,7 @@ class Controller:
         return getattr(self.library, f"harness_{name}")(self.handle, *arguments)
 
     def update(self, q, qd, effort=None, period=PERIOD, available=True):
-        """Return the commanded torques of a cycle."""
+        """Run a control cycle at a state; return the commanded torques (n,)."""
         self.time += period
         states = [q, qd] if effort is None else [q, qd, effort]
         pointer, _states = array(np.concatenate([np.asarray(x, float) for x in states]))
@@ -98,7 +98,7 @@ class Controller:
             self.call("write", index, ctypes.c_double(value))
 
     def set(self, name, value):
-        """Set a parameter; return the reason of a refusal, or None."""
+        """Set a ROS parameter of the controller; return the reason if it is refused, None otherwise."""
         if isinstance(value, str):
             reason = self.call("set_text", name.encode(), value.encode())
         else:
@@ -111,7 +111,7 @@ class Controller:
         return self.call(name).decode()
 
     def joint_state(self, topic):
-        """Return the efforts of the last message of a topic, joint name to effort."""
+        """Return the efforts by joint name in the last JointState message of a topic."""
         self.text("state")
         pointer, efforts = array(np.zeros(self.n))
         return dict(
@@ -119,7 +119,7 @@ class Controller:
         )
 
     def wrench(self):
-        """Frame and values of the last tip wrench, (6,)."""
+        """Return frame and values (6,) of the last message of the external wrench at the tip."""
         self.text("state")
         pointer, values = array(np.zeros(6))
         return self.call("wrench", pointer).decode(), values
@@ -135,7 +135,7 @@ class Controller:
         return None if frame is None else (frame.decode(), values)
 
     def deactivate(self):
-        """Deactivate the controller; return the last commands."""
+        """Deactivate the controller; return the commands that it leaves, (n,)."""
         pointer, commands = array(np.full(self.n, np.nan))
         assert self.call("deactivate", pointer)
         return commands

@@ -38,7 +38,7 @@ NAMES = {"number": "number", "integer": "integer", "string": "text", "boolean": 
 
 
 def attributes(group: type) -> dict[str, str]:
-    """Return the description of each key, from the docstrings of a class and of its bases."""
+    """Return the description of each key of a settings class, from its docstring and the ones of its bases."""
     texts: dict[str, str] = {}
     for base in reversed(group.__mro__):
         _, _, section = inspect.cleandoc(vars(base).get("__doc__") or "").partition("Attributes:\n")
@@ -75,7 +75,7 @@ def inner_path(path: str, name: str, field: FieldInfo) -> str:
 
 
 def values(schema: Mapping[str, Any]) -> str:
-    """Return the values that a JSON schema allows, in words."""
+    """Return the values that the JSON schema of a key allows, as text."""
     if "anyOf" in schema:
         return " or ".join(values(x) for x in schema["anyOf"] if x.get("type") != "null")
     if "enum" in schema:
@@ -118,13 +118,13 @@ def page_of(path: str) -> Path:
 
 
 def link(path: str, target: str) -> str:
-    """Return the link from the section of one group of keys to the section of another."""
+    """Return the Markdown link from the section of one group of keys to the section of another."""
     name = "" if page_of(path) == page_of(target) else page_of(target).name
     return f"{name}#{target.lower().replace('.', '')}"
 
 
 def rows(path: str, group: type[Group]) -> Iterator[tuple[str, ...]]:
-    """Yield key, values, default, unit and meaning; an option of several objectives may have several rows."""
+    """Yield a row per key: key, values, default, unit, meaning; an option of several objectives may have several rows."""
     schema = group.model_json_schema()["properties"]
     for name, field in group.model_fields.items():
         inner = subgroup(field.annotation)
@@ -184,7 +184,7 @@ def tables(file: Path) -> str:
 
 
 def page(file: Path) -> str:
-    """Return the text of a page with its tables replaced."""
+    """Return the text of a page of settings with its tables generated again."""
     text = file.read_text(encoding="utf-8")
     return text[: text.index(MARKER) + len(MARKER)] + "\n" + tables(file)
 

@@ -1,4 +1,4 @@
-"""The input matrix G from transmissions, gears and couplings, in report, simulation, module and training."""
+"""The input matrix G from transmissions, gears and couplings is right in report, simulation, module and training."""
 
 from dataclasses import replace
 

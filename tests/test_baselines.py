@@ -1,4 +1,4 @@
-"""Baselines: integrated with steps of their own, and identified from the same logs."""
+"""Baselines are integrated with steps of their own, identified from the same logs, and kept with a run."""
 
 import hashlib
 import json

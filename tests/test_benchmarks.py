@@ -1,4 +1,4 @@
-"""Benchmarks: folds without overlap, tables, errors of known size and correlation."""
+"""Benchmarks: folds do not overlap, tables are right, and simulated errors have their level and correlation."""
 
 import numpy as np
 import pytest
@@ -104,7 +104,8 @@ def test_errors_that_are_absent_change_nothing():
 def test_elastic_joints_resonate_and_teeth_change_flanks():
     errors = real_errors.RealErrors(resonance=10.0)
     process = real_errors.ErrorProcess(errors, np.ones(1), np.random.default_rng(0))
-    stiffness = 2.0 * (2 * np.pi * 10.0) ** 2  # of a resonance of 10 Hz and an inertia of 2 kg m^2
+    # stiffness of a joint with a resonance of 10 Hz and a link inertia of 2 kg m^2
+    stiffness = 2.0 * (2 * np.pi * 10.0) ** 2
     torque = np.linspace(-3.0, 3.0, 1001)[:, None]
     np.testing.assert_allclose(process.deflection(torque, np.array([2.0])), torque / stiffness)
     loose = real_errors.ErrorProcess(

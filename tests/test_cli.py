@@ -99,7 +99,7 @@ def test_help_and_inspect_load_nothing_heavy(robots):
         assert done.stdout.splitlines()[-1] == "set()", done.stderr
 
 
-# ---- standard output, standard error and files
+# ---- results on standard output, messages on standard error, and files
 
 
 def test_inspect_text_fits_80_columns(spelgen, robots):

@@ -1,4 +1,4 @@
-"""The preset closed-form: rigid bodies against Pinocchio, derivatives against autograd, fits against known arms."""
+"""The preset closed-form: rigid bodies equal Pinocchio, derivatives equal autograd, and fits recover known arms."""
 
 import numpy as np
 import pinocchio as pin

@@ -253,7 +253,7 @@ def test_the_sentence_has_the_best_model_and_the_ratios_of_the_others(study, res
 
 
 def test_the_true_mass_matrix_is_pinocchios_with_the_rotors(robots):
-    """Pinocchio's own reading of the file, and rotor inertia times gear squared on the diagonal."""
+    """The true M of the simulated arm equals Pinocchio's of the URDF, plus rotor inertia times gear squared."""
     urdf = robots / "ur10e.urdf"
     model = pin.buildModelFromUrdf(str(urdf))
     q = torch.from_numpy(np.random.default_rng(0).uniform(-3, 3, (5, 6)))
@@ -341,7 +341,7 @@ def test_invariants_show_a_model_that_gains_energy_or_has_an_indefinite_mass_mat
 
 @pytest.fixture(scope="module")
 def logs(robots, tmp_path_factory):
-    """Logs of two_link: four trajectories for training, four for testing."""
+    """Write logs of two_link, four trajectories for training and four for testing; return their folder."""
     folder = tmp_path_factory.mktemp("two_link")
     arm = load_arm(robots / "two_link.urdf")
     found = simulate(arm, trajectories=8)

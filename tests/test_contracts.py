@@ -1,4 +1,4 @@
-"""Contracts of an emitted module: they hold for each preset, robot, batch shape, and for any parameters."""
+"""Properties that emitted modules of all presets have, for each robot, batch shape, and for any parameters."""
 
 from dataclasses import replace
 
@@ -74,7 +74,7 @@ def random_model(module_of):
 
 
 def states(n: int, *shape: int, count: int = 4) -> tuple[Tensor, ...]:
-    """Random q, qd, qdd and tau, each (*shape, n)."""
+    """Return random q, qd, qdd and tau, (*shape, n) each."""
     generator = torch.Generator().manual_seed(0)
     return tuple(1.5 * torch.randn(*shape, n, dtype=torch.float64, generator=generator) for _ in range(count))
 
@@ -107,7 +107,10 @@ def autograd_bias(model: nn.Module, q: Tensor, qd: Tensor) -> Tensor:
 
 @each_case
 def test_explicit_derivatives_equal_automatic_ones(variant, robot, random_model):
-    """q' = dH/dp and p' = -dH/dq - D q' + G tau; gravity is dV/dq; forward dynamics give the rate of p."""
+    """Explicit derivatives equal automatic ones: q' = dH/dp, p' = -dH/dq - D q' + G tau, and gravity dV/dq.
+
+    Forward dynamics agree with the rate of p.
+    """
     for deviation in DEVIATIONS.get(variant, (None,)):
         model = random_model(variant, robot, 4, deviation).requires_grad_(False)
         q, qd, other, tau = states(model.n, 25)
@@ -229,7 +232,7 @@ def test_torch_differentiates_a_solution_in_forward_mode_under_vmap():
 
 @pytest.mark.parametrize("variant", [x for x in VARIANTS if x not in ("phnode-kan", "minimal")])
 def test_a_model_is_one_graph(variant, random_model):
-    """torch.export in strict mode for batches of any size, and torch.compile without graph breaks.
+    """A model is exported by torch.export in strict mode for batches of any size, and compiled without graph breaks.
 
     Variants all of whose parts occur in others are omitted, as each takes 7 s.
     """

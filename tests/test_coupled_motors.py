@@ -1,4 +1,4 @@
-"""Drives that move several joints: friction and rotor inertia act at motor speeds, and logs reveal couplings."""
+"""With motors that move several joints, friction and rotor inertia act at motor speeds, and logs reveal couplings."""
 
 import json
 import shutil

@@ -80,7 +80,7 @@ def test_examples(page, tmp_path, monkeypatch, request):
 
 
 def tree(folder: Path) -> dict[Path, bytes]:
-    """The files in a folder with their contents."""
+    """Return the contents of the files in a folder, by path."""
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -93,7 +93,7 @@ def cell(text: str, block: str, output: str = "") -> str:
 
 
 def notebook(page: Path) -> str:
-    """The page as a notebook: prose as Markdown cells, blocks with their outputs as code cells."""
+    """Return the notebook of a page: prose as Markdown cells, blocks with their outputs as code cells."""
     text, cells, end = page.read_text(encoding="utf-8"), [], 0
     for match in CELL.finditer(text):
         cells.append({"cell_type": "markdown", "source": text[end : match.start()].strip()})
@@ -137,7 +137,7 @@ def run_commands(block: str, folder: Path) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors of a page's headings, as both MkDocs and GitHub make them of plain words."""
+    """Return the anchors of a page's headings, which MkDocs and GitHub make in the same way of plain words."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", heading.lower())) for heading in headings}
 
@@ -201,7 +201,7 @@ def codes_of_messages() -> set[str]:
 
 
 def test_every_code_is_explained_once():
-    """Each code of a message is in one row of docs/messages.md, and each code of this page exists."""
+    """Each code of a message has one row in docs/messages.md, and each code on this page exists."""
     page = (ROOT / "docs" / "messages.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (`[^|]*) \|", page, re.MULTILINE)
     explained = Counter(code for row in rows for code in re.findall(r"`([a-z-]+)`", row))

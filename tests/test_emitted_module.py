@@ -33,7 +33,7 @@ COUNT = 10_000 if MINUTES else 500
 
 
 def states(n: int, count: int, seed: int = 0) -> list[torch.Tensor]:
-    """Random q, qd, qdd and tau."""
+    """Return random q, qd, qdd and tau, (count, n) each."""
     generator = torch.Generator().manual_seed(seed)
     return [2 * torch.randn(count, n, dtype=torch.float64, generator=generator) for _ in range(4)]
 

@@ -1,4 +1,4 @@
-"""The text of errors and diagnostics: file, line, element, got, expected, remedy."""
+"""Errors and diagnostics state file, line, element, the value found, the value expected, and advice."""
 
 import json
 import pickle

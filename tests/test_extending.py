@@ -100,7 +100,7 @@ def test_a_baseline(robots, monkeypatch, log):
     monkeypatch.setattr(registry, "BASELINES", (*registry.BASELINES, stands_still))
     results = spelgen.evaluate(spelgen.build(load_arm(robots / "two_link.urdf"), "spel", width=4), log)
     error = results.horizons[-1].errors["stands still"].mean_relative_rms
-    # the predictor "stands still" has the error 1 relative to the motion
+    # a prediction of no motion has the error 1 relative to the motion
     assert error == pytest.approx(1, rel=0.2)
     assert "stands still" in results.text()
 

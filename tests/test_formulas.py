@@ -1,4 +1,4 @@
-"""Closed forms equal Pinocchio as text, as LaTeX and as a SymPy file."""
+"""Closed forms written as text, LaTeX and SymPy file equal M and V of Pinocchio."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_sympy_proves_each_expression(robot):
         for each in found.base:
             polynomial = expansion.polynomial(element, each.index)
             for powers, share in polynomial.terms():
-                if row.entry != "V" or any(powers):  # the constant of V is omitted, as it is arbitrary
+                if row.entry != "V" or any(powers):  # without the constant of V, since it is arbitrary
                     monomial = sympy.prod(x**power for x, power in zip(generators, powers, strict=True))
                     expanded += (
                         sympy.Rational(int(share.p), int(share.q))

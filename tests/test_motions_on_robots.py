@@ -114,7 +114,7 @@ def test_a_contact_between_two_samples_is_found(urdf, angle):
     wall = Surroundings(boxes={"post": Box(size=(0.05, 0.05, 0.05), xyz=(0, 0, 1.0))})
     contact = collisions(urdf, wall).contact(motion)
     assert contact is not None and {contact.first, contact.second} == {"c", "box 'post'"}
-    # the contact begins before the centre of c is below the corner of the box
+    # at the first contact, link c has not yet reached the position below the box
     reached = np.interp(contact.time, motion.t, q[:, 1])
     assert -0.3 < reached < 0 and 0 < contact.distance < 0.01
 

@@ -1,4 +1,4 @@
-"""Rigid-body dynamics against Pinocchio's own reading of the URDF and against mechanics derived by hand."""
+"""Rigid-body dynamics equal Pinocchio's of the URDF, and mechanics that are derived by hand."""
 
 from fractions import Fraction
 

@@ -206,7 +206,7 @@ def dh_frames(robot, q):
 
 
 def dh_mass_matrix(robot, q):
-    """M(q) as the sum over links of m Jv^T Jv + Jw^T I Jw (Spong et al., Robot Modeling and Control, 7.2)."""
+    """Return M(q), (n, n): sum over links of m Jv^T Jv + Jw^T I Jw (Spong et al., Robot Modeling and Control, 7.2)."""
     frames = dh_frames(robot, q)
     table = STANDARD.get(robot) or MODIFIED[robot]
     total = np.zeros((len(q), len(q)))

@@ -110,7 +110,7 @@ def test_a_standalone_module_of_servos(arm, tmp_path):
         assert model.servo(u, q, torch.zeros_like(q)).tolist() == [[pytest.approx(0.2 * 12.0), 0.0]]
         assert float(model.servo.stored_energy(u, q)) == pytest.approx(0.5 * 12.0 * 0.04)
         far = model.servo(u + 9, q, torch.zeros_like(q))
-    assert far.tolist() == [[6.0, 6.0]]  # the effort limit of the URDF
+    assert far.tolist() == [[6.0, 6.0]]  # far from the command, the torque is the effort limit of the URDF
     assert "in ratio to kp only" in " ".join(spelgen.inspect(arm).text().split())
 
 

@@ -1,4 +1,4 @@
-"""`spelgen logs` on logs of commanded positions."""
+"""`spelgen logs` reports the tracking of servos, and faults of logs with commanded positions."""
 
 import json
 import re

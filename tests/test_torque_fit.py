@@ -506,7 +506,7 @@ def write(path, samples, arm):
 
 @pytest.fixture(scope="module")
 def run(emitted, robots, tmp_path_factory):
-    """Return the folder of a `spelgen train` run of a closed-form module, the true model, and the command's arguments."""
+    """Return the folder of a `spelgen train` run of a closed-form module, the true model, and the arguments."""
     folder = tmp_path_factory.mktemp("closed_form_run")
     module, arm = emitted["two_link"]
     true = drawn(module, seed=4, deviation=0.2)

@@ -1,4 +1,4 @@
-"""Logs of a controlled arm: tracking error, encoder steps and logged torques are as specified."""
+"""Simulated logs of a controlled arm have the specified tracking error, encoder steps and torques."""
 
 from dataclasses import replace
 
