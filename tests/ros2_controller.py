@@ -111,7 +111,7 @@ class Controller:
         return self.call(name).decode()
 
     def joint_state(self, topic):
-        """Return the efforts by joint name in the last JointState message of a topic."""
+        """Return the effort of each joint name in the last JointState message of a topic."""
         self.text("state")
         pointer, efforts = array(np.zeros(self.n))
         return dict(
@@ -135,7 +135,7 @@ class Controller:
         return None if frame is None else (frame.decode(), values)
 
     def deactivate(self):
-        """Deactivate the controller; return the commands that it leaves, (n,)."""
+        """Deactivate the controller; return its last commands, (n,)."""
         pointer, commands = array(np.full(self.n, np.nan))
         assert self.call("deactivate", pointer)
         return commands

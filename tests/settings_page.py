@@ -124,7 +124,7 @@ def link(path: str, target: str) -> str:
 
 
 def rows(path: str, group: type[Group]) -> Iterator[tuple[str, ...]]:
-    """Yield a row per key: key, values, default, unit, meaning; an option of several objectives may have several rows."""
+    """Yield a row per key: key, values, default, unit, meaning; options of several objectives may have several rows."""
     schema = group.model_json_schema()["properties"]
     for name, field in group.model_fields.items():
         inner = subgroup(field.annotation)

@@ -16,7 +16,7 @@ from spelgen.settings.log_mapping import LogMapping
 
 
 def clipped_joints(arm, log) -> dict[str, list[float]]:  # noqa: F811
-    """Return the limits in the errors about clipped torques, by joint; a log may have no other errors."""
+    """Return the limits in the errors about clipped torques, per joint; a log may have no other errors."""
     found = {}
     for error in check_logs([log], arm).errors:
         joint, limits = re.match(r"joint '(.*)', tau: got torques that stop at (.*?) N", str(error)).groups()
