@@ -119,7 +119,7 @@ class TestChain:
         assert names(arm) == ["a", "b"]
         assert ("ambiguous-chain" in codes(arm)) == (travel < 0.1)
 
-    def test_a_joint_of_effort_zero_decides_a_draw(self, robot):
+    def test_a_joint_of_effort_zero_decides_between_equal_chains(self, robot):
         spring = joint("spring", "1", "s").replace('effort="3"', 'effort="0"')
         arm = make_arm(robot(joint("a", "0", "1"), spring, joint("b", "1", "2")))
         assert names(arm) == ["a", "b"]
@@ -340,7 +340,7 @@ class TestExactness:
         st.floats(-pi, pi),
     )
     @settings(max_examples=200, deadline=None)
-    def test_any_rotation_is_met_within_1e_11(self, axis, angle):
+    def test_any_rotation_is_approximated_to_1e_11(self, axis, angle):
         rotation = rotation_about(np.array(axis) / np.linalg.norm(axis), angle)
         found = exact_rotation(rotation)
         assert (found @ found.T == IDENTITY).all()

@@ -219,7 +219,7 @@ class TestMotionFile:
         path.write_text("\n".join(lines) + "\n")
         return path
 
-    def test_what_excite_writes_is_read_back(self, robots, tmp_path):
+    def test_files_of_excite_are_read_back(self, robots, tmp_path):
         found = spelgen.excite(spelgen.load_arm(robots / "two_link.urdf"), duration=2.0, trials=2)
         (tmp_path / "m.csv").write_text(found.csv())
         motion = read_motion(tmp_path / "m.csv", found.arm.joint_names)
@@ -236,13 +236,13 @@ class TestMotionFile:
             ({"t": [*range(20), 19]}, "a step of 0 s"),
         ],
     )
-    def test_what_is_no_motion_is_refused(self, change, message, tmp_path):
+    def test_files_that_are_no_motion_are_refused(self, change, message, tmp_path):
         path = self.write(tmp_path / "m.csv", **change)
         with pytest.raises(LogError, match=message) as caught:
             read_motion(path, ["a"])
         assert str(path) in str(caught.value)
 
-    def test_what_is_no_table_is_refused(self, tmp_path):
+    def test_files_that_are_no_table_are_refused(self, tmp_path):
         (tmp_path / "m.csv").write_bytes(b"t,q_a,qd_a,qdd_a\nx,y,z,w\n" * 30)
         with pytest.raises(LogError, match=r"unreadable|no finite"):
             read_motion(tmp_path / "m.csv", ["a"])

@@ -66,7 +66,7 @@ class Geared:
         return Drives(self.matrix(), np.eye(3))
 
 
-def test_a_sound_log_is_measured_and_not_doubted(loaded, arm, log):
+def test_a_sound_log_has_its_figures_and_no_findings(loaded, arm, log):
     result = check_logs([log, replace(log, name="again", t=log.t + 3)], loaded)
     assert (result.samples, result.findings, result.errors) == (4000, (), ())
     assert result.duration == pytest.approx(40, rel=0.01)
@@ -97,7 +97,7 @@ def loaded_joint(loaded, log) -> int:
 
 
 @pytest.mark.parametrize("code", ["torque-without-gravity", "torque-scale"])
-def test_a_torque_that_is_none_is_found(loaded, arm, log, code):
+def test_torques_without_gravity_or_of_another_scale_are_found(loaded, arm, log, code):
     joint, tau = loaded_joint(loaded, log), log.tau.copy()
     still = np.zeros_like(log.q)
     gravity = regressor(arm, log.q, still, still) @ urdf_parameters(arm)
@@ -150,7 +150,7 @@ def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
         require_sound_logs([wrong], weak)
 
 
-def test_limits_overrun_are_said(loaded, arm, log):
+def test_positions_beyond_the_limits_are_reported(loaded, arm, log):
     upper = arm.coordinates[1].upper
     over = log.q.copy()
     over[:, 1] += upper + 0.01 - over[:, 1].max()
@@ -167,7 +167,7 @@ def test_noise_at_the_velocity_limit_is_no_finding(loaded, arm, log, over, codes
     assert {x.code for x in check_logs([log], slower).findings if "velocity" in x.code} == codes
 
 
-def test_noise_and_steps_are_those_put_in(log):
+def test_noise_and_encoder_steps_are_estimated(log):
     random = np.random.default_rng(2)
     noisy = replace(log, q=log.q + 1e-3 * random.standard_normal(log.q.shape))
     np.testing.assert_allclose(statistics(noisy).signals["q"][2], 1e-3, rtol=0.1)
@@ -179,7 +179,7 @@ def test_noise_and_steps_are_those_put_in(log):
     assert np.isnan(statistics(log[::4]).signals["q"][2]).all()
 
 
-def test_what_cannot_be_trained_on_is_an_error_not_the_end(loaded, arm, log):
+def test_logs_that_cannot_be_trained_on_are_errors_of_a_report(loaded, arm, log):
     frozen = log.qd.copy()
     frozen[:, 0] = 0
     result = check_logs(
@@ -189,7 +189,7 @@ def test_what_cannot_be_trained_on_is_an_error_not_the_end(loaded, arm, log):
     assert any("qd always 0 while q goes" in str(error) for error in result.errors)
 
 
-def test_the_page_tells_what_the_text_tells_and_draws_every_joint(loaded, arm, log):
+def test_the_page_has_the_findings_of_the_text_and_charts_of_every_joint(loaded, arm, log):
     hostile = replace(log, name="<script>alert(1)</script>")
     result = check_logs(
         [hostile, replace(log, name="b", t=np.where(np.arange(2000) > 999, log.t + 2, log.t))], loaded
@@ -210,7 +210,7 @@ def spelgen(tmp_path, monkeypatch):
     return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments])
 
 
-def test_the_command_tells_80_columns_json_and_a_page(spelgen, robots, arm, log, tmp_path):
+def test_the_command_prints_80_columns_json_and_a_page(spelgen, robots, arm, log, tmp_path):
     names = [coordinate.name for coordinate in arm.coordinates]
     write_logs(tmp_path / "logs.parquet", [log], names)
     command = ["logs", "logs.parquet", "--robot", robots / "rpr.urdf"]
@@ -295,7 +295,7 @@ def test_the_line_for_velocities_of_the_opposite_sense_mends_them(robots, arm, l
 
 
 @pytest.mark.parametrize("constant", [0.0, 0.1, 5.0])
-def test_a_torque_that_never_changes_is_told(loaded, log, constant):
+def test_a_constant_torque_is_reported(loaded, log, constant):
     """A constant torque is reported, also if it is 0.1, whose mean differs from it by rounding."""
     report = check_logs([replace(log, tau=np.full_like(log.tau, constant))], loaded)
     assert {x.code for x in report.findings} == {"constant-torque"}
@@ -311,7 +311,7 @@ def test_arrays_of_another_arm_are_refused(loaded, log):
         check_logs([], loaded)
 
 
-def test_a_report_is_told_in_a_line_and_in_a_notebook(loaded, log):
+def test_a_report_has_one_line_and_a_notebook_form(loaded, log):
     report = check_logs([replace(log, name="<b>", qd=-log.qd)], loaded)
     assert repr(report) == "<LogReport rpr: 1 trajectory, 19.99 s, 2000 samples; 0 warnings, 1 error>"
     shown = report._repr_html_()
@@ -337,14 +337,14 @@ def test_a_new_check_is_a_function_and_its_row(loaded, log, monkeypatch, registr
         assert {(x.code, x.message) for x in report.findings} == {("odd-name", "it is called odd")}
 
 
-def test_a_few_samples_tell_nothing_of_gravity(loaded, arm, log):
+def test_a_few_samples_give_no_figures_of_gravity(loaded, arm, log):
     result = check_logs([log[:20]], loaded)
     assert [x.gravity.explained for x in result.joints] == [None] * 3
     # within a fifth of a second no joint reverses
     assert {x.code for x in result.findings} == {"one-way"}
 
 
-def test_real_arms_are_believed(shared):
+def test_logs_of_real_arms_have_no_errors(shared):
     logs = shared / "logs" / "ur10e"
     real = load_arm(logs / "ur10e.urdf")
     paths = [path for path in sorted(logs.glob("*.parquet")) if "oad" not in path.stem]
@@ -376,7 +376,7 @@ WRONG_TORQUES = {
 
 
 @pytest.mark.parametrize("case", WRONG_TORQUES)
-def test_torques_that_cannot_be_are_refused_unless_accepted(loaded, log, case):
+def test_impossible_torques_are_refused_unless_accepted(loaded, log, case):
     change, code = WRONG_TORQUES[case]
     wrong = replace(log, tau=change(log.tau))
     with pytest.raises(SpelgenError) as caught:
@@ -428,14 +428,14 @@ def test_gravity_of_another_mounting_is_refused(robots, tmp_path, log):
         require_sound_logs([log], load_arm(tmp_path / "arm.urdf"))
 
 
-def test_a_quantised_signal_is_told(loaded, log):
+def test_a_quantised_signal_is_reported(loaded, log):
     tau = log.tau.copy()
     step = np.ptp(tau[:, 0]) / 4
     tau[:, 0] = step * np.round(tau[:, 0] / step)
     assert "coarse" in {x.code for x in check_logs([replace(log, tau=tau)], loaded).findings}
 
 
-def test_a_position_limit_that_is_reached_without_contact_is_not_told(loaded, arm, log):
+def test_a_position_limit_that_is_reached_without_contact_is_not_reported(loaded, arm, log):
     """A position limit that a joint reaches without contact is not reported.
 
     A contact shows in the torques; `test_limits_in_logs` has joints at a stop.
@@ -445,7 +445,7 @@ def test_a_position_limit_that_is_reached_without_contact_is_not_told(loaded, ar
     assert check_logs([log], limited).findings == ()
 
 
-def test_a_joint_that_never_moves_back_is_told(loaded, log):
+def test_a_joint_that_never_reverses_is_reported(loaded, log):
     forward = np.abs(log.qd[:, 0])
     q = np.column_stack([cumulative_trapezoid(forward, log.t, initial=0.0), log.q[:, 1:]])
     moved = replace(log, q=q, qd=np.column_stack([forward, log.qd[:, 1:]]))
@@ -506,7 +506,7 @@ def drive_log(joints, *logs):
     return collected
 
 
-def test_a_coupling_of_recorded_logs_is_told_before_a_fit(shared):
+def test_a_coupling_of_recorded_logs_is_reported_before_a_fit(shared):
     tx40 = load_arm(shared / "logs" / "tx40" / "tx40.urdf")
     notes = require_sound_logs(read_logs([shared / "logs" / "tx40"], tx40), tx40)
     assert [x.where for x in notes if x.code == "coupled-motors"] == ["joint 'joint_6'"]

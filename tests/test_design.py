@@ -30,7 +30,7 @@ def made(values):
         return None
 
 
-def test_what_is_refused_names_the_two_options():
+def test_a_refused_combination_names_the_two_options():
     refused = [values for values in COMBINATIONS if made(values) is None]
     for values in refused:
         with pytest.raises(SpelgenError) as error:
@@ -106,7 +106,7 @@ def test_a_wrong_preset_is_reported_with_its_line(tmp_path, monkeypatch, change,
     assert str(error.value).splitlines()[0] == message
 
 
-def test_no_preset_at_all():
+def test_an_unknown_preset_names_the_presets():
     with pytest.raises(SettingsError) as error:
         load_design("minmal")
     expected = "hybrid, closed-form, minimal, spel, spel-kan, phnode, or a YAML file"

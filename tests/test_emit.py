@@ -78,7 +78,7 @@ def test_same_bytes_under_any_hash_seed_and_from_any_folder(tmp_path):
     assert len(texts) == 1
 
 
-def test_emitted_code_is_held_to_the_rules_of_written_code(tmp_path):
+def test_emitted_code_follows_the_rules_of_written_code(tmp_path):
     for robot, preset in [
         *(("rpr", preset) for preset in PRESETS),
         ("panda", "hybrid"),

@@ -172,7 +172,7 @@ def evaluated(run, logs, **options):
     return evaluate(run, read_test_logs(run, [logs]), **options)
 
 
-def test_the_true_model_is_perfect_and_its_baseline_is_not(run):
+def test_the_true_model_has_no_error_and_its_baseline_has(run):
     result = evaluated(run, run.parent / "logs")
     assert [(x.name, x.steps, x.windows) for x in result.horizons] == [
         # windows begin two samples before a prediction, for predictors that use earlier samples
@@ -226,7 +226,7 @@ def test_the_same_run_and_logs_give_the_same_file(run):
     assert shown[0]["error"] <= shown[1]["error"]
 
 
-def test_what_could_not_be_done_is_said(run):
+def test_parts_of_an_evaluation_that_are_omitted_are_stated(run):
     result = evaluated(run, run.parent / "logs" / "train.parquet", seconds=(5.0,))
     assert {x.code: x.message for x in result.diagnostics} == {
         "tested-on-training-data": "names also used in training: motion_00, motion_01, motion_02, motion_03; "
@@ -238,7 +238,7 @@ def test_what_could_not_be_done_is_said(run):
     }
 
 
-def test_a_model_that_runs_away_has_no_error_but_null(run, tmp_path):
+def test_a_diverging_model_has_errors_of_null(run, tmp_path):
     weights = torch.load(run / "model.pt", weights_only=True)
     copy = tmp_path / "run"
     copy.mkdir()
@@ -253,7 +253,7 @@ def test_a_model_that_runs_away_has_no_error_but_null(run, tmp_path):
     assert "NaN" not in json.dumps(result.to_dict())
 
 
-def test_what_is_no_run_is_refused(run, tmp_path):
+def test_a_folder_that_is_no_run_is_refused(run, tmp_path):
     with pytest.raises(RunError) as caught:
         evaluate(tmp_path / "none", [])
     assert str(caught.value) == (
@@ -464,6 +464,6 @@ def test_logs_that_never_move_have_no_torque_errors(robots):
     assert found.horizons
 
 
-def test_what_diverged_keeps_its_column():
+def test_a_diverged_predictor_keeps_its_column():
     text = table("Prediction loss", {"seed 0": {"phnode": None, "spel": 1.0}}).text()
     assert "phnode" in text and text.splitlines()[-1].split() == ["seed", "0", "-", "1", "*"]

@@ -175,7 +175,7 @@ def test_a_joint_without_room_is_refused(robots, tmp_path):
         ({"harmonics": 1}, "harmonics: got 1, expected 2 or more"),
     ],
 )
-def test_values_that_cannot_be_are_refused(loaded, changes, message):
+def test_values_out_of_range_are_refused(loaded, changes, message):
     with pytest.raises(SettingsError) as caught:
         excite(loaded, **CHOICE | changes)
     assert str(caught.value) == f"excite: {message}"

@@ -127,7 +127,7 @@ def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
         assert b"fast;" not in files["arm_2_fast_int_main.c"]
 
 
-def test_of_one_joint_a_matrix_is_one_number(tmp_path):
+def test_a_matrix_of_one_joint_is_a_scalar(tmp_path):
     urdf = tmp_path / "one.urdf"
     urdf.write_text(ONE_JOINT)
     arm = load_arm(urdf)

@@ -96,7 +96,7 @@ def test_a_single_entry_is_exported_by_itself(name, tmp_path):
     compile_library(write_c(described, functions, tmp_path), "gcc")
 
 
-def test_a_function_of_one_joint_stays_with_it():
+def test_a_function_of_one_joint_is_exported_at_this_joint():
     model = with_parts("scara")
     functions = model.residuals
     functions.raw_torque_splines[1, 20] = 1.0

@@ -156,7 +156,7 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_goes_on_with_its_own_options(tmp_path):
+def test_a_resumed_run_keeps_its_options(tmp_path):
     logs, run = tmp_path / "train.parquet", tmp_path / "run"
     write_logs(logs, motions(), JOINTS)
     train = [

@@ -80,7 +80,7 @@ def test_small_arms_are_shown_completely(robots, spelgen):
 
 
 @pytest.mark.parametrize("robot", ON_A_BOARD)
-def test_entries_as_on_a_board(robots, robot):
+def test_entries_have_the_notation_of_a_textbook(robots, robot):
     told = inspect(robots / f"{robot}.urdf").closed_forms()
     rows = {row["name"]: row["expression"] for row in to_dict(told)["entries"]}
     assert {name: rows[name] for name in ON_A_BOARD[robot]} == ON_A_BOARD[robot]

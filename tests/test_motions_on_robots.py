@@ -225,7 +225,7 @@ def test_an_arm_that_cannot_move_freely_gets_no_motion(urdf, monkeypatch):
         ({"acceleration": -1}, "acceleration: got -1, expected one positive number per joint: j1, j2, j3"),
     ],
 )
-def test_values_that_cannot_be_are_refused(urdf, changes, message):
+def test_values_out_of_range_are_refused(urdf, changes, message):
     with pytest.raises(SettingsError) as caught:
         excite(load_arm(urdf), **QUICK | changes)
     assert str(caught.value) == f"excite: {message}"

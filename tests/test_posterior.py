@@ -109,7 +109,9 @@ def logged(model, seconds, seed, correlation=0.98, noise=0.05):
     return DynamicsSamples("known", *motion, tau + noise * tau.std(axis=0) * errors)
 
 
-def test_intervals_hold_the_truth_if_errors_last_longer_than_the_fit_assumes(robots, monkeypatch):
+def test_intervals_contain_the_truth_if_errors_are_correlated_longer_than_the_fit_assumes(
+    robots, monkeypatch
+):
     """Reported intervals contain the truth even if torque errors are correlated longer than the fit assumes.
 
     With errors correlated over 0.5 s, intervals of the posterior covariance, which assumes 0.2 s, are too narrow.

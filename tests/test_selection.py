@@ -123,7 +123,7 @@ def test_the_last_half_counts_only_within_the_range_of_the_first(hybrid):
     assert [(residual.name, residual.joint) for residual in selected] == [("raw_torque_splines", 0)]
 
 
-def test_a_gain_in_one_of_ten_stretches_is_luck(hybrid):
+def test_an_error_reduction_in_one_of_ten_blocks_is_not_significant(hybrid):
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
     everywhere = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
@@ -169,7 +169,7 @@ def test_a_network_is_fitted_to_the_residual_of_functions_of_joints(robots, monk
         torch.testing.assert_close(missing, q.sin())
 
 
-def test_gains_have_to_be_beyond_their_own_scatter():
+def test_an_error_reduction_must_exceed_its_scatter():
     squares = torch.ones(10).double()
     steady = torch.full((10,), 0.9).double()
     assert selection.significant_reduction(squares, steady + 0.001 * torch.arange(10)) == pytest.approx(
@@ -403,7 +403,7 @@ def test_the_tip_error_is_radius_times_angle_error():
     ("evidence", "unlikely"),
     [((-1.0, -20.0), [True, True]), ((-1.0, 20.0), [False, False]), ((9.0, -20.0), [False, True])],
 )
-def test_weak_evidence_of_a_joint_yields_to_that_of_all(evidence, unlikely):
+def test_weak_evidence_of_a_joint_yields_to_all_joints(evidence, unlikely):
     assert stages._rejected(torch.tensor(evidence)).tolist() == unlikely
 
 

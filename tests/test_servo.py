@@ -180,7 +180,7 @@ def test_a_known_kp_stays(tmp_path, logs, monkeypatch):
     assert [x["kp"]["known"] for x in fit.record.servo["joints"]] == [True, False]
 
 
-def test_commands_are_held_and_late():
+def test_commands_are_constant_between_samples_and_delayed():
     t = np.arange(5) * 0.02
     u = np.array([[0.0], [1.0], [2.0], [3.0], [4.0]])
     log = Trajectory(t, u, u, np.zeros((5, 0)), u=u)
@@ -255,7 +255,7 @@ def servo_values(q):
     return values
 
 
-def test_the_posterior_of_a_servo_fit_holds_the_truth(fitted, arm):
+def test_the_posterior_of_a_servo_fit_contains_the_truth(fitted, arm):
     """Intervals of a servo fit contain the true values, also if the URDF's masses are 20 % wrong.
 
     The second arm has other servos, too.
@@ -342,7 +342,7 @@ def test_simulated_commands_and_positions(tmp_path):
     assert late < np.abs(logs[0].q - logs[0].u).mean() < 0.1
 
 
-def test_exports_hold_the_servos(fitted, arm, tmp_path, monkeypatch):
+def test_exports_contain_the_servos(fitted, arm, tmp_path, monkeypatch):
     kp, kd = (x.detach().numpy() for x in fitted.model.servo.prepare()[:2])
     xml = spelgen.export(fitted, to="mjcf").files[".xml"].decode()
     found = re.findall(r'<position name="\w+" joint="\w+" kp="([^"]+)" kv="([^"]+)" forcerange="-6 6"', xml)
@@ -428,7 +428,7 @@ def test_presets_are_not_compared_under_servos(tmp_path):
     assert "servo_arm.yaml: input: got position servos, expected torques" in " ".join(result.stderr.split())
 
 
-def test_joints_by_themselves_move_as_the_arm_does(arm):
+def test_the_motion_of_single_joints_equals_the_motion_of_the_arm(arm):
     model = spelgen.build(arm, "closed-form")
     windows = replace(servo_windows(moved(model, 3.0), Preprocessing()), steps=24)
     rollouts = ServoRollouts.of(model, windows)

@@ -73,7 +73,7 @@ def test_the_command_prints_the_report(arm, logs, tmp_path):
         ({"u": lambda x: np.diff(x.u, axis=0, prepend=x.u[:1])}, r"'elbow': got increments: the position follows"),
     ],
 )  # fmt: skip
-def test_commands_that_cannot_be_these_are_errors(arm, logs, columns, text):
+def test_impossible_commands_are_errors(arm, logs, columns, text):
     found = spelgen.check_logs(changed(logs, **columns), arm)
     assert any(re.search(text, str(each)) for each in found.errors)
 
@@ -120,7 +120,7 @@ def test_errors_at_rest_are_reported(arm):
     assert 0.3 * 0.08 / 9 < elbow.following.steady_state_error < (0.08 + 0.16) / 9
 
 
-def test_servos_that_give_all_they_can_are_counted(arm):
+def test_saturated_servos_are_counted(arm):
     far = [replace(x, u=x.u + np.array([6 / 14 + 0.2, 0.0])) for x in servo_logs(1, 8.0)]
     shoulder = spelgen.check_logs(far, arm).joints[0]
     assert 0.5 < shoulder.following.saturated <= 1.0
@@ -132,7 +132,7 @@ def test_sparse_logs_are_reported(arm, logs):
 
 
 @pytest.mark.parametrize("samples", [1, 5, 13, 400])
-def test_any_logs_are_told(arm, samples):
+def test_logs_with_any_commands_have_a_report(arm, samples):
     t = np.arange(samples) * 0.02
     ramp = np.stack([0.5 * t, np.full_like(t, 0.1)], axis=1)
     for u in (ramp, 0 * ramp, 1e8 * ramp):
@@ -161,7 +161,7 @@ DEGREES = LogMapping.model_validate({"input": "position", "units": {"q": "deg"}}
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_normalised_positions_that_are_declared_as_degrees_are_told_by_their_steps(arm, logs, seed):
+def test_normalised_positions_declared_as_degrees_are_found_by_their_steps(arm, logs, seed):
     # encoder counts of each motor's calibrated range
     counts = np.random.default_rng(seed).integers(1100, 2600, 2)
     step = np.radians(200 / counts)

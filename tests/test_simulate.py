@@ -304,7 +304,7 @@ class TestInMemory:
             simulate(load_arm(robots / "two_link.urdf"), sample_rate=-1)
         assert str(error.value) == "simulate: sample_rate: got -1, expected greater than 0"
 
-    def test_settings_of_other_steps_are_not_looked_at(self, robots, tmp_path):
+    def test_settings_of_other_steps_are_not_read(self, robots, tmp_path):
         (tmp_path / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
         (tmp_path / "arm.yaml").write_text("training: {nonsense: 1}\nlogs: {units: {q: furlongs}}\n")
         assert len(simulate(load_arm(tmp_path / "arm.urdf"), trajectories=1, duration=0.1)) == 2

@@ -93,7 +93,7 @@ def test_a_known_arm_is_fitted_from_seconds_of_noisy_torque(emitted, robot):
     assert nmse(found, recorded(true, 10.0, 0.0, seed=9)) < min(2e-3, 0.02 * start)
 
 
-def test_without_noise_the_torque_is_met_to_many_digits(emitted):
+def test_without_noise_the_torque_residual_is_negligible(emitted):
     module = emitted["two_link"][0]
     true = drawn(module, seed=3, deviation=0.3)
     found = module.Model()
@@ -214,7 +214,7 @@ def test_the_widths_of_bodies_are_those_of_a_t_distribution(robots):
     assert prior.body_widths[[0, 1, 3]].max() < 1.2 * prior.widths.bodies < 0.5
 
 
-def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
+def test_the_prior_of_a_wrong_urdf_is_widened_with_a_note(emitted):
     module = emitted["six_dof"][0]
     true, fixed, found = drawn(module, seed=2, deviation=0.3), module.Model(), module.Model()
     true.get_parameter(BODIES).data[:, 9] += 3.2  # the mass of every body is 25 times larger
@@ -357,7 +357,7 @@ def test_steps_of_bodies_are_linear_in_their_parameters_and_stay_consistent(emit
     assert (torch.linalg.eigvalsh(parameters(100.0)) > 0).all()
 
 
-def test_a_drive_that_compensates_friction_unseen_is_found_out(emitted):
+def test_friction_compensation_by_a_drive_is_found(emitted):
     module = emitted["six_dof"][0]
     true, found = drawn(module, seed=2, deviation=0.2), module.Model()
     true.raw_friction_compensation[4] = 40.0
@@ -447,7 +447,7 @@ def test_compensation_belongs_to_the_input(emitted):
     torch.testing.assert_close(driven - free, added - model.input_matrix(q) @ model.torque_offset)
 
 
-def test_slow_logs_are_told_to_say_little_of_inertia(emitted):
+def test_slow_logs_get_a_note_on_undetermined_inertia(emitted):
     module = emitted["six_dof"][0]
     true = drawn(module, seed=2, deviation=0.2)
     codes = {}
@@ -827,7 +827,7 @@ def test_a_joint_that_stands_still_keeps_its_friction(robots):
     assert nmse(model, recorded(true, 10.0, 0.0, seed=9)) < 1e-3
 
 
-def test_a_model_says_what_stands_beside_its_bodies(robots):
+def test_a_model_states_its_residual_terms(robots):
     assert terms_in_use(build(robots / "rpr.urdf", "closed-form")) == []
     model = build(robots / "rpr.urdf", "hybrid", width=8)
     assert terms_in_use(model) == []

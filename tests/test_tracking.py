@@ -109,7 +109,7 @@ def test_sines_have_the_stated_frequency():
     np.testing.assert_allclose(path.q[3], path.q[1], atol=1e-12)
 
 
-def test_encoders_count_in_whole_steps_and_miss_less_than_half_a_step(recordings):
+def test_positions_are_whole_encoder_steps_within_half_a_step(recordings):
     settings, kept, _ = recordings
     step = settings.tracking.resolution
     for _, recording in kept:

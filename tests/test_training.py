@@ -176,7 +176,7 @@ def test_the_weak_form_tends_to_zero_with_the_step():
     assert losses[0] / losses[1] < 0.4
 
 
-def test_standing_still_has_loss_one(monkeypatch):
+def test_a_prediction_of_no_motion_has_the_loss_one(monkeypatch):
     def still(model, windows, substeps, solver):
         return tuple(x[:, :1].expand_as(x[:, 1:]) for x in (windows.q, windows.qd))
 
@@ -281,7 +281,7 @@ def test_resuming_drops_epochs_after_the_checkpoint(module, logs, tmp_path):
     assert [record["epoch"] for record in lines(tmp_path / "run")] == [1, 2, 3, 4, 5, 6]
 
 
-def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(module, logs, tmp_path, monkeypatch):
+def test_a_diverging_training_is_rolled_back_at_half_the_rate(module, logs, tmp_path, monkeypatch):
     calls = []
 
     def blown_up_once(model, windows, scales, substeps, solver):
@@ -300,7 +300,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(module, logs, tmp
 
 @pytest.mark.usefixtures("short_epochs")
 @pytest.mark.parametrize("optimizer", ["adamw", "lbfgs"])
-def test_numbers_that_never_recover_end_the_run(module, logs, tmp_path, monkeypatch, optimizer):
+def test_a_training_that_never_recovers_ends(module, logs, tmp_path, monkeypatch, optimizer):
     def blown_up(model, windows, scales, substeps, solver):
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss

@@ -107,7 +107,7 @@ REFUSED = {
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("case", REFUSED)
-def test_logs_that_are_none_are_told_in_our_words(tmp_path, arm, case):
+def test_files_that_are_no_logs_are_spelgen_errors(tmp_path, arm, case):
     make, message = REFUSED[case]
     with pytest.raises(LogError, match=message) as caught:
         check_logs(read_logs(make(tmp_path), arm), arm)
