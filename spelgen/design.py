@@ -124,16 +124,16 @@ def _conflicts(values: Mapping[str, object]) -> Iterator[tuple[str, str, str]]:
     if rigid != (values["potential"] == "closed-form"):
         yield "mass", "potential", "rigid bodies give both: name closed-form for both or for neither"
     if rigid != (values["dissipation"] == "constants"):
-        yield "mass", "dissipation", "dissipation: constants goes with mass: closed-form, and with it alone"
+        yield "mass", "dissipation", "dissipation: constants and mass: closed-form require each other"
     if values["memory"] == "bristles" and not rigid:
-        yield "memory", "dissipation", "bristles go with dissipation: constants"
+        yield "memory", "dissipation", "bristles require dissipation: constants"
     if values["net"] == "none" and not rigid:
-        yield "mass", "net", "net: none goes with mass: closed-form alone"
+        yield "mass", "net", "net: none requires mass: closed-form"
     if (values["net"] == "none") != (values["encoding"] == "none"):
         yield "net", "encoding", "encoding is the input of networks: none for a model without networks"
     if rigid and values["net"] == "kan":
         yield "mass", "net", "residual networks in addition to rigid bodies need net: mlp"
     if rigid and values["encoding"] == "lie-group":
-        yield "mass", "encoding", "residual terms beside rigid bodies need encoding: joint"
+        yield "mass", "encoding", "residual terms of rigid bodies need encoding: joint"
     if rigid and values["input"] != "derived":
-        yield "mass", "input", "input: derived goes with mass: closed-form"
+        yield "mass", "input", "mass: closed-form requires input: derived"

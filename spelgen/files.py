@@ -258,5 +258,5 @@ def _inside(folder: Path, name: str, address: str) -> Path:
     """
     path = folder / name
     if folder.resolve() not in path.resolve().parents:
-        raise SpelgenError(f"the key {name!r}", file=address, expected="keys inside the address alone")
+        raise SpelgenError(f"the key {name!r}", file=address, expected="only keys inside the address")
     return path

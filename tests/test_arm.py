@@ -150,7 +150,7 @@ class TestChain:
             (
                 {"joints": ["m"]},
                 "FILE:1: joint 'm': got a mimic joint, expected its leader; name 'a' instead: "
-                "what follows it moves with it",
+                "its mimic joints move with it",
             ),
             ({"joints": ["a", "a"]}, "FILE: got the joint 'a' twice, expected each joint once"),
             (
@@ -158,9 +158,12 @@ class TestChain:
                 "FILE:1: got the joints 'b' and 'a', which lie on different branches, "
                 "expected joints on one path from the root",
             ),
-            ({"joints": []}, "FILE: got no joint that moves by itself, expected a serial chain of joints"),
+            (
+                {"joints": []},
+                "FILE: got no joint that moves independently, expected a serial chain of joints",
+            ),
             ({"tip": "9"}, "FILE: no link is named '9'; known are '0', '1', '2', '3', '4'"),
-            ({"tip": "0"}, "FILE: got no joint that moves by itself, expected a serial chain of joints"),
+            ({"tip": "0"}, "FILE: got no joint that moves independently, expected a serial chain of joints"),
             ({"tip": "1", "joints": ["a"]}, "FILE: got both joints and a tip, expected one of the two"),
             (
                 {"tip": "1", "angle_tolerance": -1},

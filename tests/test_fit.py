@@ -161,7 +161,7 @@ def test_torques_are_fitted_predicted_and_scored():
     assert result.torque["model"].mean_nmse == pytest.approx(1 - found.score([test]), rel=1e-6)
     constant = Trajectory(test.t, test.q, test.qd, np.ones_like(test.tau), "constant")
     assert found.predict(constant).shape == test.tau.shape
-    with pytest.raises(LogError, match="no motion to judge torques on"):
+    with pytest.raises(LogError, match="no motion for an evaluation of torques"):
         found.score(motions())
 
 

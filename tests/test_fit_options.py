@@ -48,9 +48,9 @@ def test_an_option_applies_or_the_error_names_its_objective(option, objective, r
         several = "objectives" if len(owners) > 1 else "objective"
         told = f"{option}: belongs to the {several} {' and '.join(owners)}, this fits {objective}"
     elif rigid_bodies and objective == "momentum":
-        told = "objective: momentum belongs to models of networks alone, this is one of rigid bodies"
+        told = "objective: momentum is for models that consist of networks; this model has rigid bodies"
     elif option in (OF_NETWORKS if rigid_bodies else OF_CLOSED_FORM).get(objective, ()):
-        kind = "models of networks alone" if rigid_bodies else "models of rigid bodies"
+        kind = "models that consist of networks" if rigid_bodies else "models of rigid bodies"
         told = f"{option}: with the objective {objective} belongs to {kind}"
     else:
         config = make()
@@ -115,7 +115,7 @@ def test_a_sidecar_names_its_line(sidecar):
     with pytest.raises(SettingsError) as caught:
         assert load_settings(path).training.options
     assert str(caught.value) == (
-        "arm.yaml:4: training.window: got 7, expected nothing beside 'objective: torque': "
+        "arm.yaml:4: training.window: got 7, expected no value with 'objective: torque': "
         "this belongs to momentum and rollout"
     )
     path = sidecar("training:\n  window: 7\n  weight_decay: 0.1\n  cutoff: 5\n  decimation: 2\n")
@@ -140,11 +140,14 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
         told == "Error: --set learning_rate: belongs to the objectives momentum and rollout, this fits torque"
     )
     told = refused(module, *data, "--objective", "torque", "--set", "urdf_weight=0")
-    assert told == "Error: --set urdf_weight: with the objective torque belongs to models of networks alone"
+    assert (
+        told
+        == "Error: --set urdf_weight: with the objective torque belongs to models that consist of networks"
+    )
     told = refused(module, *data, "--objective", "momentum")
     assert (
         told
-        == "Error: --objective: momentum belongs to models of networks alone, this is one of rigid bodies"
+        == "Error: --objective: momentum is for models that consist of networks; this model has rigid bodies"
     )
     networks = write_module(tmp_path, "networks.py")
     told = refused(networks, *data, "--set", "evaluations=40")

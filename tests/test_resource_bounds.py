@@ -142,7 +142,7 @@ CASES = {
         lambda: chain(300, general), None, ("--joints", ",".join(f"j{k}" for k in range(50, 301, 50)))
     ),
     "2000 links fixed in a row": Case(
-        lambda: chain(1999, general, kind="fixed"), "no joint that moves by itself"
+        lambda: chain(1999, general, kind="fixed"), "no joint that moves independently"
     ),
     "2000 links around one": Case(lambda: star(2000, "continuous"), "1999 chains of 1 joints"),
     "2000 links fixed around one": Case(

@@ -97,7 +97,7 @@ def test_paths_of_excitation_go_from_rest_to_rest_within_range_and_speed(loaded)
 
 
 def test_options_of_sines_are_refused_for_excitation():
-    with pytest.raises(ValueError, match="amplitude and frequency of sines, beside paths: excitation"):
+    with pytest.raises(ValueError, match="amplitude and frequency of sines, with paths: excitation"):
         TrackingSettings(paths="excitation", amplitude=0.2, frequency=0.5)
 
 
@@ -217,7 +217,7 @@ def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
     [
         (
             {"control_rate": 150.0},
-            "tracking.control_rate: got 150 Hz beside samples at 500 Hz, expected a rate of which "
+            "tracking.control_rate: got 150 Hz with samples at 500 Hz, expected a rate of which "
             "simulation.sample_rate is a multiple",
         ),
         (

@@ -89,7 +89,7 @@ def csv_of_a_long_name(folder: Path) -> Path:
 
 
 COUNTS = np.arange(SAMPLES)
-DATES = "column t: got dates beyond what nanoseconds count"
+DATES = "column t: got dates beyond the range of nanosecond stamps"
 LARGE = r"row \d+, column t: got 1e\+300 in SI units .* expected a number below 1e\+24"
 VANISHING = r"t: got \S+ s after 0 s, expected increasing times"
 REFUSED = {

@@ -177,7 +177,7 @@ DOCUMENTS = {
         '\n<?xml version="1.0"?>\n<robot name="r"/>',
         "FILE:2: got text or blank lines before the XML declaration, expected <?xml ...?> at the very "
         "start of the "
-        "file; delete what stands before it",
+        "file; delete the text before it",
     ),
     "unbound prefix": (
         '<robot name="r">\n<sensor:camera/></robot>',

@@ -54,7 +54,7 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
         chain = _longest(robot)
     if not chain.joints:
         expected = "a serial chain of joints"
-        raise ArmError("no joint that moves by itself", file=robot.source, expected=expected)
+        raise ArmError("no joint that moves independently", file=robot.source, expected=expected)
     # A mobile base has a floating joint between the root and the arm. This is not an error: the arm is described
     # relative to the base.
     below = robot.path_to(chain.joints[0].parent)
@@ -139,7 +139,7 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
     got, expected, do = f"a {joint.type} joint", "a revolute, continuous or prismatic joint", None
     if joint.moves:
         got, expected = "a mimic joint", "its leader"
-        do = f"name {leaders(robot)[name].leader.name!r} instead: what follows it moves with it"
+        do = f"name {leaders(robot)[name].leader.name!r} instead: its mimic joints move with it"
     element = f"joint {name!r}"
     raise ArmError(got, file=robot.source, line=joint.line, element=element, expected=expected, do=do)
 

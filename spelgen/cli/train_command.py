@@ -40,7 +40,7 @@ def train(
     force: bool = options.FORCE,
     source: Path | None = option("RUN", "Adapt the model of this run; replaces MODULE.", "--from"),
     objective: Objective | None = option(
-        "", "Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."
+        "", "Default: torque for rigid bodies; rollout, after momentum steps, for networks."
     ),
     assignments: list[str] | None = option(
         "KEY=VALUE", "Set an option of the fit, e.g. epochs=50; repeat it for more options.", "--set"

@@ -268,10 +268,10 @@ class GeometryProblem:
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the penalty for negative rotor inertias, and for friction that drives the motion on average.
 
-        A violation adds half of its squared standard score to the cost, up to a bound. The bound is needed since a
-        drive may compensate friction, and since errors of the friction model may resemble inertia: fits of recorded
-        arms have friction that drives the motion (joint 6 of one arm of benchmarks/recordings.py) or a negative rotor
-        inertia (another arm), but not both.
+        Each of both violations adds half of its squared standard score to the cost, up to a bound. The bound is needed,
+        since the right hypothesis may have one violation: a drive may compensate friction, and errors of the friction
+        model may resemble inertia. Of the arms of benchmarks/recordings.py, one has friction that drives the motion
+        (joint 6), another one has a negative rotor inertia, and none has both.
 
         Args:
             x: (K,) parameters.

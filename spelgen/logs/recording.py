@@ -245,7 +245,8 @@ def _order_in_time(rows: Rows) -> None:
     Raises LogError for a clock that restarts, and for times that cannot be reconstructed.
     """
     rows.leave_out(_is_timeless(rows.t), "left out, with times far from those of all other rows")
-    # Times that are dates are counted from the first row: the reader does so only if the first row has a time.
+    # Times that are dates (seconds since 1970) are converted to seconds since the first row with a time. The reader of
+    # the file has done so before, except if its first row has no time.
     if len(rows.t) and abs(rows.t[0]) > 1e8:
         rows.t[:] -= rows.t[0]
     late = int(np.count_nonzero(np.diff(rows.t) < 0))

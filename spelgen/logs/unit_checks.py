@@ -92,7 +92,8 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     The settings with the smallest distance are the most plausible ones. The distance is |log r|, with r the ratio of
     dq/dt to qd in these units, plus a penalty for units other than SI.
 
-    is_far: True if the range of q is more than two turns; combinations in which q exceeds two turns are then omitted.
+    is_far: True if q, read in rad, has a range of more than two turns, so that rad is implausible. Only units in which
+    q is at most two turns are then considered.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
     # The ratio r of dq/dt to qd is known only if velocities were logged and are proportional to dq/dt. If it is

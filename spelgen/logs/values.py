@@ -126,7 +126,7 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
         return times.cast(counted).cast(pa.int64()), TIMES["ns"]
     except pa.ArrowInvalid as error:
         raise LogError(
-            f"dates beyond what nanoseconds count ({times.type})", file=layout.file, element=f"column {name}",
+            f"dates beyond the range of nanosecond stamps ({times.type})", file=layout.file, element=f"column {name}",
             expected="years from 1678 to 2262", do="check the unit of the stamps",
         ) from error  # fmt: skip
 

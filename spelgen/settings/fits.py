@@ -131,9 +131,9 @@ class FitConfig(Group):
         # The momentum objective does not apply to models of rigid bodies, which are fitted to torques directly.
         if rigid_bodies and self.objective == "momentum":
             raise OptionError(
-                "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
+                "objective", "momentum is for models that consist of networks; this model has rigid bodies"
             )
-        models = "models of networks alone" if rigid_bodies else "models of rigid bodies"
+        models = "models that consist of networks" if rigid_bodies else "models of rigid bodies"
         for name in self.unused(rigid_bodies=rigid_bodies):
             if name in self.model_fields_set:
                 raise OptionError(name, f"with the objective {self.objective} belongs to {models}")

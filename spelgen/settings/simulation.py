@@ -102,5 +102,5 @@ class TrackingSettings(Group):
         # `amplitude` and `frequency` with excitation motions are an error: they have no effect on these motions.
         sines = {"amplitude", "frequency"} & self.model_fields_set
         if self.paths == "excitation" and sines:
-            raise ValueError(f"{' and '.join(sorted(sines))} of sines, beside paths: excitation")
+            raise ValueError(f"{' and '.join(sorted(sines))} of sines, with paths: excitation")
         return self

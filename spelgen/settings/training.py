@@ -59,7 +59,7 @@ class TrainingSettings(Group):
         objective, owners = info.data.get("objective"), OWNERS.get(str(info.field_name))
         if objective and owners and objective not in owners:
             raise ValueError(
-                f"nothing beside 'objective: {objective}': this belongs to {' and '.join(owners)}"
+                f"no value with 'objective: {objective}': this belongs to {' and '.join(owners)}"
             )
         return value
 

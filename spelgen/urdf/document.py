@@ -115,7 +115,7 @@ def _refuse_damage(path: Path, data: bytes) -> None:
     if data.lstrip().startswith(b"<?xml") and not data.startswith(b"<?xml"):
         raise UrdfError(
             "text or blank lines before the XML declaration", file=path, line=_line_of(data, data.index(b"<?xml")),
-            expected="<?xml ...?> at the very start of the file", do="delete what stands before it",
+            expected="<?xml ...?> at the very start of the file", do="delete the text before it",
         )  # fmt: skip
     # DOCTYPE and ENTITY declarations are refused before parsing: an entity could expand to gigabytes, or read another
     # file.

@@ -155,9 +155,9 @@ def _lint_groups(robot: Robot, moving: Sequence[UrdfJoint]) -> Iterator[Finding]
         where, line = f"link {joint.child!r}", robot.link[joint.child].line
         if not inertials:
             message = (
-                f"joint {joint.name!r} moves it, but neither it nor what is fixed to it has an <inertial>"
+                f"joint {joint.name!r} moves it, but neither it nor a link fixed to it has an <inertial>"
             )
             yield "missing-inertial", where, line, message
         elif not any(inertial.mass for inertial in inertials):
-            message = f"joint {joint.name!r} moves it, but it and what is fixed to it have no mass"
+            message = f"joint {joint.name!r} moves it, but it and the links fixed to it have no mass"
             yield "massless-moving-link", where, line, message

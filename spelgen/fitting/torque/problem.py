@@ -278,10 +278,11 @@ class TorqueEstimate:
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
     def linearize(self) -> tuple[ResidualSamples, RigidProjection]:
-        """Return the torque residual, and the projection of joint torques onto the rigid-body and friction model.
+        """Return the torque residual at the estimate, and a `RigidProjection` for torques of residual terms.
 
-        The covariance must be current (see `with_current_covariance`). With the covariance for a larger noise, the
-        projection would remove too much of a torque.
+        The projection computes the part of a joint torque that the rigid-body and friction model would absorb. The
+        posterior covariance of the parameters must be current (see `with_current_covariance`): with the covariance for
+        a larger noise, this part would be too large.
         """
         jacobian, x = self.problem.jacobian, self.state.x
         projection = jacobian.rigid_projection(x, self.problem.noise, self.covariance)
