@@ -6,7 +6,7 @@ import numpy as np
 
 from spelgen.logs.dynamics_samples import DynamicsSamples
 
-# of the arm, the data determine only a gravity of 3 m/s^2 for links of 1 m: masses and inertias are assumed
+# the data determine a gravity of 3 m/s^2 for links of 1 m, and nothing else: masses and inertias are assumed
 URDF = """<robot name="planar">
   <link name="base"/>
   <link name="upper"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>

@@ -72,7 +72,7 @@ def test_the_seed_decides_everything(robots, tmp_path):
 
 
 def test_logs_are_the_inverse_dynamics_of_the_truth(robots, tmp_path):
-    """Without noise, encoder steps and friction, logged torques are Pinocchio's inverse dynamics of that URDF."""
+    """Without noise, encoder steps and friction, logged torques are the inverse dynamics of the as-built URDF."""
     true = spelgen.as_built(spelgen.load_arm(robots / "scara.urdf"), 5, tmp_path / "as_built.urdf")
     sidecar = tmp_path / "as_built.yaml"
     settings = yaml.safe_load(sidecar.read_text())
@@ -85,7 +85,7 @@ def test_logs_are_the_inverse_dynamics_of_the_truth(robots, tmp_path):
     model = pin.buildModelFromUrdf(str(tmp_path / "as_built.urdf"))
     model.armature = np.array([true.settings.joint(name).armature for name in true.chain.joint_names])
     data, qdd = model.createData(), np.gradient(log.qd, log.t, axis=0)
-    # without the ends of the log, at which the low-pass filter and differences are inaccurate
+    # the ends of the log are omitted, at which the low-pass filter and differences are inaccurate
     rows = range(50, len(log) - 50)
     tau = np.array([pin.rnea(model, data, log.q[k], log.qd[k], qdd[k]) for k in rows])
     np.testing.assert_allclose(log.tau[50:-50], tau, atol=2e-3 * np.abs(tau).max())

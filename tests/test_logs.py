@@ -271,7 +271,7 @@ DEGREES = {
 
 @pytest.mark.parametrize("case", DEGREES)
 def test_degrees_are_refused(case):
-    """Positions in degrees are one error about all joints, with the line that corrects all of them."""
+    """Positions in degrees are one error about all joints, with one line that corrects all joints."""
     trajectory, message, units = DEGREES[case]
     with pytest.raises(LogError) as caught:
         check([trajectory], JOINTS, ("revolute", "revolute"))

@@ -88,7 +88,10 @@ def test_distances_and_their_gradient_are_those_of_spheres(urdf):
 
 
 def test_motion_and_approach_keep_the_clearance_at_all_times(urdf):
-    """A motion planned with floor and wall keeps clear of them, between samples too; planned without, it hits them."""
+    """A motion that is planned with a floor and a wall never touches the floor or the wall, between samples either.
+
+    A motion that is planned without them hits them.
+    """
     blind = excite(load_arm(urdf), **QUICK, start=[0, 0.5, 0.5])
     assert clearances(blind.motion.q).min() < -0.05
     assert blind.collisions == "Checked: 3 pairs of links, approach included; all keep 10 mm."

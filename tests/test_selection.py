@@ -204,7 +204,7 @@ def test_repeated_samples_count_once():
 def test_bayesian_ridge_maximizes_the_marginal_likelihood():
     """Hyperparameters of the Bayesian ridge regression are a numerical maximum of the marginal likelihood.
 
-    There are two groups of parameters, one of them without effect.
+    There are two groups of parameters, one of which has no effect.
     """
     rng = np.random.default_rng(0)
     x = rng.normal(size=(2000, 12))

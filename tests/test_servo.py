@@ -235,7 +235,7 @@ def test_reported_intervals_cover_the_truth(fitted):
 
 
 def servo_truth(servos, q):
-    """Return the true values of `servo_values` for these servos."""
+    """Return the true gravity torque / kp at q (T, 2), and the elbow's true inertia / kp, of simulated servos."""
     first, second = (np.sin(q[:, 0]), np.sin(q[:, 0] + q[:, 1]))
     weight = GRAVITY * np.array([MASS[0] * COM[0] + MASS[1] * LENGTH, MASS[1] * COM[1]])
     gravity = np.stack([weight[0] * first + weight[1] * second, weight[1] * second], axis=1)

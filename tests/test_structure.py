@@ -44,7 +44,7 @@ def test_rpr_has_the_structure_of_the_paper(robots):
 
 
 def test_a_planar_chain_separates_shared_functions():
-    """The outputs of a planar 3R arm separate functions of q2, q3 and q2 + q3, although M_11 contains all of them."""
+    """The outputs of a planar 3R arm are separate functions of q2, q3 and q2 + q3, although M_11 is their sum."""
     structure = derive(planar(3))
     assert [output.joints for output in structure.outputs] == [(2,), (1,), (1, 2)]
     assert len(structure.constants) == 3

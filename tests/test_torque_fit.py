@@ -741,9 +741,9 @@ def test_negligible_friction_does_not_vary_with_position(robots):
 
 
 def test_a_spring_that_bodies_could_absorb_is_found(emitted, robots):
-    """A spring is found although rigid bodies can explain much of its torque in few logs.
+    """A spring is found although rigid bodies can explain much of the spring's torque in few logs.
 
-    In other logs the bodies explain nothing of it.
+    In other logs the bodies explain nothing of this torque.
     """
     true, joint = drawn(emitted["six_dof"][0], seed=3, deviation=0.3), 4
     stiffness = 2 * recorded(true, 3.0, 0.0).tau[:, joint].std()

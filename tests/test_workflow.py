@@ -48,7 +48,7 @@ def run_workflow(urdf, folder, settings, monkeypatch, judged=True):
 @pytest.mark.parametrize("name", OWN)
 def test_every_command_works_for_the_robots_here(name, robots, tmp_path, monkeypatch):
     settings = yaml.safe_load((robots / f"{name}.yaml").read_text())
-    # with the simulated inputs of the settings, for a shorter time
+    # the simulated inputs are the ones of the settings, for a shorter time
     settings.pop("tracking", None)
     driven = "inputs" in settings["simulation"]
     settings["simulation"] = settings["simulation"] | {"trajectories": 2} if driven else SHORT
