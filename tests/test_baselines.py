@@ -238,7 +238,7 @@ def test_least_squares_is_kept_with_a_run_and_evaluated(robots, tmp_path):
     assert found["horizons"][-1]["errors"]["least squares"]["mean_relative_rms"] < 0.05
     (trace,) = found["traces"]["torques"]
     parts = sum(np.array(part) for part in trace["parts"].values())
-    # up to the torque offset, which is not listed
+    # the parts sum to the prediction, except the torque offset, which is not listed
     np.testing.assert_allclose(parts, trace["predicted"]["model"], atol=0.05)
     energy = {name: np.array(x) for name, x in trace["energy"].items()}
     left = energy["work of the drives"] - energy["stored"] - energy["friction"] - energy["not explained"]
