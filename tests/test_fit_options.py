@@ -32,7 +32,7 @@ OF_NETWORKS = {"torque": {"evaluations", "weight_decay", "urdf_weight"}}
 
 def test_every_option_has_a_value_here_and_a_place_in_the_settings():
     assert OWNERS.keys() == VALUES.keys()
-    in_a_file = OWNERS.keys() - {"adapt"}  # of one run, not of a robot
+    in_a_file = OWNERS.keys() - {"adapt"}  # `adapt` belongs to one run, not to a robot, and is no setting
     assert in_a_file <= TrainingSettings.model_fields.keys()
     beside = {"objective", "cutoff", "decimation", "gap", "torque_delay", "validation_fraction", "seed"}
     assert TrainingSettings.model_fields.keys() == in_a_file | beside
@@ -159,7 +159,7 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_goes_on_with_its_own_options(tmp_path):
+def test_a_resumed_run_keeps_its_options(tmp_path):
     logs, run = tmp_path / "train.parquet", tmp_path / "run"
     write_logs(logs, motions(), JOINTS)
     train = [
@@ -194,7 +194,7 @@ def test_a_name_in_place_of_a_configuration_is_reported(robots):
 
 
 def test_logs_are_read_for_the_choice_of_an_objective_only_if_it_depends_on_them(robots):
-    """An option that does not apply is reported before logs are read, which may take long."""
+    """An option that does not belong to the objective is reported before the logs are read, which may take long."""
 
     def unread():
         raise AssertionError("the logs were read")
