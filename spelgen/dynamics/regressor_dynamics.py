@@ -112,7 +112,7 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the quantities of the B bodies that depend only on q (configuration cache), and momentum derivatives.
+        """Return the configuration cache of the B bodies (quantities that depend only on q), and momentum derivatives.
 
         q: (..., n). The derivatives of the bodies' momenta with respect to qd are (..., n, 12 B). The momentum of a body
         is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and its pseudo-inertia J.
