@@ -115,8 +115,8 @@ class RegressorDynamics:
         """Return the configuration cache of the B bodies (quantities that depend only on q), and momentum derivatives.
 
         q: (..., n). The derivatives of the bodies' momenta with respect to qd are (..., n, 12 B). The momentum of a
-        body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and its pseudo-
-        inertia J.
+        body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and its
+        pseudo-inertia J.
         """
         # The kinetic energy of a body, 1/2 tr(T' J T'^T), is linear in its pseudo-inertia J, so J may be physically
         # inconsistent. `chain.forward` returns the transforms T times four given points; the columns of the identity as
