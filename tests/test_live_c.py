@@ -1,4 +1,4 @@
-"""The C estimator equals the Python one along recorded logs, keeps its times, and survives hostile samples."""
+"""The C estimator equals the Python estimator along logs, is fast enough, and gives finite results for any sample."""
 
 import shutil
 from pathlib import Path
@@ -30,7 +30,7 @@ PLAIN = "-O0"
 
 
 def randomised(urdf, preset="hybrid"):
-    """A model with all terms: its parameters moved by small random numbers."""
+    """Return a model with small random numbers added to all parameters, so that no term is zero."""
     model = build(urdf, preset).double()
     random = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -51,7 +51,7 @@ def require_equal(found: Columns, states: list[EstimatorState], tolerance: float
 
 
 def segments(files: list[Path], arm: Arm) -> Trajectory:
-    """Return a segment of each of the logs in a row, of all together about SAMPLES samples, with gaps of a second."""
+    """Return one log of segments of several recordings, about SAMPLES samples in total, with gaps of a second."""
     columns: list[list[np.ndarray]] = []
     end, count = 0.0, SAMPLES // len(files)
     for (log,) in (read_logs([file], arm) for file in files):
@@ -64,7 +64,10 @@ def segments(files: list[Path], arm: Arm) -> Trajectory:
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_c_equals_python_along_recordings(name, tmp_path):
-    """With an unfitted model, noise as large as its residuals, and delayed torques: every part is busy."""
+    """C and Python estimators give equal outputs along recordings, in conditions that use each part of the estimator.
+
+    The model is not fitted, the noise is as large as its residuals, and torques are delayed.
+    """
     urdf = SHARED / ("arms/panda_erd.urdf" if name == "panda" else f"logs/{name}/{name}.urdf")
     files = sorted((SHARED / "logs" / name).glob("*.parquet"))
     if not files:
@@ -85,7 +88,10 @@ def test_c_equals_python_along_recordings(name, tmp_path):
 
 
 def test_c_equals_python_with_couplings_and_hostile_samples(tmp_path):
-    """A mimic joint, a prismatic one, coupled motors and a passive joint, unusable samples, and early torques."""
+    """C and Python estimators give equal outputs with mimic and prismatic joints, coupled motors and a passive joint.
+
+    Some samples are unusable, and torques are early.
+    """
     (tmp_path / "arm.urdf").write_text(COUPLED)
     (tmp_path / "arm.yaml").write_text(MOTORS)
     model = randomised(tmp_path / "arm.urdf", "closed-form")
@@ -113,7 +119,7 @@ def test_c_equals_python_for_friction_without_a_state(tmp_path):
 
 
 def motion_of(model, seconds: float) -> Trajectory:
-    """A smooth motion with the torques of the model."""
+    """Return a log of a smooth motion with the torques of the model."""
     q, qd, qdd = smooth_motion(model.n, seconds, np.random.default_rng(3))
     state = [bristles_along(q, bristle_reach(model))] if model.elements else []
     with torch.no_grad():
@@ -124,7 +130,7 @@ def motion_of(model, seconds: float) -> Trajectory:
 
 
 def hostile(log: Trajectory, count: int | None = None) -> tuple[np.ndarray, ...]:
-    """Samples of a log, repeated to a number of samples, of which one in five is not usable."""
+    """Return times and samples of a log, repeated up to `count` samples, of which one in five is unusable."""
     random = np.random.default_rng(5)
     rows = np.arange(count or len(log)) % len(log)
     laps = np.arange(len(rows)) // len(log)
@@ -140,8 +146,8 @@ def hostile(log: Trajectory, count: int | None = None) -> tuple[np.ndarray, ...]
     t[kinds == 5] -= 0.5
     t[1:][kinds[1:] == 6] = t[:-1][kinds[1:] == 6]
     tau[kinds == 7] = 1e9
-    t[len(t) // 2 :] += 3.0  # a gap
-    t[2 * len(t) // 3 :] -= 5.0  # a clock that is set back
+    t[len(t) // 2 :] += 3.0  # a gap of 3 s in the times
+    t[2 * len(t) // 3 :] -= 5.0  # the clock is set back by 5 s
     return t, q, qd, tau
 
 
@@ -158,7 +164,7 @@ def test_a_million_hostile_samples_give_finite_estimates():
         rows = slice(start, start + 10**5)
         found = compiled.run(t[rows], q[rows], qd[rows], tau[rows])
         for name, values in vars(found).items():
-            # an upper limit of the mass is infinite before the first report
+            # the upper limit of the mass is infinite before the first report
             assert np.isfinite(values[found.limit < np.inf] if name == "limit" else values).all(), name
         total += len(found.mass)
     counts = compiled.refused()
@@ -195,7 +201,7 @@ def test_a_state_saved_during_a_contact_is_restored_and_a_damaged_one_is_not():
     state = compiled.saved()
     compiled.start()
     assert compiled.restore(state)
-    # a clock that starts again, with all that was found; the contact lasts for another second
+    # after `restore`, times may start at zero again, and all estimates are kept; the contact lasts for another second
     tau = log.tau - push * (log.t < log.t[0] + 1.0)[:, None]
     after = compiled.run(log.t[:300], log.q[:300], log.qd[:300], tau[:300])
     assert (after.refusal == 0).all()
@@ -225,7 +231,7 @@ def test_a_run_with_noise_levels_exports_the_estimator(tmp_path):
 
 
 def test_step_and_report_take_microseconds(tmp_path):
-    """At most 5 us a step of seven joints and 1 ms a report on a desktop; ten times as long on a loaded machine."""
+    """A step of seven joints takes at most 5 us and a report 1 ms; limits are ten times larger for loaded machines."""
     urdf = Path(__file__).parents[1] / "robots" / "panda.urdf"
     model = randomised(urdf, "closed-form")
     log = motion_of(model, 20.0)
