@@ -172,7 +172,7 @@ def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
     # predictions of more than 0.3 s ahead do not include the disturbance
     later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
     np.testing.assert_allclose(found - later, estimator.drift.x[:, 1], atol=1e-9)
-    # Before its first report, the payload is an external torque, to be compensated if the user wants it.
+    # Before its first report, the payload is an external torque, which `compensate_external` compensates.
     part, k = dataclasses.replace(log, tau=tau)[:180], 179
     for compensated in (False, True):
         early = Estimator(load_run(run), levels=levels, compensate_external=compensated)
