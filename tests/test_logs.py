@@ -191,9 +191,9 @@ BAD = {
     ),
     "time-back": (
         HEADER + "0,0,0,0\n0.1,1,0,0\n0.2,2,0,0\n0.05,3,0,0\n",
-        "{}:5: row 4, column t: got t = 0.05 s after 0.2 s (1 such steps, this is the first), "
+        "{}:5: row 4, column t: got t = 0.05 s after 0.2 s (1 such step, this is the first), "
         "expected increasing times; "
-        "sort the rows, drop repeats, or split recordings by a column 'trajectory'",
+        "number the recordings, in Python: log['trajectory'] = (log['t'].diff() < 0).cumsum()",
     ),
 }
 

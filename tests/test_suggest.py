@@ -66,6 +66,40 @@ def test_numbered_columns_with_set_points_and_without_velocities(scara, tmp_path
     assert text.count("gain: 1.0 # Nm per A at the joint, the gear included: write its value") == 4
 
 
+@pytest.mark.parametrize("derivative", ["D_Theta_{}", "theta_dot_{}", "dtheta{}"])
+def test_derivatives_of_positions_are_velocities(scara, tmp_path, derivative):
+    """Names of public simulations and of MATLAB; accelerations are not used."""
+    names = ["Theta_{}", derivative, "Torque_{}", "DD_Theta_{}", "theta_ddot_{}"]
+    head = ["Time", *(name.format(k) for name in names for k in range(4))]
+    rows = np.column_stack([T, Q, QD, TAU, -Q, -Q])
+    found, text = suggested(written(tmp_path / "log.csv", head, rows), scara)
+    require_same(found)
+    assert "differentiated" not in text
+
+
+def test_rows_without_times_get_a_rate_to_write(scara, tmp_path):
+    head = [f"{x}{k}" for x in ("q", "tau") for k in range(4)]
+    path = written(tmp_path / "log.csv", head, np.column_stack([Q, TAU]))
+    text = suggest_mapping(path, scara.chain.joint_names).text
+    assert "sample_rate: # [Hz] of the rows" in text
+    (tmp_path / "map.yaml").write_text(text)
+    with pytest.raises(LogError, match="or 'sample_rate: HZ' if there is none"):
+        read_logs(path, scara, tmp_path / "map.yaml")
+    (tmp_path / "map.yaml").write_text(text.replace("sample_rate:", "sample_rate: 125"))
+    (found,) = read_logs(path, scara, tmp_path / "map.yaml")
+    np.testing.assert_allclose(found.t, T, atol=1e-12)
+    np.testing.assert_array_equal(found.tau, TAU)
+
+
+def test_a_file_of_torques_only_is_to_be_joined_with_the_positions(scara, tmp_path):
+    head = ["t", *(f"- {name}_effort" for name in scara.chain.joint_names)]
+    path = written(tmp_path / "effort.csv", head, np.column_stack([T, TAU]))
+    with pytest.raises(LogError, match=r"no positions .*join files with a signal each .*merge\(pandas.read_csv"):
+        suggest_mapping(path, scara.chain.joint_names)
+    with pytest.raises(LogError, match="or write their names under 'logs'"):  # and not: rename effort to q
+        read_logs(path, scara)
+
+
 PUBLIC = {
     "libfranka": ("time", "q[{}]", "dq[{}]", "tau_J[{}]", "O_T_EE[{}] q_d[{}] dq_d[{}] tau_J_d[{}] dtau_J[{}] "
                   "tau_ext_hat_filtered[{}]"),
@@ -129,7 +163,7 @@ def test_columns_of_another_arm_are_listed(scara, tmp_path):
     rows = np.column_stack([T, 0 * Q, 0 * QD, 0 * TAU, Q, QD, TAU])
     found, text = suggested(written(tmp_path / "log.csv", ["t", *sides], rows), scara)
     require_same(found)
-    assert f"# not used: left_pos_{names[0]}, left_pos_{names[1]}" in text
+    assert f"# not used for q: left_pos_{names[0]} ... left_pos_{names[-1]}\n" in text
 
 
 @pytest.mark.parametrize(("unit", "name"), [("%", "percent"), ("‰", "permille"), ("A", "A")])

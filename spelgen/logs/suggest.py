@@ -8,6 +8,7 @@ import difflib
 import json
 import re
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
+from spelgen.labels import listed
 from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
 from spelgen.logs.tables import SERVO_ADVICE, names_joint, reading
@@ -38,6 +40,7 @@ COMMANDED = {
 # Words in names of signals other than measured joint signals.
 NOT_MEASURED = COMMANDED | {
     "error", "std", "external", "ext", "tcp", "ee", "eef", "cartesian", "tool", "contact", "gravity", "friction",
+    "dd", "ddot",
 }  # fmt: skip
 MEASURED = {"actual", "act", "measured", "meas", "present", "feedback", "fb", "ist"}
 # For each quantity: units as written in column names, in lower case, and the corresponding units of a mapping.
@@ -53,6 +56,12 @@ UNITS = {
 }  # fmt: skip
 # Letters that are units only in brackets: without brackets they may be part of a name.
 BARE = {"s", "n", "a", "m"}
+# Names of derivatives of positions, such as `d_theta` and `q_dot`.
+DERIVATIVE = r"(?<![^\W\d_])(?:d[ _]?(?:theta|pos|q)|(?:theta|pos|q)[ _]?dot)(?![^\W\d_])"
+JOINING = (
+    "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
+    "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
+)
 CURRENT = {"current", "currents", "curr", "cur", "strom"}
 
 
@@ -75,7 +84,8 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     """Return a draft of the mapping for a log file.
 
     commands: True if the log contains commanded positions instead of torques. Raises LogError if the file cannot be
-    read, if it has no column of times, or commanded positions and no torques without `commands`.
+    read, if all its columns are of positions or of torques only, or of commanded positions and no torques without
+    `commands`.
     """
     log_format = format_of(file)
     if log_format is LEROBOT:
@@ -90,17 +100,16 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     columns = [_column_name(name, {"time"} if name in dates else set()) for name in _names(table)]
     columns_of = _by_quantity(columns, commands, joints)
-    if not columns_of["t"]:
-        got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
-        do = "name it so, or write 'columns' and 'sample_rate' under 'logs' if there is none and rows are evenly spaced"
-        raise LogError(got, file=file, expected="one of times, called t or time", do=do)
     # The register "load" of a servo is no torque.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
     if not commands and not torques and len(_by_quantity(columns, True, joints)["u"]) >= len(joints):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
     # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
     # measurement. Without a stamp, the name with the fewest words is used.
-    clock = min(columns_of.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
+    clocks = columns_of.pop("t")
+    clock = min(
+        clocks, key=lambda x: ("header" not in x.words, len(x.words)), default=ColumnName("t", set(), "s")
+    )
     stamp = re.sub(r"secs?$", "", clock.name)
     nanoseconds = [x.name for x in columns if re.fullmatch(rf"{re.escape(stamp)}n(ano)?secs?", x.name)]
     if stamp != clock.name and nanoseconds:
@@ -122,6 +131,8 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         f"columns: {{t: {json.dumps(clock.name)}}}",
         f"units: {json.dumps(units)}",
     ]
+    if not clocks:
+        lines[1] = "sample_rate: # [Hz] of the rows, which have no times: write its value"
     if not commands and "qd" not in by_joint:
         lines.append("velocity: differentiated")
     lines.append("joints:")
@@ -133,13 +144,27 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
             lines.append(f"    gain: 1.0 # Nm per {units['tau']} {at_joint}")
         if units.get("q") == "counts":
             lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
-    used = {column.name for named in by_joint.values() for column in named.values()}
-    unused = [x.name for quantity in by_joint for x in columns_of[quantity] if x.name not in used]
+    used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
+    absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
+    if absent and used.issuperset(x.name for x in columns):
+        got, expected = (
+            f"no {listed(absent)} beside its other columns",
+            "all signals of a recording in one file",
+        )
+        raise LogError(got, file=file, expected=expected, do=JOINING)
     # Unused columns are, for example, columns of a gripper, or of another arm with similar names.
-    if unused:
-        lines.append(f"# not used: {shortened(unused, TUNING.listed)}")
+    for quantity in by_joint:
+        unused = _ranges([x.name for x in columns_of[quantity] if x.name not in used])
+        if unused:
+            lines.append(f"# not used for {quantity}: {shortened(unused, TUNING.listed)}")
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     return _suggestion(lines, missing, "column")
+
+
+def _ranges(names: Sequence[str]) -> list[str]:
+    """Return the names, in which runs such as x1, x2, x3, that differ only in a number, are `x1 ... x3`."""
+    groups = [list(group) for _, group in groupby(names, lambda name: re.sub(r"\d+(?=\D*$)", "", name))]
+    return [f"{x[0]} ... {x[-1]}" if len(x) > 2 else ", ".join(x) for x in groups]
 
 
 def _suggestion(lines: Sequence[str], missing: Sequence[str], kind: str) -> Suggestion:
@@ -174,7 +199,8 @@ def _column_name(name: str, words: set[str]) -> ColumnName:
     if not unit and last and last[2].lower() in unit_names - BARE and last[2] != name[:1]:
         base, unit = last.groups()
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", base)
-    return ColumnName(name, words | set(re.findall(r"[^\W\d_]+", separated.lower())), unit.strip().lower())
+    text = re.sub(DERIVATIVE, "qd", separated.lower())
+    return ColumnName(name, words | set(re.findall(r"[^\W\d_]+", text)), unit.strip().lower())
 
 
 def _by_quantity(

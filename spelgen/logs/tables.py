@@ -247,7 +247,9 @@ def _renaming(
     ]
     if not unused:
         return "log them, torques for example as efforts of ROS, or as motor currents with a 'gain'"
-    for close in difflib.get_close_matches(name, unused, n=5):
+    # If all columns have other names, one similar name proves nothing: `effort_elbow` resembles `q_elbow`.
+    has_any = set(columns).intersection(chain(*of_quantity.values()))
+    for close in difflib.get_close_matches(name, unused, n=5) if has_any else ():
         if names_joint(close, "".join(named[-1:])):
             return f"rename the column {close!r} to {name!r}?"
     return (
