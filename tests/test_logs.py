@@ -601,3 +601,21 @@ def test_reversed_columns_are_cut_into_windows():
     q = np.sin(t[:, None] * [1.0, 1.7])[:, ::-1]
     windows = cut_windows([Trajectory(t, q, q, q, "x")], 5, measured=False)
     assert windows.q.shape == (116, 5, 2)
+
+
+@pytest.mark.parametrize("origin", [0.0, 1.7e9])
+def test_files_that_continue_each_other_are_one_recording(tmp_path, origin):
+    """A logger that starts a new file each second, with times of one clock, and two recordings of their own."""
+    t = np.arange(500) / 100
+    whole = Trajectory(t, np.sin(t)[:, None], np.cos(t)[:, None], t[:, None], "whole")
+    for k in range(5):
+        rows = [f"{origin + x:.4f},{q!r},{qd!r},{tau!r}" for x, q, qd, tau in zip(
+            *(y.ravel().tolist() for y in (t, whole.q, whole.qd, whole.tau)), strict=True)][100 * k : 100 * k + 100]  # fmt: skip
+        csv(tmp_path / f"{4 - k}.csv", "\n".join([HEADER.strip(), *rows, ""]))
+    csv(tmp_path / "later.csv", HEADER + "".join(f"{origin + 6 + k / 100},0,0,0\n" for k in range(50)))
+    csv(tmp_path / "elsewhere.csv", HEADER + "".join(f"{origin + 5 + k / 100},9,0,0\n" for k in range(50)))
+    joined, *others = read_logs(tmp_path, ("a",))
+    assert [len(x) for x in (joined, *others)] == [500, 50, 50]
+    np.testing.assert_allclose(joined.t - joined.t[0], t, atol=1e-6)
+    np.testing.assert_array_equal(joined.q, whole.q)
+    assert "the files up to 0.csv continue it" in joined.remarks[0]
