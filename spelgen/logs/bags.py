@@ -5,6 +5,7 @@ This module reads the records of such a file itself. A record is an operation co
 body. https://mcap.dev/spec
 """
 
+import os.path
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
@@ -140,12 +141,15 @@ def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     """Return the advice to map joint names to names in the log.
 
     names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains
-    the settings that map the names if every joint name is the end of exactly one logged name ("j1" and "left_j1").
+    the settings that map the names if every joint name, without a prefix of all joints, is the end of exactly one
+    logged name ("panda_j1" and "fer_j1", "j1" and "left_j1").
     """
-    endings = {name: [x for x in logged if x.endswith(name)] for name in names}
-    if any(len(full_names) != 1 for full_names in endings.values()):
-        return "map the joints' names under 'logs'"
-    return mapping_line({"joints": {name: {"name": full_name} for name, (full_name,) in endings.items()}})
+    prefix = len(os.path.commonprefix([*names]).rpartition("_")[0])
+    for ends in (names, [name[prefix:] for name in names] if prefix else ()):
+        endings = {name: [x for x in logged if x.endswith(end)] for name, end in zip(names, ends, strict=False)}
+        if endings and all(len(full_names) == 1 for full_names in endings.values()):
+            return mapping_line({"joints": {name: {"name": full_name} for name, (full_name,) in endings.items()}})
+    return mapping_line({"joints": {names[0]: {"name": "NAME IN THE LOG"}}}) + ", and so for the other joints"
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:

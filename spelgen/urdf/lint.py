@@ -66,7 +66,8 @@ def _lint_inertial(link: str, inertial: Inertial) -> Iterator[Finding]:
     # Triangle inequality: each principal moment is the sum of two of three nonnegative second moments of mass, so that
     # none exceeds the sum of the other two.
     elif smallest + middle < largest * (1 - _ROUNDING):
-        inequality = f"{smallest:.3g} + {middle:.3g} < {largest:.3g}"
+        sides = [x if abs(x) > _ROUNDING * largest else 0.0 for x in (smallest, middle)]
+        inequality = f"{sides[0]:.3g} + {sides[1]:.3g} < {largest:.3g}"
         message = f"no mass distribution has these principal moments: {inequality}"
         yield "triangle-inequality", where, line, message
 
