@@ -94,7 +94,9 @@ def test_rows_without_times_get_a_rate_to_write(scara, tmp_path):
 def test_a_file_of_torques_only_is_to_be_joined_with_the_positions(scara, tmp_path):
     head = ["t", *(f"- {name}_effort" for name in scara.chain.joint_names)]
     path = written(tmp_path / "effort.csv", head, np.column_stack([T, TAU]))
-    with pytest.raises(LogError, match=r"no positions .*join files with a signal each .*merge\(pandas.read_csv"):
+    with pytest.raises(
+        LogError, match=r"no positions .*join files with a signal each .*merge\(pandas.read_csv"
+    ):
         suggest_mapping(path, scara.chain.joint_names)
     with pytest.raises(LogError, match="or write their names under 'logs'"):  # and not: rename effort to q
         read_logs(path, scara)
@@ -106,6 +108,8 @@ PUBLIC = {
     "RTDE": ("timestamp", "actual_q_{}", "actual_qd_{}", "actual_moment_{}", "target_q_{} target_moment_{} "
              "actual_current_{} actual_TCP_speed_{} actual_TCP_force_{}"),
     "set and actual": ("t", "q_act_{}", "dq_act_{}", "trq_{}", "q_set_{} I_act_{} friction_trq_{} gravity_trq_{}"),
+    "Doosan": ("time", "actual_joint_position_{}", "actual_joint_velocity_{}", "actual_joint_torque_{}",
+               "raw_joint_torque_{} actual_motor_torque_{}"),
     "FRI": ("sec nsec", "measured_position_{}", "measured_speed_{}", "measured_torque_{}", "ipo_position_{} "
             "commanded_position_{} commanded_torque_{} external_torque_{}"),
     "Kortex": ("ts", "actuators[{}].position", "actuators[{}].velocity", "actuators[{}].torque", ""
@@ -177,7 +181,16 @@ def test_parts_of_a_torque_get_a_gain_to_write(scara, tmp_path, unit, name):
     assert f'"tau": "{name}"' in text and text.count(f"gain: 1.0 # Nm per {name}") == 4
 
 
-@pytest.mark.parametrize("words", [("Zeit", "Winkel", "Geschwindigkeit", "Drehmoment"), ("t", "θ", "ω", "τ")])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("Zeit", "Winkel", "Geschwindigkeit", "Drehmoment"),
+        ("t", "θ", "ω", "τ"),
+        ("temps", "position", "vitesse", "couple"),
+        ("时间", "位置", "速度", "力矩"),
+        ("time", "qpos", "qvel", "qfrc_actuator"),
+    ],
+)
 def test_words_of_other_languages(scara, tmp_path, words):
     head = [words[0], *(f"{word} {k}" for word in words[1:] for k in range(4))]
     rows = [[t, *q, *qd, *tau] for t, q, qd, tau in zip(T, Q, QD, TAU, strict=True)]

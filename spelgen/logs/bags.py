@@ -5,10 +5,9 @@ This module reads the records of such a file itself. A record is an operation co
 body. https://mcap.dev/spec
 """
 
-import os.path
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -144,11 +143,13 @@ def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     the settings that map the names if every joint name, without a prefix of all joints, is the end of exactly one
     logged name ("panda_j1" and "fer_j1", "j1" and "left_j1").
     """
-    prefix = len(os.path.commonprefix([*names]).rpartition("_")[0])
-    for ends in (names, [name[prefix:] for name in names] if prefix else ()):
-        endings = {name: [x for x in logged if x.endswith(end)] for name, end in zip(names, ends, strict=False)}
-        if endings and all(len(full_names) == 1 for full_names in endings.values()):
-            return mapping_line({"joints": {name: {"name": full_name} for name, (full_name,) in endings.items()}})
+    words = [name.split("_") for name in names]
+    shared = len(list(takewhile(lambda column: len(set(column)) == 1, zip(*words, strict=False))))
+    for ends in (names, ["_".join(of_name[shared:]) for of_name in words]):
+        found = [[x for x in logged if x.endswith(end)] for end in ends]
+        if all(len(full_names) == 1 for full_names in found):
+            lines = {name: {"name": full_name} for name, (full_name,) in zip(names, found, strict=True)}
+            return mapping_line({"joints": lines})
     return mapping_line({"joints": {names[0]: {"name": "NAME IN THE LOG"}}}) + ", and so for the other joints"
 
 

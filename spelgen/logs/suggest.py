@@ -26,11 +26,15 @@ from spelgen.logs.unit_checks import time_unit
 from spelgen.settings.log_mapping import CURRENTS, LogMapping
 
 WORDS = {
-    "t": {"t", "ts", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis", "zeit"},
-    "q": {"q", "pos", "position", "positions", "angle", "angles", "theta", "θ", "winkel"},
-    "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega", "ω", "geschwindigkeit"},
-    "tau": {"tau", "τ", "torque", "torques", "trq", "tq", "effort", "efforts", "force", "forces", "current", "currents",
-            "curr", "cur", "moment", "drehmoment", "strom", "load"},
+    "t": {"t", "ts", "time", "times", "timestamp", "stamp", "clock", "datetime", "secs", "seconds", "millis", "zeit",
+          "temps", "tiempo", "时间"},
+    "q": {"q", "qpos", "pos", "position", "positions", "angle", "angles", "theta", "θ", "winkel", "posicion",
+          "posición", "位置", "角度"},
+    "qd": {"qd", "dq", "qp", "qvel", "vel", "velocity", "velocities", "speed", "speeds", "omega", "ω",
+           "geschwindigkeit", "vitesse", "velocidad", "速度", "角速度"},
+    "tau": {"tau", "τ", "torque", "torques", "trq", "tq", "tor", "effort", "efforts", "force", "forces", "qfrc",
+            "current", "currents", "curr", "cur", "moment", "drehmoment", "strom", "load", "couple", "par", "力矩",
+            "扭矩"},
 }  # fmt: skip
 # Words that distinguish the names of commanded values from the names of measured values.
 COMMANDED = {
@@ -297,16 +301,16 @@ def _first_list(column: pa.ChunkedArray) -> list[object]:
 def _of_one_signal(columns: Sequence[ColumnName], joints: Sequence[str]) -> Sequence[ColumnName]:
     """Return the columns of one of the signals of a quantity that a log contains for all joints.
 
-    Names of a signal's columns differ only in the words of the joint. Torques are preferred to currents, names with a
-    word such as "actual" to others, and names with few words to longer ones: `tau_J` to `tau_hat_filtered`. All columns
-    are returned if no signal has a column for each joint.
+    Names of a signal's columns differ only in the words of the joint. Torques are preferred to currents, torques of
+    joints to torques of motors, names with a word such as "actual" to others, and names with few words to longer ones:
+    `tau_J` to `tau_hat_filtered`. All columns are returned if no signal has a column for each joint.
     """
     signals: dict[frozenset[str], list[ColumnName]] = {}
     for column in columns:
         joint = max((x for x in joints if names_joint(column.name, x)), key=len, default="")
         signals.setdefault(frozenset(column.words - _column_name(joint, set()).words), []).append(column)
     complete = [
-        ((bool(words & CURRENT), not words & MEASURED, len(words)), named)
+        ((bool(words & CURRENT), "motor" in words, not words & MEASURED, len(words)), named)
         for words, named in signals.items()
         if len(named) >= len(joints)
     ]

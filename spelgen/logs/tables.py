@@ -102,7 +102,8 @@ class LogFormat(NamedTuple):
 
 
 SERVO_ADVICE = (
-    "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
+    "write 'input: position' into the YAML beside the URDF if these are commands of position servos, "
+    "or map them as tau"
 )
 
 
