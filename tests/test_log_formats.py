@@ -460,7 +460,9 @@ def test_names_of_a_bag_are_mapped(bag):
     folder = bag(states)
     mapping = {"joints": {"shoulder": {"name": "e"}, "elbow": {"name": "s"}}}
     check(read_logs([folder], JOINTS, mapping=LogMapping.model_validate(mapping))[0], "bag", rtol=1e-12)
-    with pytest.raises(LogError, match=r"bag: got joint states of s, e only, expected shoulder, elbow; write 'joints: "):
+    with pytest.raises(
+        LogError, match=r"joint states of s, e only, expected shoulder, elbow; write 'joints: "
+    ):
         read_logs([folder], JOINTS)
 
 

@@ -609,9 +609,10 @@ def test_files_that_continue_each_other_are_one_recording(tmp_path, origin):
     t = np.arange(500) / 100
     whole = Trajectory(t, np.sin(t)[:, None], np.cos(t)[:, None], t[:, None], "whole")
     for k in range(5):
-        rows = [f"{origin + x:.4f},{q!r},{qd!r},{tau!r}" for x, q, qd, tau in zip(
-            *(y.ravel().tolist() for y in (t, whole.q, whole.qd, whole.tau)), strict=True)][100 * k : 100 * k + 100]  # fmt: skip
-        csv(tmp_path / f"{4 - k}.csv", "\n".join([HEADER.strip(), *rows, ""]))
+        piece = whole[100 * k : 100 * k + 100]
+        values = np.column_stack([piece.t, piece.q, piece.qd, piece.tau]).tolist()
+        rows = [f"{origin + x:.4f},{q!r},{qd!r},{tau!r}\n" for x, q, qd, tau in values]
+        csv(tmp_path / f"{4 - k}.csv", HEADER + "".join(rows))
     csv(tmp_path / "later.csv", HEADER + "".join(f"{origin + 6 + k / 100},0,0,0\n" for k in range(50)))
     csv(tmp_path / "elsewhere.csv", HEADER + "".join(f"{origin + 5 + k / 100},9,0,0\n" for k in range(50)))
     joined, *others = read_logs(tmp_path, ("a",))
