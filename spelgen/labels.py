@@ -112,7 +112,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def share(fraction: float, reference: str = "") -> str:
-    """Return a fraction of ``reference`` as text, such as ``5 %``, ``5 % of the motion`` or ``13.6 times the motion``."""
+    """Return a fraction of ``reference`` as text: ``5 %``, ``5 % of the motion``, ``13.6 times the motion``."""
     # Above 1 a factor is easier to understand than a percentage: 2.5 times the motion, not 250 %.
     if fraction > 1:
         return f"{fraction:.3g} times {reference}" if reference else f"{100 * fraction:.0f} %"

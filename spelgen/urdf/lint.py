@@ -11,7 +11,9 @@ from spelgen.urdf.robot import Inertial, Robot, Tensor, UrdfJoint
 # [1] Smallest reported violation, relative to the largest principal moment: printed tensors are rounded, which causes
 # smaller violations.
 _ROUNDING = 1e-6
-
+_SMALLEST_INERTIA = (
+    1e-15  # [kg m2] smaller principal moments are rounding errors of 0: a milligram of 1 mm has 1e-12
+)
 _LARGEST_LENGTH = 20.0  # [m] larger lengths are probably in millimetres
 # [m] Largest plausible radius of gyration of a link. In 200 URDFs of arms only placeholders have a larger one.
 _LARGEST_GYRATION = 3.0
@@ -41,7 +43,7 @@ def _lint_inertial(link: str, inertial: Inertial) -> Iterator[Finding]:
     where, line, tensor = f"link {link!r} inertial", inertial.line, inertial.tensor
     if inertial.mass < 0:
         yield "negative-mass", where, line, f"the mass is {inertial.mass:g} kg"
-    if not any(tensor):
+    if max(map(abs, tensor)) < _SMALLEST_INERTIA:
         if inertial.mass > 0:
             yield "zero-inertia", where, line, "the inertia tensor is zero: a point mass"
         return
