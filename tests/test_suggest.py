@@ -102,6 +102,15 @@ def test_a_file_of_torques_only_is_to_be_joined_with_the_positions(scara, tmp_pa
         read_logs(path, scara)
 
 
+def test_a_row_per_joint_is_to_be_pivoted(scara, tmp_path):
+    rows = [[t, joint, 0.0, 0.0] for t in T for joint in scara.chain.joint_names]
+    path = written(tmp_path / "long.csv", ["time", "name", "position", "effort"], rows)
+    with pytest.raises(
+        LogError, match=r"joints in the column 'name', expected all joints in each row; .*columns='name'\)"
+    ):
+        suggest_mapping(path, scara.chain.joint_names)
+
+
 PUBLIC = {
     "libfranka": ("time", "q[{}]", "dq[{}]", "tau_J[{}]", "O_T_EE[{}] q_d[{}] dq_d[{}] tau_J_d[{}] dtau_J[{}] "
                   "tau_ext_hat_filtered[{}]"),

@@ -7,8 +7,8 @@ SI units: the checks of logs then detect degrees, for example, and state the set
 import difflib
 import json
 import re
-from collections.abc import Mapping, Sequence
-from itertools import groupby
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
@@ -101,6 +101,15 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         raise LogError("messages of ROS, with names and units", file=file, expected=suffixes, do=do)
     with reading(file):
         table = log_format.read(file, (), LogMapping())[0].read(None)
+    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
+    for name in (x for x in texts if set(joints) <= set(table[x].to_pylist())):
+        do = f"in Python: wide = log.pivot(index=TIME, columns={name!r}); wide.columns = map('_'.join, wide.columns)"
+        raise LogError(f"joints in the column {name!r}", file=file, expected="all joints in each row", do=do)
+    return _table_mapping(table, file, joints, commands)
+
+
+def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands: bool) -> Suggestion:
+    """Return the draft for a table of the log `file`; see `suggest_mapping`."""
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     columns = [_column_name(name, {"time"} if name in dates else set()) for name in _names(table)]
     columns_of = _by_quantity(columns, commands, joints)
@@ -108,16 +117,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
     if not commands and not torques and len(_by_quantity(columns, True, joints)["u"]) >= len(joints):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
-    # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
-    # measurement. Without a stamp, the name with the fewest words is used.
-    clocks = columns_of.pop("t")
-    clock = min(
-        clocks, key=lambda x: ("header" not in x.words, len(x.words)), default=ColumnName("t", set(), "s")
-    )
-    stamp = re.sub(r"secs?$", "", clock.name)
-    nanoseconds = [x.name for x in columns if re.fullmatch(rf"{re.escape(stamp)}n(ano)?secs?", x.name)]
-    if stamp != clock.name and nanoseconds:
-        clock = ColumnName(f"{clock.name} + {nanoseconds[0]}", clock.words, "s")
+    clock = _clock(columns_of.pop("t"), columns)
     # Numbered columns are assigned by cells that contain joint names, since the order in a log may differ from the
     # arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)
@@ -125,37 +125,29 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         quantity: _by_joint(_of_one_signal(named, joints), joints, order)
         for quantity, named in columns_of.items()
     }
+    used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
+    absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
+    if absent and used.issuperset(x.name for x in columns):
+        expected = "all signals of a recording in one file"
+        raise LogError(
+            f"no {listed(absent)} beside its other columns", file=file, expected=expected, do=JOINING
+        )
     # A mapping has columns of velocities for all joints or for none. If one is absent, all velocities are computed from
     # positions.
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)
     lines = [
-        f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints.",
-        f"columns: {{t: {json.dumps(clock.name)}}}",
-        f"units: {json.dumps(units)}",
+        f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints."
     ]
-    if not clocks:
-        lines[1] = "sample_rate: # [Hz] of the rows, which have no times: write its value"
+    if clock.name:
+        lines.append(f"columns: {{t: {json.dumps(clock.name)}}}")
+    else:
+        lines.append("sample_rate: # [Hz] of the rows, which have no times: write its value")
+    lines.append(f"units: {json.dumps(units)}")
     if not commands and "qd" not in by_joint:
         lines.append("velocity: differentiated")
-    lines.append("joints:")
-    for joint in joints:
-        entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
-        lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}"]
-        if units.get("tau") in CURRENTS:
-            at_joint = "at the joint, the gear included: write its value"
-            lines.append(f"    gain: 1.0 # Nm per {units['tau']} {at_joint}")
-        if units.get("q") == "counts":
-            lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
-    used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
-    absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
-    if absent and used.issuperset(x.name for x in columns):
-        got, expected = (
-            f"no {listed(absent)} beside its other columns",
-            "all signals of a recording in one file",
-        )
-        raise LogError(got, file=file, expected=expected, do=JOINING)
+    lines += ["joints:", *chain.from_iterable(_joint_lines(joint, by_joint, units) for joint in joints)]
     # Unused columns are, for example, columns of a gripper, or of another arm with similar names.
     for quantity in by_joint:
         unused = _ranges([x.name for x in columns_of[quantity] if x.name not in used])
@@ -163,6 +155,31 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
             lines.append(f"# not used for {quantity}: {shortened(unused, TUNING.listed)}")
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     return _suggestion(lines, missing, "column")
+
+
+def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName]) -> ColumnName:
+    """Return the column of times, or "sec + nsec" of two columns; with the name "" if there is none."""
+    # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
+    # measurement. Without a stamp, the name with the fewest words is used.
+    none = ColumnName("", set(), "s")
+    clock = min(clocks, key=lambda x: ("header" not in x.words, len(x.words)), default=none)
+    stamp = re.sub(r"secs?$", "", clock.name)
+    nanoseconds = [x.name for x in columns if re.fullmatch(rf"{re.escape(stamp)}n(ano)?secs?", x.name)]
+    if stamp != clock.name and nanoseconds:
+        return ColumnName(f"{clock.name} + {nanoseconds[0]}", clock.words, "s")
+    return clock
+
+
+def _joint_lines(
+    joint: str, by_joint: Mapping[str, Mapping[str, ColumnName]], units: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield the lines of a joint: its columns, and the conversions whose values the user must write."""
+    entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
+    yield from (f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}")
+    if units.get("tau") in CURRENTS:
+        yield f"    gain: 1.0 # Nm per {units['tau']} at the joint, the gear included: write its value"
+    if units.get("q") == "counts":
+        yield "    counts_per_turn: 4096 # of the joint, the gear included: write its value"
 
 
 def _ranges(names: Sequence[str]) -> list[str]:
