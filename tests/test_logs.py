@@ -174,7 +174,8 @@ BAD = {
     "missing-column": (
         "t,q_a,qd_a,torque_a\n0,0,0,0\n",
         "{}: missing column tau_a: got only the columns t, q_a, qd_a, torque_a, "
-        "expected t, q_<joint>, qd_<joint>, tau_<joint>; rename the column 'torque_a' to 'tau_a'?",
+        "expected t, q_<joint>, qd_<joint>, tau_<joint>; rename the columns, or write their names under 'logs' in "
+        "the robot's YAML: `spelgen logs LOGS --robot ROBOT.urdf --suggest FILE` drafts them",
     ),
     "repeated-column": (
         "t,q_a,q_a,qd_a,tau_a\n0,0,0,0,0\n",

@@ -41,26 +41,16 @@ class Segment(NamedTuple):
 
     def continued_by(self, other: "Segment") -> bool:
         """Return True if another file continues this one: times and positions proceed by a step that is no gap."""
-        mine, others = self.layout, other.layout
-        ends = np.stack([self.values[-1], other.values[0]])
-        ends[1, 0] += other.start - self.start
-        steps = np.diff(self.values, axis=0)[:, : 1 + len(mine.joints)]
-        if (
-            mine.labels
-            or mine.recording
-            or mine.mapping.sample_rate
-            or not (len(steps) and (steps[:, 0] > 0).all())
-        ):
+        mine, others, count = self.layout, other.layout, 1 + len(self.layout.joints)
+        if mine.file == others.file or (mine.columns, mine.mapping) != (others.columns, others.mapping):
             return False
-        if (
-            (mine.columns, mine.mapping) != (others.columns, others.mapping)
-            or others.labels
-            or others.recording
-        ):
+        if mine.mapping.sample_rate or len(self.values) < 2:
             return False
-        between, largest = np.abs(ends[1] - ends[0])[: 1 + len(mine.joints)], np.abs(steps).max(axis=0)
-        largest[0] = np.median(steps[:, 0])
-        return bool(ends[1, 0] > ends[0, 0] and (between <= TUNING.gap * largest).all())
+        steps = np.diff(self.values[:, :count], axis=0)
+        step = other.values[0, :count] - self.values[-1, :count]
+        step[0] += other.start - self.start
+        largest = np.array([np.median(steps[:, 0]), *np.abs(steps[:, 1:]).max(axis=0)])
+        return bool(min(step[0], *steps[:, 0]) > 0 and (np.abs(step) <= TUNING.gap * largest).all())
 
 
 class LogSegments:
@@ -143,12 +133,11 @@ def _joined_files(recordings: list[list[Segment]]) -> list[list[Segment]]:
     joined: list[list[Segment]] = []
     for group in sorted(recordings, key=lambda x: x[0].start + x[0].values[0, 0]):
         if not joined or not joined[-1][-1].continued_by(group[0]):
-            joined.append(group)
-            continue
-        first = joined[-1][0]
+            joined.append([])
+        first = joined[-1][0] if joined[-1] else group[0]
         for segment in group:
             segment.values[:, 0] += segment.start - first.start
-        joined[-1] += [x._replace(start=first.start) for x in group]
+            joined[-1].append(segment._replace(start=first.start))
     for group in joined:
         layout, last = group[0].layout, group[-1].layout.file
         if last != layout.file:

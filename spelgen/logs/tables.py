@@ -1,10 +1,9 @@
 """Common result of all readers of logs: a table, and its layout, which states the column of each quantity and joint."""
 
-import difflib
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, starmap
@@ -213,7 +212,7 @@ def missing_columns(
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
         others = [x for x in columns if x not in (mapping.columns.t, mapping.columns.trajectory)]
-        do = _renaming(missing[0], others, of_quantity, [mapping.log_name(joint) for joint in joints])
+        do = _naming(others, set(chain(*of_quantity.values())))
     element = f"missing column{'s' * (len(missing) > 1)} {shortened(missing, TUNING.listed)}"
     got, expected = (
         f"only the columns {shortened(list(columns), TUNING.listed)}",
@@ -229,30 +228,11 @@ def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequenc
     return torques.isdisjoint(columns) and all(x in columns or list_element(x, columns) for x in commands)
 
 
-def _renaming(
-    name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
-) -> str:
-    """Return the advice for the missing column `name`: rename a similar column, or map the names.
-
-    A similar column is an unused column whose name contains the same joint. of_quantity: names of the expected columns
-    per quantity. joints: the joints' names in the log.
-    """
-    named = [
-        joint for names in of_quantity.values() for x, joint in zip(names, joints, strict=True) if x == name
-    ]
+def _naming(columns: Collection[str], names: Collection[str]) -> str:
+    """Return the advice for missing columns. columns: columns of the log. names: names of the expected columns."""
     # Columns of accelerations are not proposed as torques: files of the command `excite` contain accelerations, too.
-    unused = [
-        x
-        for x in columns
-        if x not in chain(*of_quantity.values()) and not x.lower().startswith(("qdd", "acc"))
-    ]
-    if not unused:
+    if all(x in names or x.lower().startswith(("qdd", "acc")) for x in columns):
         return "log them, torques for example as efforts of ROS, or as motor currents with a 'gain'"
-    # If all columns have other names, one similar name proves nothing: `effort_elbow` resembles `q_elbow`.
-    has_any = set(columns).intersection(chain(*of_quantity.values()))
-    for close in difflib.get_close_matches(name, unused, n=5) if has_any else ():
-        if names_joint(close, "".join(named[-1:])):
-            return f"rename the column {close!r} to {name!r}?"
     return (
         "rename the columns, or write their names under 'logs' in the robot's YAML: "
         "`spelgen logs LOGS --robot ROBOT.urdf --suggest FILE` drafts them"
