@@ -313,19 +313,16 @@ def _dependent_remarks(
     URDF has no closed loops: a linkage is opened. Its two joints then have the same parent body and parallel axes, and
     one of them is not in the chain.
     """
-    branches: dict[
-        str, list[UrdfJoint]
-    ] = {}  # the joint at the root of a branch and those behind it, by their links
+    roots: dict[str, str] = {}  # first link of the branch to which a link belongs
+    branches: dict[str, list[UrdfJoint]] = {}
     for joint in locked:
-        if joint.parent in branches or joint.moves:
-            branches[joint.child] = branches.get(joint.parent, [])
-            branches[joint.child].append(joint)
-    for branch in {id(x): x for x in branches.values()}.values():
-        joint = branch[0]
-        turning = [x for x in branch if x.moves]
-        if joint.mimic is not None or any(x.type == "prismatic" for x in turning):
+        if joint.moves or joint.parent in roots:
+            root = roots[joint.child] = roots.get(joint.parent, joint.child)
+            branches.setdefault(root, []).extend([joint] * joint.moves)
+    for branch in branches.values():
+        joint, axes = branch[0], [_axis(placement.frames[x.parent], x) for x in branch]
+        if joint.mimic is not None or any(x.type not in ("revolute", "continuous") for x in branch):
             continue
-        axes = [_axis(placement.frames[x.parent], x) for x in turning]
         beside = _parallel_beside(placement.frames[joint.parent], moved, axes[0])
         # All joints of a linkage turn in one plane; a head pans and tilts.
         if beside and all(_are_parallel(axes[0], axis) for axis in axes):
@@ -350,10 +347,5 @@ def _are_parallel(axis: np.ndarray, other: np.ndarray) -> bool:
 def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], axis: np.ndarray) -> list[str]:
     """Return the names of the revolute joints on the body of ``frame`` with an axis parallel to ``axis`` (3,)."""
     # The axis of a moving joint is the z axis of its frame, in the frame of the parent body.
-    return [
-        body.name
-        for body in (moving.body for moving in moved)
-        if body.parent == frame.body >= 0
-        and body.joint_type != "prismatic"
-        and _are_parallel(axis, np.array(body.rotation, dtype=float)[:, 2])
-    ]
+    beside = [x.body for x in moved if x.body.parent == frame.body >= 0 and x.body.joint_type != "prismatic"]
+    return [x.name for x in beside if _are_parallel(axis, np.array(x.rotation, dtype=float)[:, 2])]

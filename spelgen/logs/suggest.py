@@ -26,15 +26,14 @@ from spelgen.logs.unit_checks import time_unit
 from spelgen.settings.log_mapping import CURRENTS, LogMapping
 
 WORDS = {
-    "t": {"t", "ts", "time", "times", "timestamp", "stamp", "clock", "datetime", "secs", "seconds", "millis", "zeit",
-          "temps", "tiempo", "时间"},
-    "q": {"q", "qpos", "pos", "position", "positions", "angle", "angles", "theta", "θ", "winkel", "posicion",
-          "posición", "位置", "角度"},
-    "qd": {"qd", "dq", "qp", "qvel", "vel", "velocity", "velocities", "speed", "speeds", "omega", "ω",
-           "geschwindigkeit", "vitesse", "velocidad", "速度", "角速度"},
-    "tau": {"tau", "τ", "torque", "torques", "trq", "tq", "tor", "effort", "efforts", "force", "forces", "qfrc",
-            "current", "currents", "curr", "cur", "moment", "drehmoment", "strom", "load", "couple", "par", "力矩",
-            "扭矩"},
+    quantity: frozenset(words.split())
+    for quantity, words in (
+        ("t", "t ts time times timestamp stamp clock datetime secs seconds millis zeit temps tiempo 时间"),
+        ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición 位置 角度"),
+        ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit vitesse velocidad 速度"),
+        ("tau", "tau τ torque torques trq tq tor effort efforts force forces qfrc moment load current currents curr "
+                "cur drehmoment strom couple par 力矩 扭矩"),
+    )
 }  # fmt: skip
 # Words that distinguish the names of commanded values from the names of measured values.
 COMMANDED = {
@@ -121,10 +120,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     # Numbered columns are assigned by cells that contain joint names, since the order in a log may differ from the
     # arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)
-    by_joint = {
-        quantity: _by_joint(_of_one_signal(named, joints), joints, order)
-        for quantity, named in columns_of.items()
-    }
+    by_joint = {x: _by_joint(_of_one_signal(named, joints), joints, order) for x, named in columns_of.items()}
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
     absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
     if absent and used.issuperset(x.name for x in columns):
@@ -149,10 +145,10 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
         lines.append("velocity: differentiated")
     lines += ["joints:", *chain.from_iterable(_joint_lines(joint, by_joint, units) for joint in joints)]
     # Unused columns are, for example, columns of a gripper, or of another arm with similar names.
-    for quantity in by_joint:
-        unused = _ranges([x.name for x in columns_of[quantity] if x.name not in used])
-        if unused:
-            lines.append(f"# not used for {quantity}: {shortened(unused, TUNING.listed)}")
+    unused = {x: _ranges([y.name for y in columns_of[x] if y.name not in used]) for x in by_joint}
+    lines += [
+        f"# not used for {x}: {shortened(names, TUNING.listed)}" for x, names in unused.items() if names
+    ]
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     return _suggestion(lines, missing, "column")
 

@@ -211,14 +211,13 @@ def missing_columns(
     elif set(missing) <= set(of_quantity.get("qd", ())):
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
-        others = [x for x in columns if x not in (mapping.columns.t, mapping.columns.trajectory)]
-        do = _naming(others, set(chain(*of_quantity.values())))
+        used = {mapping.columns.t, mapping.columns.trajectory, *chain(*of_quantity.values())}
+        do = _naming([x for x in columns if x not in used])
     element = f"missing column{'s' * (len(missing) > 1)} {shortened(missing, TUNING.listed)}"
-    got, expected = (
-        f"only the columns {shortened(list(columns), TUNING.listed)}",
-        ", ".join([mapping.columns.t, *patterns]),
+    got = f"only the columns {shortened(list(columns), TUNING.listed)}"
+    return LogError(
+        got, file=file, element=element, expected=", ".join([mapping.columns.t, *patterns]), do=do
     )
-    return LogError(got, file=file, element=element, expected=expected, do=do)
 
 
 def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequence[str]) -> bool:
@@ -228,10 +227,10 @@ def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequenc
     return torques.isdisjoint(columns) and all(x in columns or list_element(x, columns) for x in commands)
 
 
-def _naming(columns: Collection[str], names: Collection[str]) -> str:
-    """Return the advice for missing columns. columns: columns of the log. names: names of the expected columns."""
+def _naming(unused: Collection[str]) -> str:
+    """Return the advice for missing columns. unused: columns of the log that were not expected."""
     # Columns of accelerations are not proposed as torques: files of the command `excite` contain accelerations, too.
-    if all(x in names or x.lower().startswith(("qdd", "acc")) for x in columns):
+    if all(x.lower().startswith(("qdd", "acc")) for x in unused):
         return "log them, torques for example as efforts of ROS, or as motor currents with a 'gain'"
     return (
         "rename the columns, or write their names under 'logs' in the robot's YAML: "
