@@ -40,7 +40,7 @@ COMMANDED = {
     "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
     "demand", "planned", "ipo", "set", "soll", "u",
 }  # fmt: skip
-# Words in names of signals other than measured joint signals.
+# Words in names of columns that mark signals other than measured joint signals.
 NOT_MEASURED = COMMANDED | {
     "error", "std", "external", "ext", "tcp", "ee", "eef", "cartesian", "tool", "contact", "gravity", "friction",
     "dd", "ddot",
@@ -57,7 +57,7 @@ UNITS = {
     "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
-# Letters that are units only in brackets: without brackets they may be part of a name.
+# Letters in column names that are units only in brackets: without brackets they may be part of a name.
 BARE = {"s", "n", "a", "m"}
 # Names of derivatives of positions, such as `d_theta` and `q_dot`.
 DERIVATIVE = r"(?<![^\W\d_])(?:d[ _]?(?:theta|pos|q)|(?:theta|pos|q)[ _]?dot)(?![^\W\d_])"
@@ -69,7 +69,7 @@ CURRENT = {"current", "currents", "curr", "cur", "strom"}
 
 
 class Suggestion(NamedTuple):
-    """Draft of a mapping as YAML text, with comments on its assumptions. missing: quantities without a column."""
+    """Draft of a column mapping as YAML text with comments on its assumptions. missing: quantities without a column."""
 
     text: str
     missing: tuple[str, ...]
@@ -84,7 +84,7 @@ class ColumnName(NamedTuple):
 
 
 def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False) -> Suggestion:
-    """Return a draft of the mapping for a log file.
+    """Return a draft of the column mapping for a log file, from the names and first values of its columns.
 
     commands: True if the log contains commanded positions instead of torques. Raises LogError if the file cannot be
     read, if all its columns are of positions or of torques only, or of commanded positions and no torques without
@@ -112,13 +112,13 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     columns = [_column_name(name, {"time"} if name in dates else set()) for name in _names(table)]
     columns_of = _by_quantity(columns, commands, joints)
-    # The register "load" of a servo is no torque.
+    # A column named "load" is no torque: it is a register of a servo.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
     if not commands and not torques and len(_by_quantity(columns, True, joints)["u"]) >= len(joints):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
     clock = _clock(columns_of.pop("t"), columns)
-    # Numbered columns are assigned by cells that contain joint names, since the order in a log may differ from the
-    # arm's: ROS often sorts joints by name.
+    # Numbered columns are assigned to joints by cells that contain joint names, since the order in a log may differ
+    # from the arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)
     by_joint = {x: _by_joint(_of_one_signal(named, joints), joints, order) for x, named in columns_of.items()}
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
@@ -128,23 +128,21 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
         raise LogError(
             f"no {listed(absent)} beside its other columns", file=file, expected=expected, do=JOINING
         )
-    # A mapping has columns of velocities for all joints or for none. If one is absent, all velocities are computed from
-    # positions.
+    # A mapping has columns of velocities for all joints or for none. If the velocities of a joint are absent, all
+    # velocities are computed from positions.
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)
+    rate = "sample_rate: # [Hz] of the rows, which have no times: write its value"
     lines = [
-        f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints."
+        f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints.",
+        f"columns: {{t: {json.dumps(clock.name)}}}" if clock.name else rate,
+        f"units: {json.dumps(units)}",
     ]
-    if clock.name:
-        lines.append(f"columns: {{t: {json.dumps(clock.name)}}}")
-    else:
-        lines.append("sample_rate: # [Hz] of the rows, which have no times: write its value")
-    lines.append(f"units: {json.dumps(units)}")
     if not commands and "qd" not in by_joint:
         lines.append("velocity: differentiated")
     lines += ["joints:", *chain.from_iterable(_joint_lines(joint, by_joint, units) for joint in joints)]
-    # Unused columns are, for example, columns of a gripper, or of another arm with similar names.
+    # Comments of the draft list unused columns, for example of a gripper, or of another arm with similar names.
     unused = {x: _ranges([y.name for y in columns_of[x] if y.name not in used]) for x in by_joint}
     lines += [
         f"# not used for {x}: {shortened(names, TUNING.listed)}" for x, names in unused.items() if names
@@ -208,7 +206,10 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
 
 
 def _column_name(name: str, words: set[str]) -> ColumnName:
-    """Return the parts of a column's name; its unit is in brackets, or its last word. words: additional words."""
+    """Return the words and the unit in a column's name; the unit is in brackets, or the last word.
+
+    words: additional words of the column, which its name does not contain.
+    """
     bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d',]+)[\])]", name)
     base, unit = bracketed.groups() if bracketed else (name, "")
     unit_names = set().union(*UNITS.values())
@@ -223,7 +224,7 @@ def _column_name(name: str, words: set[str]) -> ColumnName:
 def _by_quantity(
     columns: Sequence[ColumnName], commands: bool, joints: Sequence[str]
 ) -> dict[str, list[ColumnName]]:
-    """Return the columns of each quantity, by the name of the quantity.
+    """Return {quantity: columns} for the quantities "t", "q", "qd", "tau" or "u".
 
     The quantity of a column is determined by the words in its name or, if these do not determine it, by its unit.
 
@@ -248,7 +249,7 @@ def _by_quantity(
 def _units(
     clock: ColumnName, by_joint: Mapping[str, Mapping[str, ColumnName]], table: pa.Table
 ) -> dict[str, str]:
-    """Return {quantity: unit}, from the names of the columns; the unit of times may be derived from the time steps."""
+    """Return {quantity: unit} from the units and words in column names; the unit of times also from the time steps."""
     units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
     for quantity, named in by_joint.items():
         for column in named.values():
@@ -264,7 +265,7 @@ def _units(
 
 
 def _unit_of_times(name: str, table: pa.Table) -> str | None:
-    """Return the unit in which the median step of a column of times is plausible; None if there is no such unit."""
+    """Return the unit in which the median time step of a column is plausible for a log; None if there is none."""
     if name not in table.schema.names:
         return None
     times = table[name].drop_null()
@@ -275,7 +276,7 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
-    """Return {joint: index in the log} from the cells of the first row that contain joint names.
+    """Return {joint: index of its columns in the log}, from cells of the first row that contain joint names.
 
     Such cells are in columns `name0`, `name1`, ..., or in a column of lists of names. Joints without a cell are
     omitted.
@@ -292,9 +293,9 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
 
 
 def _names(table: pa.Table) -> list[str]:
-    """Return the names of the columns; a column of lists is replaced by its elements, such as `q[0]`, `q[1]`.
+    """Return the names of a table's columns; a column of lists is replaced by its elements, such as `q[0]`, `q[1]`.
 
-    Columns with the same name as another column are omitted.
+    Names that two columns have are omitted.
     """
     names: list[str] = []
     for name, column in zip(table.column_names, table.columns, strict=True):
@@ -312,11 +313,14 @@ def _first_list(column: pa.ChunkedArray) -> list[object]:
 
 
 def _of_one_signal(columns: Sequence[ColumnName], joints: Sequence[str]) -> Sequence[ColumnName]:
-    """Return the columns of one of the signals of a quantity that a log contains for all joints.
+    """Return the columns of the best signal of a quantity, for example of the measured and not the desired positions.
 
-    Names of a signal's columns differ only in the words of the joint. Torques are preferred to currents, torques of
-    joints to torques of motors, names with a word such as "actual" to others, and names with few words to longer ones:
-    `tau_J` to `tau_hat_filtered`. All columns are returned if no signal has a column for each joint.
+    A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
+    differ only in the words of the joint. Torques are preferred to currents, torques of joints to torques of motors,
+    names with a word such as "actual" to others, and names with few words to longer ones: `tau_J` to
+    `tau_hat_filtered`.
+
+    columns: all columns of the quantity, which are returned if no signal has a column for each joint.
     """
     signals: dict[frozenset[str], list[ColumnName]] = {}
     for column in columns:
@@ -335,8 +339,8 @@ def _by_joint(
 ) -> dict[str, ColumnName]:
     """Return {joint: column}: the column whose name contains the name of the joint.
 
-    If no column name contains a joint name, columns are assigned by the last number in their names: `order` contains
-    {joint: number}. If `order` does not contain all joints, they are assigned to the numbers in ascending order.
+    If no column name contains a joint name, columns are assigned by the last number in their names. order: {joint:
+    number}; if it does not contain all joints, the joints are assigned to the numbers in ascending order.
     """
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
     numbers = [(re.findall(r"\d+", column.name), column) for column in columns]
