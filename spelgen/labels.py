@@ -147,7 +147,7 @@ def thousandths(joint_types: Sequence[str]) -> str:
 
 
 def observed(predictor: str) -> str:
-    """Return the name of a predictor with an observer, which adds the disturbance torque of a momentum observer."""
+    """Return the name of a predictor whose predictions include the disturbance that a momentum observer estimates."""
     return f"{predictor} + observer"
 
 

@@ -132,7 +132,7 @@ class _Sentences:
         """Yield a fact for each joint on which no entry of M depends."""
         inputs = {joint for entry in self.structure.entries for joint in entry.joints}
         if not inputs:
-            return  # M is constant, and the facts about constant entries already state it.
+            return  # M is constant, as the facts about its entries state, so no joint is listed.
         for joint in sorted(set(range(len(self.structure.joints))) - inputs):
             means = "It is not an input of the networks of M"
             yield Fact(f"M does not depend on joint {joint + 1}", means, self._reason(idle_reason, joint))

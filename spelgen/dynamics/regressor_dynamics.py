@@ -202,7 +202,7 @@ def identified_dynamics(
     reach = reach_of(arm.joint_types).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        """Return the friction torque, (..., n) [Nm, N], at qd, (..., n), and the friction state z, (..., n, K)."""
+        """Return the friction torque, (..., n) [Nm, N], at velocities qd, (..., n), and at the state z, (..., n, K)."""
         deflection = None if z is None or reach is None else z / reach
         return friction.torque(constants, qd, deflection, drives.speeds)
 

@@ -117,7 +117,10 @@ def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
 
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
-    """Return a linear combination of terms, (...,) each, with the order of operations of a module's source."""
+    """Return a linear combination of terms, (...,) each, with the order of operations of a module's source.
+
+    sums: pairs (factor, index of a term).
+    """
     # Negative terms are subtracted, as in the module's source, so that rounding errors are equal.
     total: Tensor | float = 0
     for position, (factor, index) in enumerate(sums):
@@ -137,7 +140,10 @@ def _model_class(base: str) -> Callable[..., ArmModel]:
 
 
 def _without_state(base: str) -> ArmModel:
-    """Return a new model without attributes, for unpickling: pickle then sets the attributes; base: its base class."""
+    """Return a new model without attributes; pickle calls this function, and then sets the attributes.
+
+    base: name of the class of ``spelgen.runtime`` from which the model is derived.
+    """
     model_class = cast("type[ArmModel]", _model_class(base))
     return model_class.__new__(model_class)
 
