@@ -152,5 +152,5 @@ def observed(predictor: str) -> str:
 
 
 def is_drawn(predictor: str) -> bool:
-    """Return True if charts show a predictor. A predictor with an observer is shown only if it is the trained model."""
+    """Return True if charts show a predictor: of the predictors with a disturbance observer, only the trained model."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

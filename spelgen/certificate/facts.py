@@ -82,8 +82,8 @@ class _Sentences:
 
         Args:
             kind: "zero" or "constant".
-            why: function of the tests of axes and an entry that returns the reason, or None.
-            statement: predicate of the sentence about the entries.
+            why: function of (`Axes`, entry of M) that returns the reason why the entry is zero or constant, or None.
+            statement: end of the sentence about the entries, such as "always zero".
             means_one: consequence for the model, if the fact is about one entry.
             means_several: consequence for the model, if the fact is about several entries.
         """

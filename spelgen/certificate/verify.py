@@ -268,7 +268,8 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)
         counts.append(str(without))
-        # The rank of the changes of M caused by the first k joints is the number of outputs that depend on any of them.
+        # Outputs are linearly independent functions of q. Therefore the rank of the changes of M due to the first k
+        # joints must equal the number of outputs that depend on any of these joints.
         name = f"outputs before joint {first + 1}"
         magnitudes += _rank(name, changes[:first].reshape(-1, width), outputs - without).magnitudes
     yield _DerivedFact("outputs without the first 0, 1, ... joints", ", ".join(counts), magnitudes)

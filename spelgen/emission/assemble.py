@@ -107,10 +107,12 @@ def spec_of(model: object) -> ModelSpec | None:
 
 
 def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
-    """Return the mass matrix M, (..., n, n), from its functions and constants, as ``mass_entries`` of a module does.
+    """Return the mass matrix M, (..., n, n), from its functions of q and its constants (the terms).
+
+    The function ``mass_entries`` of an emitted module computes the same.
 
     Args:
-        rows: linear combinations of the terms, a list for each row of the lower triangle of M.
+        rows: for each row of the lower triangle of M, a list of the entries as linear combinations of the terms.
         terms: values of the functions of q, then of the constants, (...,) each.
     """
     return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in rows))

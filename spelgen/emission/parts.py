@@ -146,7 +146,8 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
 def _friction_laws(spec: ModelSpec) -> Call:
     if spec.design.memory == "none":
         return call("SlidingFriction", JOINTS)
-    # `breakaway` has a row for each joint type of the arm, in the order of BREAKAWAY: a module's text is deterministic.
+    # The rows of `breakaway`, one per joint type of the arm, have the order of BREAKAWAY, so that the text of a module
+    # is deterministic.
     breakaway = {name: row for name, row in BREAKAWAY.items() if name in spec.joint_types}
     rounding = {"stribeck_rounding": SERVO_STRIBECK_ROUNDING} if spec.servos else {}
     return call("FrictionLaws", JOINTS, breakaway=breakaway, **rounding)

@@ -46,9 +46,9 @@ class LiveTuning:
     # [1] Residuals beyond this number of standard deviations are treated as outliers, with a larger noise variance
     # (Huber, Robust Statistics, 1981).
     outlier: float = 3.0
-    # [1] Variance of friction with an unknown friction state, divided by the square of `Balance.uncertainty`. The ratio
-    # would be 1/3 for friction that is uniformly distributed between its bounds. It is larger, because the errors of
-    # the samples of a block are correlated.
+    # [1] Variance of the friction torque of a joint whose friction state is unknown, divided by the square of
+    # `Balance.uncertainty`, half the range of this torque. The value would be 1/3 for a uniform distribution over the
+    # range. It is larger, because samples are averaged in blocks, and the errors in a block are correlated.
     uncertainty: float = 3.0
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
