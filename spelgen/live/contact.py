@@ -52,7 +52,7 @@ class ContactObserver:
         self.t: float | None = None
         self.inputs = self.low = np.zeros((15, len(self.levels.speed)))
         self.baseline = np.zeros_like(self.levels.speed)
-        self.touched = self.baseline > 0
+        self.touched = np.zeros(len(self.baseline), dtype=bool)
 
     def step(self, t: float, at: Balance, payload: Payload, drift: np.ndarray) -> ContactState:
         """Update the observer with a sample; return the external torques and the detected contact.
