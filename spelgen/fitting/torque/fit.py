@@ -129,10 +129,9 @@ def fit_torque(
         subset = samples.subsampled(TUNING.initial_samples)
         set_initial_gains(model, subset, prior.gains)
         limit_friction(model, subset.columns)
-    initial = copy.deepcopy(model.state_dict())
-    fitted, comparison = _staged_fit(model, samples, prior, adapt), None
-    if adapt is None:
-        fitted, comparison = _not_behind_regression(model, samples, prior, fitted, initial)
+        fitted, comparison = _compared_fit(model, samples, prior)
+    else:
+        fitted, comparison = _staged_fit(model, samples, prior, adapt), None
     estimate, state = fitted.estimate, fitted.estimate.state
     jacobian, estimator = estimate.problem.jacobian, estimate.problem.noise_estimator
     scale = jacobian.logged_scale(state.x)
@@ -153,11 +152,18 @@ def fit_torque(
 
 
 def _staged_fit(
-    model: ArmModel, samples: TorqueSamples, prior: GaussianPrior, adapt: Adaptation | None
+    model: ArmModel,
+    samples: TorqueSamples,
+    prior: GaussianPrior,
+    adapt: Adaptation | None = None,
+    max_error: torch.Tensor | None = None,
 ) -> _StagedFit:
-    """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters."""
-    subset = samples.subsampled(TUNING.initial_samples)
-    estimate, selected = _run_stages(TorqueProblem.of(TorqueJacobian(model, subset), prior, adapt), samples)
+    """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters.
+
+    max_error: (n,), see `TorqueProblem`.
+    """
+    jacobian = TorqueJacobian(model, samples.subsampled(TUNING.initial_samples))
+    estimate, selected = _run_stages(TorqueProblem.of(jacobian, prior, adapt, max_error), samples)
     problem = estimate.problem
     problem.jacobian.rigid.write(estimate.state.x)
     errors = jackknife(estimate)
@@ -166,24 +172,24 @@ def _staged_fit(
     return _StagedFit(estimate, errors, selected, held_out, copy.deepcopy(model.state_dict()))
 
 
-def _not_behind_regression(
-    model: ArmModel,
-    samples: TorqueSamples,
-    prior: GaussianPrior,
-    fitted: _StagedFit,
-    initial: dict[str, torch.Tensor],
+def _compared_fit(
+    model: ArmModel, samples: TorqueSamples, prior: GaussianPrior
 ) -> tuple[_StagedFit, RegressionComparison]:
-    """Return ``fitted``, or a second fit if ridge regression predicts held-out torques significantly better.
+    """Fit all parameters; fit again if ridge regression predicts held-out torques significantly better than the fit.
 
     The second fit has the result of the regression as its initial guess. It is returned only if its held-out error is
-    below the error of ``fitted``. The parameters of the returned fit are written to the model. initial: state_dict of
-    the model before the fit.
+    below the error of the first fit. The parameters of the returned fit are written to the model.
     """
-    blocks = contiguous_blocks(samples)
-    regression = best_regression(model, blocks, joint_torque(model, samples.columns).std(dim=0).numpy())
+    initial, blocks = copy.deepcopy(model.state_dict()), contiguous_blocks(samples)
+    torque_std = joint_torque(model, samples.columns).std(dim=0)
+    regression = best_regression(model, blocks, torque_std.numpy())
+    regression_squares = torch.from_numpy(regression.held_out)
+    # The torque noise is not larger than the held-out error of the regression.
+    max_error = torque_std * (regression_squares.sum(dim=0) / samples.count).sqrt()
+    fitted = _staged_fit(model, samples, prior, max_error=max_error)
     # The lower bound of the noise is added to both errors, so that smaller differences are not significant.
     negligible = TUNING.min_noise**2 * model.n * torch.tensor([block.count for block in blocks])
-    other = torch.from_numpy(regression.held_out) + negligible
+    other = regression_squares.sum(dim=1) + negligible
 
     def behind(fit: _StagedFit) -> bool:
         """Return True if the regression is significantly better than the fit (Student's t test, p = 0.01)."""
@@ -200,7 +206,7 @@ def _not_behind_regression(
     if behind(fitted):
         model.load_state_dict(initial)
         start_at(model, samples.subsampled(TUNING.initial_samples), regression)
-        restarted = _staged_fit(model, samples, prior, None)
+        restarted = _staged_fit(model, samples, prior, max_error=max_error)
         if restarted.held_out.sum() < fitted.held_out.sum():
             best, replaced = restarted, nmse(fitted.held_out)
         model.load_state_dict(best.parameters)
