@@ -297,7 +297,9 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
 
 def test_noise_is_what_each_joint_misses():
     """Ten times the squares are sqrt(10) times the noise, and no joint's noise is another's."""
-    estimator = torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double())
+    estimator = torque_problem.NoiseEstimator(
+        50, torch.full((2,), 5.0).double(), *torch.tensor([[1.0] * 2, [10.0] * 2]).double()
+    )
     noise = [estimator.estimate(torch.tensor(x).double()) for x in ([2.0, 8.0], [20.0, 80.0])]
     torch.testing.assert_close(noise[0][1], 2 * noise[0][0])
     torch.testing.assert_close(noise[1], 10**0.5 * noise[0])
@@ -306,7 +308,9 @@ def test_noise_is_what_each_joint_misses():
 def test_weights_that_samples_determine_leave_fewer_errors():
     """Of ten independent errors four weights leave six, and twenty leave one."""
     estimator, squares = (
-        torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double()),
+        torque_problem.NoiseEstimator(
+            50, torch.full((2,), 5.0).double(), *torch.tensor([[1.0] * 2, [10.0] * 2]).double()
+        ),
         torch.tensor([2.0, 8.0]),
     )
     noise = [estimator.estimate(squares.double(), determined).square() for determined in (0.0, 4.0, 20.0)]

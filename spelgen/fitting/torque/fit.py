@@ -2,6 +2,7 @@
 
 initial fit -> choice of the friction state -> choice of friction effects -> residual terms -> final fit
     -> comparison with ridge regression on held-out blocks of samples -> another fit if the regression is better
+    -> comparison with the model before the fit, which is kept if the fit is not better
 
 The stages before the residual terms use a subset of the samples, residual terms are selected on a larger subset, and
 the final fit uses all samples.
@@ -18,6 +19,7 @@ from scipy.special import stdtrit
 
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
+from spelgen.fitting.levenberg_marquardt import initial_state
 from spelgen.fitting.torque.covariance import Jackknife, contiguous_blocks, jackknife
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import joint_torque, limit_friction, set_initial_gains
@@ -41,8 +43,8 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 
-class RegressionComparison(NamedTuple):
-    """Held-out errors of a torque fit and of ridge regression, see `Regression`.
+class FitComparison(NamedTuple):
+    """Held-out errors of a torque fit and of simpler methods: ridge regression (see `Regression`), and no fit.
 
     Attributes:
         fit, regression: mean squared error of held-out blocks divided by the variance of the torque, averaged over
@@ -50,12 +52,15 @@ class RegressionComparison(NamedTuple):
         behind: True if the regression is significantly better than the fit.
         replaced: the error of the first fit, whose initial guess was the URDF, if it was replaced by a fit whose
             initial guess is the regression; otherwise None.
+        discarded: the error of the fit, if it was discarded because the model before the fit has no larger error;
+            otherwise None. `fit` is then the error of the model before the fit.
     """
 
     fit: float
     regression: float
     behind: bool
     replaced: float | None
+    discarded: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +78,7 @@ class TorqueSolution:
         correlation_time: correlation time of the torque errors, (n,) [s].
         held_out_nmse: mean squared error of held-out blocks divided by the variance of the torque, (n,).
         selected_terms: the selected residual terms.
-        comparison: comparison with ridge regression; None for an adapted fit.
+        comparison: comparison with simpler methods; None for an adapted fit.
     """
 
     rms_residual: np.ndarray
@@ -86,7 +91,7 @@ class TorqueSolution:
     correlation_time: np.ndarray
     held_out_nmse: np.ndarray
     selected_terms: tuple[SelectedTerm, ...]
-    comparison: RegressionComparison | None
+    comparison: FitComparison | None
 
 
 class _StagedFit(NamedTuple):
@@ -174,11 +179,12 @@ def _staged_fit(
 
 def _compared_fit(
     model: ArmModel, samples: TorqueSamples, prior: GaussianPrior
-) -> tuple[_StagedFit, RegressionComparison]:
+) -> tuple[_StagedFit, FitComparison]:
     """Fit all parameters; fit again if ridge regression predicts held-out torques significantly better than the fit.
 
     The second fit has the result of the regression as its initial guess. It is returned only if its held-out error is
-    below the error of the first fit. The parameters of the returned fit are written to the model.
+    below the error of the first fit. If the error of the model before the fit is not larger, its parameters are
+    returned. The returned parameters are written to the model.
     """
     initial, blocks = copy.deepcopy(model.state_dict()), contiguous_blocks(samples)
     torque_std = joint_torque(model, samples.columns).std(dim=0)
@@ -186,6 +192,7 @@ def _compared_fit(
     regression_squares = torch.from_numpy(regression.held_out)
     # The torque noise is not larger than the held-out error of the regression.
     max_error = torque_std * (regression_squares.sum(dim=0) / samples.count).sqrt()
+    unfitted = _unfitted(model, samples, prior)
     fitted = _staged_fit(model, samples, prior, max_error=max_error)
     # The lower bound of the noise is added to both errors, so that smaller differences are not significant.
     negligible = TUNING.min_noise**2 * model.n * torch.tensor([block.count for block in blocks])
@@ -202,15 +209,33 @@ def _compared_fit(
         """Return the mean nMSE of all joints. held_out: (blocks,), sums of squared errors / variance."""
         return float(held_out.sum()) / samples.count / model.n
 
-    best, replaced = fitted, None
+    best, replaced, discarded = fitted, None, None
     if behind(fitted):
         model.load_state_dict(initial)
         start_at(model, samples.subsampled(TUNING.initial_samples), regression)
         restarted = _staged_fit(model, samples, prior, max_error=max_error)
         if restarted.held_out.sum() < fitted.held_out.sum():
             best, replaced = restarted, nmse(fitted.held_out)
-        model.load_state_dict(best.parameters)
-    return best, RegressionComparison(nmse(best.held_out), nmse(other), behind(best), replaced)
+    # A single block cannot be held out, so that nothing shows that the fit is better.
+    if len(blocks) == 1 or unfitted.held_out.sum() <= best.held_out.sum():
+        best, discarded = unfitted, nmse(best.held_out)
+    model.load_state_dict(best.parameters)
+    return best, FitComparison(nmse(best.held_out), nmse(other), behind(best), replaced, discarded)
+
+
+def _unfitted(model: ArmModel, samples: TorqueSamples, prior: GaussianPrior) -> _StagedFit:
+    """Return the current parameters of a model as an estimate with the covariance of the prior."""
+    problem = TorqueProblem.of(TorqueJacobian(model, samples), prior)
+    state, free = initial_state(problem, problem.prior.mean), problem.free
+    covariance = problem.of_all_parameters(torch.linalg.inv(problem.prior.precision[free][:, free]))
+    residual = problem.jacobian.residual_samples(state.x).torque_residual
+    sizes = [block.count for block in contiguous_blocks(samples)]
+    squares = torch.stack([block.square().sum(dim=0) for block in residual.split(sizes)])
+    held_out = (squares / problem.noise_estimator.torque_std.square()).sum(dim=1)
+    estimate = TorqueEstimate(problem, state, covariance)
+    return _StagedFit(
+        estimate, Jackknife(covariance, squares), (), held_out, copy.deepcopy(model.state_dict())
+    )
 
 
 def _run_stages(

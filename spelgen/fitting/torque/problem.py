@@ -131,7 +131,7 @@ class TorqueProblem:
     adapt: Adaptation | None
     compensated: torch.Tensor
     correlation_time: torch.Tensor
-    max_error: torch.Tensor | None
+    max_error: torch.Tensor | None = None
 
     @classmethod
     def of(
