@@ -74,7 +74,8 @@ def linear_response(
     Returns:
         (..., K, n) positions at the end of each interval [rad, m].
     """
-    system = np.zeros((len(frequency), 3, 3))  # The state has three entries: position, velocity, command.
+    # system: (n, 3, 3), matrix A of x' = A x, with the state x = (position, velocity, command)
+    system = np.zeros((len(frequency), 3, 3))
     system[:, 0, 1] = 1.0
     system[:, 1, 0], system[:, 1, 2] = -(frequency**2), frequency**2
     system[:, 1, 1] = -2 * damping * frequency

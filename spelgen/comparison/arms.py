@@ -146,7 +146,7 @@ class ArmInputs(ComparedArm):
         return load_arm(self.urdf, self.joints, self.tip)
 
     def log_mapping(self) -> LogMapping:
-        """Return the columns and units of the logs."""
+        """Return the columns and units of the arm's logs."""
         return log_source(self.load(), self.mapping).mapping
 
     def split(self, number: int, splits: int) -> tuple[list[Trajectory], list[Trajectory]]:

@@ -100,8 +100,8 @@ class Job(Group):
         """
         protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
         options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
-        # The hash contains the content of the design and not its name, since a YAML file may have changed. It contains
-        # the version of spelgen, since versions may give different results.
+        # The hash contains the content of the design and not its name, since a YAML file may have changed. The hash
+        # contains the version of spelgen, since versions may give different results.
         sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
         return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
 
@@ -111,12 +111,12 @@ class Job(Group):
         return ablation_designs().get(self.design, self.design)
 
     def build(self) -> ArmModel:
-        """Return the untrained model."""
+        """Return the untrained model of the run."""
         arm = self.inputs.load()
         return build(arm, self.named_design, width=self.width, depth=self.depth, seed=self.seed)
 
     def result(self) -> RunResult | None:
-        """Return the stored result if its key is the key of this run, else None. Raises RunError."""
+        """Return the stored result if it has the key of this run, a hash of all inputs, else None. Raises RunError."""
         path = self.folder / "result.json"
         if not path.is_file():
             return None
@@ -197,7 +197,7 @@ def run_job(job: Job) -> RunResult:
 
 
 def _own_checkpoint(job: Job, run: RunFolder) -> bool:
-    """Return True if the folder has a checkpoint of this run; a checkpoint with another key is discarded."""
+    """Return True if the run's folder has a checkpoint with the key of the run; one with another key is discarded."""
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()

@@ -22,7 +22,7 @@ from spelgen.settings.settings import load_settings
 from spelgen.tasks import run_tasks
 
 PRESETS_ON_LOGS: tuple[str, ...] = ("closed-form", "hybrid")
-# The models of the paper (Wang et al., Sci Rep 15:33179, 2025) are first.
+# Presets that are compared on simulated logs. The models of the paper (Wang et al., Sci Rep 15:33179, 2025) are first.
 SIMULATED_PRESETS: tuple[str, ...] = ("phnode", "spel", "spel-kan", "minimal", "hybrid", "closed-form")
 
 
@@ -53,7 +53,8 @@ class Study:
             text += f", {len(self.results)} finished before"
         if not self.estimates:
             return text
-        # The estimated time assumes that all workers are equally loaded. It is at least the time of the longest run.
+        # The estimated time assumes that all workers are equally loaded. The estimate is at least the time of the
+        # longest run.
         seconds = max(sum(self.estimates.values()) / parallel, *self.estimates.values(), 0.0)
         return f"{text}; estimated time {duration(seconds)}"
 

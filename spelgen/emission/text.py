@@ -31,7 +31,7 @@ _COMMENTS = {
 }
 _EXAMPLE = """\
     import torch
-    from {module} import Model
+    from {module} import Model  # if this file is {module}.py
 
     model = Model()  # trained: model.load_state_dict(torch.load("run/model.pt"))
     q, qd, tau = torch.zeros(3, 100, {n}, dtype=torch.float64)  # any batch, joints last

@@ -91,7 +91,7 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
         whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
     gravity = dynamics.gravity(q)
     scale = gravity.square().mean(dim=0).sqrt()
-    # If no joint has a gravity torque, the errors are divided by 1.
+    # If no joint has a gravity torque, the errors of the gravity torque are divided by 1.
     scale = scale.clamp(min=TUNING.min_gravity_scale * scale.max().item() or 1.0)
     return UrdfRegularizer(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
 

@@ -66,8 +66,8 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
     )
     names = list(arm.chain.joint_names)
     settings = {"about": ABOUT.format(seed), "moving_joints": names} | carried
-    # Other arms are simulated along prescribed paths. This is not possible with position servos and passive joints, so
-    # such arms keep the protocol of their settings.
+    # Arms with position servos or passive joints cannot be simulated along prescribed paths, as all other arms are.
+    # They keep the protocol of their settings.
     if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
         settings["simulation"] = carried.get("simulation", {}) | {"seed": seed}
         return settings
@@ -106,7 +106,7 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
     dynamics = arm_dynamics(bodies.chain, bodies.settings)
     inertia = np.einsum("tii->i", dynamics.mass_matrix(q)) / len(q)
     speed = np.array([min(joint.velocity or np.inf, SPEEDS[joint.joint_type]) for joint in joints])
-    # The typical rigid-body torque is the RMS of gravity torque plus inertia torque. Both are assumed to be
+    # The typical rigid-body torque is the RMS of gravity torque plus inertia torque. The two torques are assumed to be
     # uncorrelated, so their mean squares are added.
     torque = np.hypot(
         np.sqrt(np.square(dynamics.gravity(q)).mean(axis=0)), AS_BUILT.acceleration * speed * inertia

@@ -72,9 +72,9 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
             (-1 to 1), torque of the bodies, and 1.
         errors: (W, K, n), command errors u - q [rad, m] at the K intervals of each of W windows.
     """
-    matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, W K, 5)
+    matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5)
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
-    # The driver gelsd is used, because torch's default driver chooses its pivots differently in each run.
+    # The least-squares driver is gelsd, because torch's default driver chooses its pivots differently in each run.
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution
     residual = target - matrix @ solution
     unscaled = torch.linalg.pinv(matrix.mT @ matrix).diagonal(dim1=-2, dim2=-1)
@@ -92,8 +92,8 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     q, qd = windows.q.numpy(), windows.qd.numpy()
     measured, dt = q[:, 1:], float(windows.dt.mean())
 
-    # The result is cached: most evaluations of the residual have the same delay, since finite differences change one of
-    # the four unknowns at a time.
+    # The mean commands for a delay are cached: most evaluations of the residual have the same delay, since finite
+    # differences change one of the four unknowns at a time.
     @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
         """Return the mean command of each interval of W windows of K samples, (W, K-1, n) [rad, m]."""
@@ -102,9 +102,11 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     def delayed_error(delay: float) -> float:
         return float(np.square(commands(delay) - measured).mean())
 
-    # A bounded scalar search suffices: commands change little within the bounds, so the error has one minimum.
+    # A bounded scalar search suffices for the delay of the commands: commands change little within the bounds, so the
+    # error has one minimum.
     late = minimize_scalar(delayed_error, bounds=(0, TUNING.max_delay), method="bounded").x
-    # The unknowns x: log of the natural frequency [rad/s], log of the damping ratio, delay [s], offset [rad, m].
+    # The unknowns x of a joint's linear servo: log of the natural frequency [rad/s], log of the damping ratio, delay
+    # [s], offset [rad, m].
     initial = (np.log(TUNING.frequency), 0.0, TUNING.initial_delay, 0.0)
     bounds = ((-np.inf, -np.inf, 0.0, -np.inf), (np.inf, np.inf, TUNING.max_delay, np.inf))
     fits = []

@@ -22,8 +22,10 @@ SERVO_UNITS = {
     "static error": "{0.position}",
     "offset/kp": "{0.position}",
 }
-"""Unit of each quantity of position servos. lag: kd/kp plus the delay of the commands; static error: coulomb/kp plus
-half the dead zone, which is `dead zone`."""
+"""Unit of each quantity of position servos.
+
+lag: kd/kp plus the delay of the commands. dead zone: half its width. static error: coulomb/kp plus half the dead zone.
+"""
 SUMS = {"lag": ("kd/kp", "delay"), "static error": ("coulomb/kp", "dead zone")}
 """Sums of two quantities that logs of servos may determine better than either of the two."""
 
@@ -45,7 +47,7 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def base_parameters(self) -> tuple[Interval, ...]:
-        """95 % intervals of the base parameters, or of their ratios to kp of `scale_joint`."""
+        """95 % intervals of the base parameters or, if no kp is known, of their ratios to kp of `scale_joint`."""
         if self._scale_index is None:
             return super().base_parameters
         values, roots = self._ratios(self._scale_index)
@@ -54,7 +56,7 @@ class ServoPosterior(Posterior):
 
     @property
     def base_units(self) -> str:
-        """Units of the base parameters, for the title of a table."""
+        """Units of the base parameters, with the name of the joint whose kp divides them, for the title of a table."""
         units = super().base_units
         return units if self.scale_joint is None else f"{units}; ratios to kp of {self.scale_joint}"
 
@@ -78,7 +80,10 @@ class ServoPosterior(Posterior):
         return (*super().unidentifiable, *pairs, *common)
 
     def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
-        """Return the quantities of the servos, and the function that returns their values, (8, n)."""
+        """Return the quantities of the servos that have intervals, and the function that returns their values.
+
+        The quantities are the keys of `SERVO_UNITS`. The function returns (8, n) for a model.
+        """
         line, joints = friction_line(self.model), tuple(range(self.model.n))
         quantities = [
             DriveQuantity(name, unit, name != "offset/kp", joints) for name, unit in SERVO_UNITS.items()
@@ -97,7 +102,7 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _scale_index(self) -> int | None:
-        """Index of `scale_joint`."""
+        """Index of the joint whose kp divides the base parameters (`scale_joint`); None if a kp is known."""
         if not self.model.servo.trained.all():
             return None
         ratios = map(self._ratios, range(self.model.n))
@@ -105,11 +110,11 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _stiffness(self) -> Propagated:
-        """kp of all servos, (n,) [Nm/rad, N/m], with a square root of its covariance."""
+        """kp of all servos, (n,) [Nm/rad, N/m], with a square root (n, k) of their covariance."""
         return self.propagate(lambda model: model.servo.kp())
 
     def _ratios(self, joint: int) -> Propagated:
-        """Return the ratios of the base parameters to kp of a joint, (r,), with a square root of their covariance."""
+        """Return the r base parameters / kp of a joint, (r,), with a square root (r, k) of their covariance."""
         values, (kp, kp_root) = self._base_values, self._stiffness
         ratio = values.value / kp[joint]
         return Propagated(ratio, (values.root - ratio.outer(kp_root[joint])) / kp[joint])

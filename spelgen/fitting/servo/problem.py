@@ -88,11 +88,11 @@ class ServoProblem:
         return cls(rollouts, noise, Likelihood.of(errors, noise, max_samples))
 
     def reweighted(self, x: ServoParameters) -> ServoProblem:
-        """Return the same problem with the likelihood estimated from the errors at parameters x."""
+        """Return the problem with the likelihood re-estimated from the position errors at parameters x."""
         return self.of(self.rollouts, self.noise, self.residual(x))
 
     def refined(self, steps: int, difference_step: float) -> ServoProblem:
-        """Return the same problem with other integration and finite-difference steps.
+        """Return the problem with other integration steps and other finite-difference steps.
 
         steps: number of integration steps per sample interval. difference_step: step of the finite differences.
         """
@@ -103,20 +103,20 @@ class ServoProblem:
 
     @property
     def parameters(self) -> ParameterMap:
-        """The map of the parameters to the model, and their prior."""
+        """Map from the fitted parameters to the model, with the prior of the parameters."""
         return self.rollouts.parameters
 
     def residual(self, x: ServoParameters) -> Tensor:
-        """Return predicted minus measured positions after the burn-in, (W, K', n) [rad, m]."""
+        """Return predicted minus measured positions after the burn-in for parameters x, (W, K', n) [rad, m]."""
         return self.rollouts.residual(x)
 
     def joint_costs(self, x: ServoParameters, errors: Tensor) -> Tensor:
-        """Return each joint's part of the cost, (n,), from errors (W, K', n): likelihood and prior of the joint."""
+        """Return the negative log posterior of each joint's own parameters, (n,), from errors (W, K', n) [rad, m]."""
         prior = self._prior(x)[: x.joints.numel()].view_as(x.joints)
         return self.likelihood.costs(errors) + prior.sum(dim=0)
 
     def cost(self, x: ServoParameters, errors: Tensor) -> float:
-        """Return the cost for errors (W, K', n); infinite if a rollout diverged."""
+        """Return the negative log posterior at x for errors (W, K', n) [rad, m]; infinite if a rollout diverged."""
         if not errors.isfinite().all():
             return float("inf")
         return float(self.likelihood.costs(errors).sum() + self._prior(x).sum())

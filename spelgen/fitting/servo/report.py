@@ -31,9 +31,10 @@ RATIOS = {
     "static_error": ("static error", "rad, m"),
     "dead_zone": ("half dead zone", "rad, m"),
 }
-"""Label and unit of each ratio to kp.
+"""Label and unit of each ratio of a parameter to kp.
 
-lag: kd / kp plus the delay. dry: mean dry friction in motion / kp. static_error: dry plus half the dead zone."""
+lag: kd / kp plus the delay. dry: mean dry friction in motion / kp. static_error: dry plus half the dead zone.
+"""
 ABOUT = (
     "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "
     "sum of kd and viscous friction, which such logs do not distinguish. lag: the sum of kd/kp and the delay, one "
@@ -75,7 +76,7 @@ class ServoSolution:
 
     @property
     def quantile(self) -> float:
-        """Half the width of a 95 % interval, divided by the standard deviation."""
+        """Half the width of a 95 % interval divided by the standard deviation, from Student's t."""
         # With few blocks, the quantile of Student's t distribution is larger than the Gaussian's 1.96.
         return float(stdtrit(max(1, len(self.blocks.curvature) - 1), 0.975))
 
@@ -103,7 +104,7 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # The step is an estimate of the integration error. It is added to the covariance as an error of one standard
+    # The step is an estimate of the integration error. The step is added to the covariance as an error of one standard
     # deviation.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
@@ -157,9 +158,9 @@ def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
 def ratios_with_deviations(
     problem: ServoProblem, solution: ServoSolution
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return {key of `RATIOS`: (ratios, deviations)}, (n,) each.
+    """Return {key of `RATIOS`: (ratios, deviations)}, (n,) each, for the current parameters of the model.
 
-    The deviations are the standard deviations of the logarithms of the ratios.
+    The deviations are the standard deviations of the logarithms of the ratios, from the covariance of ``solution``.
     """
     rollouts, parameters = problem.rollouts, problem.parameters
     tensors = {name: x.detach().clone().requires_grad_() for name, x in parameters.tensors.items()}
@@ -185,7 +186,7 @@ def ratios_with_deviations(
 
 
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
-    """Return the content for config.json: delay [s], RMS errors [rad, m], and per joint kp and the ratios to kp.
+    """Return the record of a fit for config.json: delay [s], RMS errors [rad, m], and per joint kp and ratios to kp.
 
     The intervals are 95 % intervals. The key "determined" is True if the upper end of the interval is below
     `ServoTuning.max_factor` times the ratio. For dry friction and the dead zone, the logs must also distinguish one
@@ -213,7 +214,7 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
             if ratio == "dead_zone" and not value:
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
-            # The logarithm is limited to 50, so that exp does not overflow.
+            # The half width of the interval of the logarithm is limited to 50, so that exp does not overflow.
             factor = math.exp(min(half, 50.0))
             # The static error, a sum of dry friction and dead zone, may be determined even if its two terms are not.
             determined = factor < TUNING.max_factor and (distinct[joint] or ratio not in ("dry", "dead_zone"))
@@ -247,7 +248,8 @@ def servo_summary(record: Content | None) -> FitSummary | None:
                 cells.append(f"{number(interval['value'])} +- {width:.2g} %")
             else:
                 cells.append("open")
-                # The dead zone is not named, since dry friction of the same joint is then undetermined and named.
+                # The dead zone is not in the list of undetermined ratios, since dry friction of the same joint is then
+                # undetermined and in the list.
                 if column != "dead_zone":
                     undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))

@@ -39,7 +39,7 @@ from spelgen.identification.least_squares import correlation_time
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 State = SolverState[torch.Tensor]
-"""Parameters x (K,), and as residual the squared torque residual per joint (n,)."""
+"""State of the solver: parameters x (K,), and as `residual` the squared torque residual per joint, (n,) [Nm^2, N^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,8 @@ class NoiseEstimator:
             max_error: (n,) [Nm, N] or None: the standard deviation of the torque.
         """
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
-        # The standard deviation has a lower bound, which avoids divisions by zero at joints of constant torque.
+        # The standard deviation of the torque has a lower bound, which avoids divisions by zero at joints of constant
+        # torque.
         torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
         max_error = torque_std if max_error is None else torch.minimum(max_error, torque_std)
         return cls(jacobian.samples.count, correlation_length, torque_std, max_error)
@@ -95,8 +96,8 @@ class NoiseEstimator:
             effective_parameters: (n,) number of parameters that each joint's torque determines. Each parameter reduces
                 the degrees of freedom of the residual by one independent error.
         """
-        # At least one independent error remains. Otherwise the difference could be negative, since `updated` assigns an
-        # equal share of the parameters to each joint.
+        # At least one independent error remains. Otherwise the difference could be negative, since
+        # `TorqueProblem.updated` assigns an equal share of the parameters to each joint.
         fraction = (self.errors - effective_parameters).clamp(min=1.0) / self.errors
         rms = torch.minimum((squared_residual / self.count / fraction).sqrt(), self.max_error)
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
@@ -104,7 +105,7 @@ class NoiseEstimator:
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
         """Return the noise (n,) [Nm, N] for an iteration of noise annealing.
 
-        It is `annealing_fraction` times the noise that is estimated from the residual.
+        This noise is `annealing_fraction` times the noise that is estimated from the residual.
 
         squared_residual: (n,) sum over all samples [Nm^2, N^2].
         """
@@ -176,14 +177,14 @@ class TorqueProblem:
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
-        # Joints have common parameters, so the solution depends on the weights 1 / noise^2 of the joints, which depend
-        # on the solution. Two iterations suffice.
+        # The least-squares solution depends on the weights 1 / noise^2 of the joints, since joints have common
+        # parameters, and the weights depend on the solution. Two iterations suffice.
         for _ in range(2):
             noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
         return replace(self, noise=noise)
 
     def residual(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the sum of the squared torque residual over all samples, per joint, (n,) [Nm^2, N^2]."""
+        """Return the sum of the squared torque residual over all samples at x (K,), per joint, (n,) [Nm^2, N^2]."""
         return self.jacobian.squared_residual(x)
 
     def cost(self, x: torch.Tensor, residual: torch.Tensor) -> float:
@@ -196,9 +197,9 @@ class TorqueProblem:
         return float(((residual / self.noise.square()).sum() + penalty) / 2)
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
-        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) for the k free parameters."""
-        # The prior of common factors couples free and fixed parameters. Therefore all rows are computed first, and the
-        # free ones are selected afterwards.
+        """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters."""
+        # The prior of common factors couples free and fixed parameters. Therefore the Hessian of all parameters is
+        # computed first, and the rows and columns of the free ones are selected afterwards.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
@@ -210,8 +211,8 @@ class TorqueProblem:
         step: (k,), step of the k free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
-        # x + step needs less time and is as good near the optimum. Far from the optimum, the curved step may have a
-        # lower cost.
+        # The candidate x + step needs less time and is as good near the optimum. Far from the optimum, the curved step
+        # may have a lower cost.
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
@@ -242,15 +243,15 @@ class TorqueProblem:
         return covariance
 
     def updated(self, state: State, covariance: torch.Tensor) -> TorqueProblem:
-        """Return the problem with noise and prior widths re-estimated at a state.
+        """Return the problem with noise and prior widths re-estimated at a state of the solver.
 
         The noise depends on the effective number of parameters, gamma = tr(1 - covariance P), with the precision P of
         the prior (MacKay, 1992). Each joint is assigned an equal share of gamma. covariance: (K, K), posterior
         covariance.
         """
         free, joints = self.free, len(state.residual)
-        # gamma is computed for all joints together, since the torques of several joints determine a parameter of a
-        # body.
+        # The effective number of parameters, gamma, is computed for all joints together, since the torques of several
+        # joints determine a parameter of a body.
         gamma = float(free.sum() - (covariance * self.prior.precision)[free][:, free].sum())
         noise = self.noise_estimator.estimate(state.residual, gamma / joints)
         # The prior width of the bodies cannot be estimated if only one body, the load, is fitted.
@@ -291,7 +292,8 @@ class TorqueEstimate:
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
-        # The weight of an independent error, length / noise^2, must be the same for both sample intervals.
+        # The weight of an independent error, (correlation length) / noise^2, must be the same for both sample
+        # intervals.
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
@@ -353,8 +355,8 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # `weight` is the weight of the estimate, if the weight of the prior mean is 1: a ratio of numbers of independent
-    # errors.
+    # `weight` is the weight of the estimated correlation time, if the weight of its prior mean is 1: a ratio of numbers
+    # of independent errors.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

@@ -68,7 +68,7 @@ def _regression(
     def products(x: SampleBlock) -> np.ndarray:
         """Return the Gram matrix of the K columns of the regressor and the torque per joint, (n, K + 1, K + 1).
 
-        Both are first divided by `torque_std` per joint.
+        Columns and torque are first divided by `torque_std` per joint.
         """
         rows = np.concatenate([columns(x), joint_torque(model, x).numpy()[..., None]], axis=2)
         rows = (rows / torque_std[:, None]).swapaxes(0, 1)
@@ -83,7 +83,8 @@ def _regression(
     def solution(gram: np.ndarray, penalty: float) -> np.ndarray:
         """Return (..., K + 1): the weights of the K scaled columns, then -1 as the weight of the torque.
 
-        The quadratic form of a Gram matrix with this vector is the squared residual.
+        gram: (..., K + 1, K + 1) Gram matrix of columns and torque. The quadratic form of a Gram matrix with the
+        returned vector is the squared residual.
         """
         normal = gram[..., :-1, :-1] + penalty * np.eye(len(length))
         weights = np.linalg.solve(normal, gram[..., :-1, -1:])[..., 0]
@@ -95,7 +96,7 @@ def _regression(
         return np.asarray((weights * (grams @ weights)).sum(axis=(2, 3)))
 
     penalty = min(PENALTIES, key=lambda penalty: float(held_out(penalty).sum()))
-    parameters = (solution(total, penalty) / scale)[:-1]  # weights of the unscaled columns
+    parameters = (solution(total, penalty) / scale)[:-1]  # parameters: weights of the unscaled columns
     return Regression(held_out(penalty), lambda x: columns(x) @ parameters)
 
 
@@ -110,8 +111,9 @@ def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) ->
     """
     with torch.no_grad():
         body = pseudo_inertia(torch.tensor([DEFAULT_BODY]).double())
-        relative = torch.linalg.solve(model.bodies.factors, body)  # C^-1 J, with the pseudo-inertia J
-        relative = torch.linalg.solve(model.bodies.factors, relative.mT)  # C^-1 J C^-T
+        # relative: C^-1 J, with the factor C of a body and the pseudo-inertia J
+        relative = torch.linalg.solve(model.bodies.factors, body)
+        relative = torch.linalg.solve(model.bodies.factors, relative.mT)  # relative: C^-1 J C^-T
         model.bodies.raw.copy_(log_cholesky_parameters(upper_cholesky((relative + relative.mT) / 2)))
         inputs = torch.linalg.pinv(model.input_matrix(samples.columns.q[:1])[0])
     torque = torch.from_numpy(regression.torque(samples.columns)) @ inputs.mT
