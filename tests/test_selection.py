@@ -295,12 +295,10 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
     assert torque_problem.TorqueProblem.cost(problem, x, squares) == pytest.approx(expected)
 
 
-ESTIMATOR = torque_problem.NoiseEstimator(50, *torch.tensor([[5.0, 5.0], [1.0, 1.0], [10.0, 10.0]]).double())
-
-
 def test_noise_is_at_most_the_largest_error():
     """A joint with a residual of 5 Nm and a largest error of 2 Nm; the other joint has its own residual of 1 Nm."""
-    estimator = replace(ESTIMATOR, max_error=torch.tensor([2.0, 2.0]).double())
+    columns = torch.tensor([[5.0, 5.0], [10.0, 10.0], [2.0, 2.0]]).double()
+    estimator = torque_problem.NoiseEstimator(50, *columns)
     noise = estimator.estimate(50 * torch.tensor([25.0, 1.0]).double())
     torch.testing.assert_close(noise, 5**0.5 * torch.tensor([2.0, 1.0]).double())
     torch.testing.assert_close(estimator.upper_bound(), 5**0.5 * estimator.max_error)
@@ -308,15 +306,19 @@ def test_noise_is_at_most_the_largest_error():
 
 def test_noise_is_what_each_joint_misses():
     """Ten times the squares are sqrt(10) times the noise, and no joint's noise is another's."""
-    noise = [ESTIMATOR.estimate(torch.tensor(x).double()) for x in ([2.0, 8.0], [20.0, 80.0])]
+    estimator = torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double())
+    noise = [estimator.estimate(torch.tensor(x).double()) for x in ([2.0, 8.0], [20.0, 80.0])]
     torch.testing.assert_close(noise[0][1], 2 * noise[0][0])
     torch.testing.assert_close(noise[1], 10**0.5 * noise[0])
 
 
 def test_weights_that_samples_determine_leave_fewer_errors():
     """Of ten independent errors four weights leave six, and twenty leave one."""
-    squares = torch.tensor([2.0, 8.0]).double()
-    noise = [ESTIMATOR.estimate(squares, determined).square() for determined in (0.0, 4.0, 20.0)]
+    estimator, squares = (
+        torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double()),
+        torch.tensor([2.0, 8.0]),
+    )
+    noise = [estimator.estimate(squares.double(), determined).square() for determined in (0.0, 4.0, 20.0)]
     torch.testing.assert_close(noise[1], noise[0] * 10 / 6)
     torch.testing.assert_close(noise[2], noise[0] * 10)
 

@@ -313,9 +313,9 @@ def test_held_out_errors_of_ridge_regression_are_those_of_refits(emitted, robots
             stacked = np.vstack([rows[kept].reshape(-1, rows.shape[2]), ridge])
             known = np.append(target[kept].ravel(), np.zeros(rows.shape[2]))
             parameters = np.linalg.lstsq(stacked, known, rcond=None)[0]
-            errors.append(np.square(rows[block] @ parameters - target[block]).sum())
+            errors.append(np.square(rows[block] @ parameters - target[block]).sum(axis=0))
         of_penalties.append(errors)
-    expected = min(of_penalties, key=sum)
+    expected = min(of_penalties, key=np.sum)
     np.testing.assert_allclose(found.held_out, expected, rtol=1e-4)
 
 

@@ -24,6 +24,7 @@ from spelgen.fitting.torque.covariance import Jackknife, contiguous_blocks, jack
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import joint_torque, limit_friction, set_initial_gains
 from spelgen.fitting.torque.problem import (
+    UNBOUNDED,
     TorqueEstimate,
     TorqueProblem,
     refine,
@@ -163,7 +164,7 @@ def _staged_fit(
     samples: TorqueSamples,
     prior: GaussianPrior,
     adapt: Adaptation | None = None,
-    max_error: torch.Tensor | None = None,
+    max_error: torch.Tensor = UNBOUNDED,
 ) -> _StagedFit:
     """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters.
 
@@ -182,24 +183,20 @@ def _staged_fit(
 def _compared_fit(
     model: ArmModel, samples: TorqueSamples, prior: GaussianPrior
 ) -> tuple[_StagedFit, FitComparison]:
-    """Fit all parameters; fit again if ridge regression predicts held-out torques significantly better than the fit.
+    """Fit all parameters, and fit again if ridge regression predicts held-out torques significantly better.
 
-    The second fit has the result of the regression as its initial guess. The second fit is returned only if its
-    held-out error is below the error of the first fit. If the held-out error of the model before the fit is not larger,
-    the parameters before the fit are returned. The returned parameters are written to the model.
+    The second fit bounds the torque noise by the held-out error of the regression. If the regression is still better, a
+    third fit has the result of the regression as its initial guess. The fit with the smallest held-out error is
+    returned, or the model before the fit if its error is not larger. The returned parameters are written to the model.
     """
     initial, blocks = copy.deepcopy(model.state_dict()), contiguous_blocks(samples)
     torque_std = joint_torque(model, samples.columns).std(dim=0)
     regression = best_regression(model, blocks, torque_std.numpy())
-    regression_squares = torch.from_numpy(regression.held_out)
-    # The torque noise is not larger than the held-out error of the regression.
-    max_error = torque_std * (regression_squares.sum(dim=0) / samples.count).sqrt()
-    unfitted = _unfitted(model, samples, prior)
-    fitted = _staged_fit(model, samples, prior, max_error=max_error)
+    squares = torch.from_numpy(regression.held_out)
     # The squared lower bound of the noise is added to the held-out errors of the fit and of the regression, so that
     # smaller differences are not significant.
     negligible = TUNING.min_noise**2 * model.n * torch.tensor([block.count for block in blocks])
-    other = regression_squares.sum(dim=1) + negligible
+    other = squares.sum(dim=1) + negligible
 
     def behind(fit: _StagedFit) -> bool:
         """Return True if the held-out error of the regression is significantly smaller (t test, p = 0.01)."""
@@ -216,13 +213,20 @@ def _compared_fit(
         """
         return float(held_out.sum()) / samples.count / model.n
 
-    best, replaced, discarded = fitted, None, None
-    if behind(fitted):
+    best, replaced, discarded = _staged_fit(model, samples, prior), None, None
+    if behind(best):
+        max_error = torque_std * (squares.sum(dim=0) / samples.count).sqrt()
+        model.load_state_dict(initial)
+        bounded = _staged_fit(model, samples, prior, max_error=max_error)
+        best = min(best, bounded, key=lambda fit: float(fit.held_out.sum()))
+    if behind(best):
         model.load_state_dict(initial)
         start_at(model, samples.subsampled(TUNING.initial_samples), regression)
         restarted = _staged_fit(model, samples, prior, max_error=max_error)
-        if restarted.held_out.sum() < fitted.held_out.sum():
-            best, replaced = restarted, nmse(fitted.held_out)
+        if restarted.held_out.sum() < best.held_out.sum():
+            best, replaced = restarted, nmse(best.held_out)
+    model.load_state_dict(initial)
+    unfitted = _unfitted(model, samples, prior)
     # A single block cannot be held out, so that nothing shows that the fit is better.
     if len(blocks) == 1 or unfitted.held_out.sum() <= best.held_out.sum():
         best, discarded = unfitted, nmse(best.held_out)

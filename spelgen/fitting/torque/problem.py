@@ -38,6 +38,8 @@ from spelgen.fitting.torque.tuning import TUNING
 from spelgen.identification.least_squares import correlation_time
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
+UNBOUNDED = torch.tensor(torch.inf).double()
+"""Bound of the torque errors of a fit that is not compared with a simpler method [Nm, N]."""
 State = SolverState[torch.Tensor]
 """State of the solver: parameters x (K,), and as `residual` the squared torque residual per joint, (n,) [Nm^2, N^2]."""
 
@@ -55,23 +57,17 @@ class NoiseEstimator:
     count: int
     correlation_length: torch.Tensor
     torque_std: torch.Tensor
-    max_error: torch.Tensor
+    max_error: torch.Tensor = UNBOUNDED
 
     @classmethod
     def of(
-        cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor, max_error: torch.Tensor | None = None
+        cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor, max_error: torch.Tensor = UNBOUNDED
     ) -> NoiseEstimator:
-        """Return the estimator for the samples of a Jacobian.
-
-        Args:
-            correlation_time: (n,) [s] of the torque errors.
-            max_error: (n,) [Nm, N] or None: the standard deviation of the torque.
-        """
+        """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
         # The standard deviation of the torque has a lower bound, which avoids divisions by zero at joints of constant
         # torque.
         torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
-        max_error = torque_std if max_error is None else torch.minimum(max_error, torque_std)
         return cls(jacobian.samples.count, correlation_length, torque_std, max_error)
 
     @property
@@ -80,16 +76,13 @@ class NoiseEstimator:
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] of a model with the largest torque error."""
-        return self.max_error * self.correlation_length.sqrt()
+        """Return the largest noise (n,) [Nm, N], at most that of a model that predicts a constant torque."""
+        return torch.minimum(self.max_error, self.torque_std) * self.correlation_length.sqrt()
 
     def estimate(
         self, squared_residual: torch.Tensor, effective_parameters: torch.Tensor | float = 0.0
     ) -> torch.Tensor:
         """Return the noise (n,) [Nm, N] for a squared residual, between a fraction of `torque_std` and `max_error`.
-
-        Without the upper bound, a joint that is fitted badly would have a large noise and a small weight, which makes
-        its fit even worse.
 
         Args:
             squared_residual: (n,) sum over all samples [Nm^2, N^2].
@@ -122,8 +115,9 @@ class TorqueProblem:
         adapt: group of parameters to estimate, "load", "friction" or "unit"; None: all parameters.
         compensated: (n,), True for joints whose drives compensate friction (see `stages.find_compensation`).
         correlation_time: (n,) [s], correlation time of the torque errors.
-        max_error: (n,) [Nm, N], upper bound of the root mean square torque error: a simpler method has this error on
-            held-out samples. None: the standard deviation of the torque.
+        max_error: (n,) [Nm, N], upper bound of the root mean square torque error, for example the held-out error of
+            ridge regression. Without a bound, a joint that is fitted badly has a large noise and therefore a small
+            weight, which keeps its fit bad.
     """
 
     jacobian: TorqueJacobian
@@ -132,7 +126,7 @@ class TorqueProblem:
     adapt: Adaptation | None
     compensated: torch.Tensor
     correlation_time: torch.Tensor
-    max_error: torch.Tensor | None = None
+    max_error: torch.Tensor = UNBOUNDED
 
     @classmethod
     def of(
@@ -140,7 +134,7 @@ class TorqueProblem:
         jacobian: TorqueJacobian,
         widths: GaussianPrior,
         adapt: Adaptation | None = None,
-        max_error: torch.Tensor | None = None,
+        max_error: torch.Tensor = UNBOUNDED,
     ) -> TorqueProblem:
         """Return the problem with the model's current parameters as the prior mean.
 
