@@ -80,7 +80,25 @@ def identify_by(
         notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
     # logged motor torques are converted to joint torques, which the regressor describes
     equations = _Equations(arm.chain, [replace(x, tau=x.tau @ drives.inputs.T) for x in samples], drives)
-    return [replace(equations.solved(x), diagnostics=tuple(notes), torque_delay=delay) for x in methods]
+    solved = map(equations.solved, methods)
+    return [replace(x, diagnostics=(*notes, *_negative_friction(x)), torque_delay=delay) for x in solved]
+
+
+def friction_compensated(values: str) -> Diagnostic:
+    """Return the warning about drives that compensate friction. values: friction or compensation per joint."""
+    message = (
+        f"the measured torque decreases with velocity, as if the drive compensated friction: {values}; check the "
+        "torques' signs and what the controller subtracts"
+    )
+    return Diagnostic("warning", "friction-compensated", "logs", None, message)
+
+
+def _negative_friction(result: Identification) -> Iterator[Diagnostic]:
+    """Yield a warning if the 95 % interval of a viscous friction coefficient is below zero."""
+    names = {f"viscous{k}": name for k, name in enumerate(result.arm.joint_names, start=1)}
+    negative = [f"{names[x.name]} {x.text}" for x in result.intervals if x.name in names and x.high < 0]
+    if negative:
+        yield friction_compensated(f"viscous friction {', '.join(negative)} Nm s/rad (N s/m)")
 
 
 def least_squares(

@@ -53,8 +53,8 @@ class FitComparison(NamedTuple):
         behind: True if the regression is significantly better than the fit.
         replaced: the error of the first fit, whose initial guess was the URDF, if it was replaced by a fit whose
             initial guess is the regression; otherwise None.
-        discarded: the error of the fit, if it was discarded because the model before the fit has no larger error;
-            otherwise None. `fit` is then the error of the model before the fit.
+        discarded: the error of the fit, if the logs do not support a fit and the model before the fit has no larger
+            error; otherwise None. `fit` is then the error of the model before the fit, which is the result.
     """
 
     fit: float
@@ -187,7 +187,8 @@ def _compared_fit(
 
     The second fit bounds the torque noise by the held-out error of the regression. If the regression is still better, a
     third fit has the result of the regression as its initial guess. The fit with the smallest held-out error is
-    returned, or the model before the fit if its error is not larger. The returned parameters are written to the model.
+    returned. If its error is above `TUNING.unsupported`, and not below the error of the model before the fit, the model
+    before the fit is returned. The returned parameters are written to the model.
     """
     initial, blocks = copy.deepcopy(model.state_dict()), contiguous_blocks(samples)
     torque_std = joint_torque(model, samples.columns).std(dim=0)
@@ -225,11 +226,12 @@ def _compared_fit(
         restarted = _staged_fit(model, samples, prior, max_error=max_error)
         if restarted.held_out.sum() < best.held_out.sum():
             best, replaced = restarted, nmse(best.held_out)
-    model.load_state_dict(initial)
-    unfitted = _unfitted(model, samples, prior)
-    # A single block cannot be held out, so that nothing shows that the fit is better.
-    if len(blocks) == 1 or unfitted.held_out.sum() <= best.held_out.sum():
-        best, discarded = unfitted, nmse(best.held_out)
+    # A fit that is supported by its data is kept even if the URDF is exact: it has the smaller intervals.
+    if nmse(best.held_out) > TUNING.unsupported:
+        model.load_state_dict(initial)
+        unfitted = _unfitted(model, samples, prior)
+        if unfitted.held_out.sum() <= best.held_out.sum():
+            best, discarded = unfitted, nmse(best.held_out)
     model.load_state_dict(best.parameters)
     return best, FitComparison(nmse(best.held_out), nmse(other), behind(best), replaced, discarded)
 

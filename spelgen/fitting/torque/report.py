@@ -16,6 +16,7 @@ from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.torque.fit import FitComparison, TorqueSolution
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
+from spelgen.identification.identify import friction_compensated
 from spelgen.runtime.motors import MotorInputs
 
 TERM_NAMES = {
@@ -50,11 +51,7 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
         joints = ", ".join(
             f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated) if value[k] > 0
         )
-        yield _warning(
-            "friction-compensated",
-            "the measured torque decreases with velocity, as if the drive compensated friction: "
-            f"{joints} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts",
-        )
+        yield friction_compensated(f"{joints} Nm s/rad (N s/m) are added")
     if residual_terms(model) is not None:
         yield Diagnostic("info", "residuals", "model", None, _selected_terms(samples, solution, names))
     # A few positions suffice for the mean inertia.
