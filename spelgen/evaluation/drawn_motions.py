@@ -48,7 +48,7 @@ class PredictedMotion(DrawnMotion):
     """A measured motion and its prediction, (T, n) each: a predicted window of a log, or a replayed log.
 
     Attributes:
-        start: Time of the first sample of the window since the start of the log [s]; None for a replayed log.
+        start: Time t of the first sample of the window in the log [s]; None for a replayed log.
         predicted_q: Predicted positions, (T, n) [rad, m].
         qd: Measured velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         predicted_qd: Predicted velocities, (T, n) [rad/s, m/s]; None for a replayed log.
@@ -90,9 +90,9 @@ Drawn = TypeVar("Drawn", bound=DrawnMotion)
 
 
 def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
-    """Return the motion of median error and the motion of largest error, with their field `which`.
+    """Return the motion of median error and the motion of largest error; a single motion is returned once.
 
-    A single motion is returned once.
+    The field `which` of the returned motions is set to "typical" and "worst".
     """
     # Sorting keeps the order of motions with equal errors, so the same logs always give the same page.
     ordered = sorted(motions, key=lambda motion: math.inf if motion.error is None else motion.error)
@@ -163,7 +163,10 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 
 
 def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
-    """Return mean motion, acceleration and torque of each sample interval of a log of low sample rate."""
+    """Return the mean q, qd, qdd and torque in each sample interval of `piece`, a log of low sample rate.
+
+    The mean acceleration is the change of qd divided by the duration of the interval.
+    """
     steps = cut_windows([piece], 2, measured=logs.used.filtered)
     qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt
     q, qd, tau = steps.q.mean(dim=1).numpy(), steps.qd.mean(dim=1).numpy(), steps.tau[:, 0].numpy()

@@ -42,7 +42,7 @@ class Row:
 
     @property
     def best(self) -> list[str]:
-        """Names of the columns with the smallest number; [] if the row has one column or is not ranked."""
+        """Names of the columns that have the smallest number of this row; [] for a row of one column, or not ranked."""
         if not self.ranked or len(self.values) < 2:
             return []
         smallest = min((value for value in self.values.values() if value is not None), default=None)

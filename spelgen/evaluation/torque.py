@@ -135,7 +135,7 @@ def coarse_torques(
             steps[joint] = step
             message = (
                 f"the torque of {joint} is logged in steps of {step:.3g}, as large as the torque itself: "
-                "its error is that of the log, and the assessment omits this joint"
+                "these steps determine its error, and the assessment omits this joint"
             )
             notes.append(Diagnostic("warning", "coarse-torque", "logs", None, message))
     return steps

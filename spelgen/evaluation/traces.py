@@ -194,7 +194,7 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
     motions = []
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
         motion = predicted_motion(piece.name, predictions.windows, predictions.states[MODEL], k)
-        start = number(piece.t[first] - piece.t[0])
+        start = number(piece.t[first])
         motions.append(replace(thinned(motion, TUNING.curve_samples), start=start, error=number(error)))
     return typical_and_worst(motions)
 
@@ -228,7 +228,7 @@ def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Traj
     # The grid of speeds is finer near zero, where the sign of friction changes.
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)
     speeds = torch.from_numpy(grid[:, None] * fast)  # speeds: (81, n), 81 speeds of each joint
-    # velocity vectors (81, n, n): entry [k, j] is a velocity vector at which only joint j moves.
+    # velocity vectors (81, n, n): entry [k, j] is the vector at which joint j has its speed k and the other joints rest
     alone = torch.diag_embed(speeds)
     positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)
     curves = {}

@@ -162,7 +162,7 @@ def _relative(errors: StateErrors | None) -> float:
 
 
 def _better_baselines(results: Results) -> list[str]:
-    """Return sentences that name the horizons at which constant velocity or another baseline has a smaller error."""
+    """Return sentences that name the baselines with a smaller error than the model: at which horizons, or in torque."""
     times = []
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:

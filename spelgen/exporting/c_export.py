@@ -109,7 +109,7 @@ def called_by_c(
             # Outputs start as NaN, so that the parity check fails if a function does not write an entry.
             outputs[key] = np.full((states, *shape), np.nan, dtypes.get(key, dtype))
         arguments += outputs.values()
-        # The C functions are called once per state, as by a control loop.
+        # The exported C functions have no batch dimension, so each is called once per state.
         for state in range(states):
             rows = [array[state : state + 1] for array in arguments]
             call(*(row.ctypes.data_as(ctypes.c_void_p) for row in rows))

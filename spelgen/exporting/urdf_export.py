@@ -88,7 +88,7 @@ def _settings_text(projection: RigidBodyProjection) -> str:
     """Return the arm's settings as YAML with the rotor inertia and the friction of the model."""
     path = projection.arm.robot.path.with_suffix(".yaml")
     content: dict[str, dict[str, dict[str, object]]] = {}
-    # All other settings in the user's settings file are kept.
+    # The user's settings file of the arm is copied, with new rotor inertias and friction.
     if path.exists():
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})

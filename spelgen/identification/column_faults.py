@@ -100,8 +100,9 @@ class WrongScale(Fault):
     """Base class of faults that factors on the motion and on the torques correct: signals of another sense or unit.
 
     factors: candidates for the factors, (2, n) each: first row for the motion, second row for the torques of n joints.
-    The function `joint_keys` is common to all subclasses, since the setting `sign` affects both the motion and the
-    torque of a joint.
+
+    All subclasses share `joint_keys`: the setting `sign` reverses both the motion and the torque of a joint, so that a
+    correction of the motion also changes the setting `gain` of the torque.
     """
 
     def __init__(self, factors: Sequence[np.ndarray]) -> None:
@@ -163,7 +164,7 @@ class JointSense(WrongScale):
         super().__init__([np.stack([sign, torque]) for sign in signs for torque in (np.ones(n), sign)])
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose motion has the opposite sense: their factor `motion` is negative."""
+        """Return the mask (n,) of the joints whose motion has the opposite sense: `motion`, (n,), is negative there."""
         return np.asarray(motion < 0)
 
     def text(self, correction: Correction) -> str:
@@ -221,9 +222,9 @@ class TorqueUnit(WrongScale):
                 bounds=(-np.log(10), np.log(10)), method="bounded", options={"xatol": 0.05},
             ).x  # fmt: skip
             best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
-        # Separate factors also correct errors of the URDF's masses, which lowers the cost a little: a significant
-        # decrease is required. No factor explains torques that do not resemble the URDF's, e.g. torques without sign:
-        # residuals must be small.
+        # Two conditions are tested. Separate factors also correct errors of the URDF's masses, which lowers the cost a
+        # little, so the cost decrease must be significant. Torques of another fault, such as torques without sign, are
+        # not explained by any factor, so the relative residual of each joint must be small.
         if best.cost < lowest.cost - GEOMETRY.needed and best.errors.max() <= GEOMETRY.unexplained:
             yield best
 
@@ -237,7 +238,7 @@ class TorqueUnit(WrongScale):
         return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * present])))
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose torque has another unit: a factor `torque` other than 1 or -1."""
+        """Return the mask (n,) of the joints whose torque has another unit: `torque`, (n,), is not 1 or -1 there."""
         return np.asarray(np.abs(torque) != 1)
 
     def text(self, correction: Correction) -> str:
@@ -271,7 +272,7 @@ class PositionUnit(WrongScale):
     rarity = 2
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose positions have another unit: a factor `motion` not 1 or -1."""
+        """Return the mask (n,) of the joints whose positions have another unit: `motion`, (n,), is not 1 or -1."""
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
@@ -283,9 +284,11 @@ class PositionUnit(WrongScale):
 def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
     """Return candidates for factors (2, n) that correct the unit of the positions of all joints of one type.
 
-    scale: (n,) factor from logged positions to SI units in the current mapping, with the sign of the joint. There is
-    one candidate for each type of joint and each unit that differs from the unit in the mapping; torques have the
-    factor 1.
+    There is one candidate for each type of joint and each unit that differs from the unit in the mapping; torques have
+    the factor 1.
+
+    scale: (n,) factor from logged positions to SI units in the current mapping; negative for joints with the setting
+    `sign: -1`.
     """
     types, candidates = np.array(arm.joint_types), []
     for joint_type, units in UNITS.items():

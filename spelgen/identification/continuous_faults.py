@@ -79,9 +79,10 @@ class ZeroOffset(Fault):
         return f"positions with another zero, by {size}"
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the setting `offset` of a joint, the zero of its position; {} for a joint of the opposite sense.
+        """Return the setting `offset` of a joint if the hypothesis has another zero of its position; {} if not.
 
-        `JointSense` returns the offset for joints of the opposite sense, since another sign changes the offset, too.
+        For a joint of the opposite sense, {} is returned, too: `JointSense` returns sign and offset of such a joint,
+        since another sign may need another offset.
         """
         offset = correction.hypothesis.offset[joint]
         if correction.factors[0, joint] < 0 or offset == correction.unchanged.offset[joint]:
@@ -277,7 +278,7 @@ class Compensation(Fault):
             return
 
         def reduced(fraction: np.ndarray) -> Hypothesis:
-            """Return the hypothesis that the torques contain this fraction, (1,), of gravity."""
+            """Return the hypothesis that the torques contain only a fraction of the gravity torque; fraction: (1,)."""
             return with_gravity(self, base, fraction * present)
 
         without = problem.fit(reduced(np.zeros(1)))

@@ -115,7 +115,7 @@ class DriveProblem:
 
     @cached_property
     def errors(self) -> np.ndarray:
-        """Squared torque residual (B, n) of each joint in each block, divided by the mean squared torque of a block.
+        """Sum of the squared torque residuals of each joint in each block, (B, n), divided by `size` of the joint.
 
         The parameters are fitted to all other blocks; with a single block, they are fitted to this block.
         """

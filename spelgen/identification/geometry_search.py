@@ -57,10 +57,11 @@ def kinds_of_faults(
 
 
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
-    """Return the fit of the unchanged log and, if hypotheses about faults fit significantly better, their fits.
+    """Return the fit of the unchanged log, then the fits of hypotheses about faults that fit significantly better.
 
-    The best fit is first, and is followed by fits that are about as good. faults: kinds of faults; each kind and
-    combinations are tested.
+    At most three hypotheses of about the same cost are returned, the best one first. The result has only the fit of the
+    unchanged log if no hypothesis fits significantly better; a fault with other evidence than the cost needs no
+    significant decrease. faults: kinds of faults; each kind and combinations are tested.
     """
     # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)
@@ -101,12 +102,13 @@ def _weighed(
 ) -> list[HypothesisFit]:
     """Return the fits with costs that take a friction model with hysteresis into account.
 
-    The model of `problem` lacks presliding hysteresis. The residual of the hysteresis is a few per cent of the torque
-    under each hypothesis, and hides a part of the cost decrease of the right hypothesis. With hysteresis all cost
-    decreases are larger, also the decreases of wrong hypotheses (on recorded arms up to 32 instead of 17). Therefore
-    the larger one of two decreases is used: the decrease without hysteresis, and half of the decrease with hysteresis.
-    For a hypothesis with another delay the smaller one of both full decreases is used, since hysteresis resembles a
-    delay.
+    The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
+    under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
+
+    A friction model with hysteresis shows the whole decrease, but also larger decreases of wrong hypotheses: on
+    recorded arms up to 32, instead of 17 without hysteresis. Its decreases are therefore halved. The larger one of the
+    decrease without hysteresis and the halved decrease is used. For a hypothesis with another delay, the smaller one of
+    both decreases (not halved) is used, since hysteresis resembles a delay.
 
     Args:
         problem: problem without hysteresis.

@@ -62,7 +62,10 @@ class Hypothesis:
         return replace(self, faults=faults, **changes)  # type: ignore[arg-type]
 
     def signals(self, samples: MotionSamples) -> MotionSamples:
-        """Return the signals of the joints, in SI units, that logged samples mean under this hypothesis."""
+        """Return the samples corrected by this hypothesis: true signals of the joints, in SI units.
+
+        samples: logged samples. The result has signals only at the samples, and not around them.
+        """
         delays = _per_signal(self.delay)
         if self.drift.any():
             delays = delays + samples.times[:, None, None] * _per_signal(self.drift)

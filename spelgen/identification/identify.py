@@ -88,7 +88,7 @@ def friction_compensated(values: str) -> Diagnostic:
     """Return the warning about drives that compensate friction. values: friction or compensation per joint."""
     message = (
         f"the measured torque decreases with velocity, as if the drive compensated friction: {values}; check the "
-        "torques' signs and what the controller subtracts"
+        "signs of the torques, and whether the controller subtracts friction"
     )
     return Diagnostic("warning", "friction-compensated", "logs", None, message)
 
@@ -164,7 +164,8 @@ class _Equations:
         parameters: number K of parameters.
         """
         count, first = sum(len(block.q) for block in self._blocks), 0
-        group = np.arange(count) * BLOCKS // count  # `group`: the contiguous block of each sample
+        # group: number of the contiguous block to which each sample belongs, (count,)
+        group = np.arange(count) * BLOCKS // count
         products = np.zeros((len(self.drives.speeds), BLOCKS, parameters + 1, parameters + 1))
         for columns, tau in self._rows(friction):
             rows = np.concatenate([columns, tau[..., None]], axis=2).swapaxes(0, 1)

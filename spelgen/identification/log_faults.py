@@ -40,7 +40,7 @@ class Correction:
 
     @property
     def factors(self) -> np.ndarray:
-        """Factors (2, n) on the motion and torques of n joints, relative to the scales of the current mapping."""
+        """Scales in `hypothesis` divided by the scales in the current mapping, (2, n): motion, then torque."""
         return np.asarray(self.hypothesis.scale / self.unchanged.scale)
 
     def lines(self) -> str:
@@ -96,9 +96,9 @@ class Fault(ABC):
         """Return least-squares fits of hypotheses that correct one more fault of this kind in the log than `base`."""
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterable[HypothesisFit]:
-        """Return fits of hypotheses whose search takes seconds, such as orders of all joints.
+        """Return least-squares fits of hypotheses that take seconds to find, such as orders of all joints.
 
-        The search calls it only if no hypothesis among `fits` explains the torques.
+        `compare_hypotheses` calls this function only if none of the quick `fits` explains the torques.
         """
         return ()
 

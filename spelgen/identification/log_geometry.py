@@ -61,7 +61,7 @@ class GeometryProblem:
         self._counted: np.ndarray | None = None
         self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
-        self._chains: dict[Vector3, BodyChain] = {}  # chains of bodies, per vector of gravity
+        self._chains: dict[Vector3, BodyChain] = {}  # {vector of gravity: the arm's chain of bodies}, a cache
 
     def thinned(self, count: int) -> GeometryProblem:
         """Return the same least-squares problem on at most `count` samples, evenly spaced, to save time."""
@@ -72,8 +72,9 @@ class GeometryProblem:
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
         """Return the least-squares problem in which only some of the torques are fitted.
 
-        The other torques and their regressor rows become zero. counted: mask (S, n) of the fitted torques in the
-        unchanged log.
+        The other torques and their regressor rows become zero.
+
+        counted: mask (S, n), True for the torques that are fitted, of each joint in the unchanged log.
         """
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
@@ -130,7 +131,7 @@ class GeometryProblem:
         return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
     def residual(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
-        """Return the torque residual (S, n) [Nm, N] of parameters (K,): torques of the model minus logged torques."""
+        """Return the torques of the model with parameters (K,) minus the logged torques, (S, n) [Nm, N]."""
         torque = self.equations(hypothesis)[0] @ parameters
         return np.asarray(torque - hypothesis.signals(self.samples).tau)
 
@@ -147,8 +148,9 @@ class GeometryProblem:
                 self._chains[hypothesis.gravity] = body_chain(self.arm, hypothesis.gravity)
             rows = drive_rows(self._chains[hypothesis.gravity], q, qd, qdd, self.speeds)
             if self._has_hysteresis:
-                # The deflections of drive j act on joint i with the factor C_ji, like its other friction. Under a
-                # hypothesis, a joint may have the motion of another column, or motion of the opposite sense.
+                # `bent`: deflections of the bristles under the hypothesis. They are stored for the current mapping, so
+                # the joints are permuted and the signs reversed like the motion. The friction of drive j, which
+                # includes the force of its bristles, acts on joint i with the factor C_ji of C = `speeds`.
                 bent = self.samples.bent[:, hypothesis.source[0]] * np.sign(hypothesis.scale[0])[:, None]
                 bristles = bent[:, None] * self.speeds.T[:, :, None]
                 rows = np.concatenate([rows, bristles.reshape(*q.shape, -1)], axis=2)
@@ -268,10 +270,10 @@ class GeometryProblem:
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the penalty for negative rotor inertias, and for friction that drives the motion on average.
 
-        A violation adds half of its squared standard score to the cost, up to a bound. The bound is needed since a
-        drive may compensate friction, and since errors of the friction model may resemble inertia: fits of recorded
-        arms have friction that drives the motion (joint 6 of one arm of benchmarks/recordings.py) or a negative rotor
-        inertia (another arm), but not both.
+        Each of both violations adds half of its squared standard score to the cost, up to a bound. The bound is needed,
+        since the right hypothesis may have one violation: a drive may compensate friction, and errors of the friction
+        model may resemble inertia. Of the arms of benchmarks/recordings.py, one has friction that drives the motion
+        (joint 6), another one has a negative rotor inertia, and none has both.
 
         Args:
             x: (K,) parameters.
@@ -282,7 +284,8 @@ class GeometryProblem:
         armature, viscous, coulomb = (self._bodies + n * effect + drives for effect in range(3))
         functionals = np.zeros((2 * n, len(x)))
         functionals[drives, armature] = 1.0
-        # power that friction takes from the motion, qd (viscous qd + Coulomb sign qd), summed over the samples
+        # The second n functionals are the powers that friction takes from the motion of each joint, qd (viscous qd +
+        # Coulomb sign(qd)), summed over the samples. The sums are entries of the Gram matrices.
         functionals[n + drives, viscous] = normal[drives, viscous, viscous]
         functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
         negative = np.minimum(functionals @ x, 0.0)
@@ -354,7 +357,10 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
 
 
 def solution(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return `inverse(matrix) @ vector`, (K,), for a matrix (K, K) and a vector (K,), in a third of the time."""
+    """Return `inverse(matrix) @ vector`, (K,), for a matrix (K, K) and a vector (K,).
+
+    The linear system is solved without the inverse, which takes a third of the time.
+    """
     scaled, scale = _with_unit_diagonal(matrix)
     return np.asarray(np.linalg.solve(scaled, vector / scale) / scale)
 

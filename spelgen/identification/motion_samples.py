@@ -37,11 +37,11 @@ class MotionSamples(NamedTuple):
     """S samples of motion and joint torques of n joints, with the signals around each sample.
 
     Attributes:
-        values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at the E times `OFFSETS` relative to each sample.
-            Before the start and after the end of a recording, the first and last values continue. E = 1 if signals are
-            stored only at the samples, and not around them.
-        bent: (S, n, K) bristle deflections of the unchanged log, divided by the break-away displacements; K = 0 for
-            samples without a history of motion.
+        values: (S, n, 4, E) q [rad, m], qd, qdd (per s, per s^2) and tau [Nm, N] at the E times `OFFSETS` relative to
+            each sample. Before the start and after the end of a recording, the first and last values continue. E = 1 if
+            signals are stored only at the samples, and not around them.
+        bent: (S, n, K) deflections of K bristles per joint for the motion in the current mapping, divided by the
+            break-away displacements; K = 0 for samples without a history of motion.
         direction: (S, n) direction of dry friction, see `DynamicsSamples`.
         times: (S,) times of the samples since the start of their recording [s]; 0 for E = 1.
     """
@@ -73,18 +73,19 @@ class MotionSamples(NamedTuple):
         return self.values[..., self.values.shape[3] // 2]
 
     def at(self, delays: np.ndarray) -> np.ndarray:
-        """Return the signals (S, n, 4) at the times `delays` [s] after the samples, by a spline.
+        """Return the signals (S, n, 4) at the times `delays` [s] after the samples, interpolated by a spline.
 
-        delays: (n, 4), up to `longest_delay`; or (S, n, 4) of any length, for which the signals around the sample that
-        is nearest to the delayed time are interpolated.
+        delays: (n, 4), the same for all samples, with magnitudes up to `longest_delay`: the signals around each sample
+        are interpolated. Or (S, n, 4), of any magnitude: the signals around another sample are interpolated, the one
+        that is nearest to the delayed time.
         """
         if not delays.any():
             return self.central
         spline = interpolation()
         if delays.ndim == 2:
             return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
-        # `present`: times of the samples, larger in later recordings, so that the nearest sample is of the same
-        # recording
+        # `present`: times of the samples on a common axis. 1e6 s are added from one recording to the next, so that the
+        # nearest sample always belongs to the same recording.
         recording = np.cumsum(np.diff(self.times, prepend=self.times[:1]) < 0)
         present = self.times + 1e6 * recording
         times = present[:, None, None] + delays
@@ -95,7 +96,7 @@ class MotionSamples(NamedTuple):
 
     @property
     def longest_delay(self) -> float:
-        """Longest time [s] after a sample at which signals are known; 0 if they are stored only at the samples."""
+        """Largest time before or after a sample up to which its signals are stored [s]; 0 without such signals."""
         return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
 
     def every(self, stride: int) -> MotionSamples:
@@ -114,7 +115,10 @@ def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
 
 @cache
 def interpolation() -> CubicSpline:
-    """Return the spline of the weights (E,) of the signals at `OFFSETS`, a function of time [s] after the sample."""
+    """Return a function of time [s] after a sample, which returns weights (E,) for the values at the times `OFFSETS`.
+
+    The weighted sum of the E values is their cubic spline at this time.
+    """
     return CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
 
 
@@ -130,8 +134,8 @@ class DriveLog:
 
         Args:
             joint_types: "revolute" or "prismatic" for each of the n joints.
-            drives: input matrix and speeds of the drives.
-            preprocessing: filter and gap of the samples; its torque delay is ignored.
+            drives: input matrix, and matrix from joint speeds to motor speeds.
+            preprocessing: filter, and shortest gap [s] at which recordings are split; its torque delay is ignored.
         """
         self._inputs, self._preprocessing = drives.inputs, replace(preprocessing, torque_delay=0.0)
         smoothing = np.full(len(joint_types), FrictionModel().coulomb_smoothing_velocity)

@@ -79,9 +79,9 @@ def find_torque_delay(
     Args:
         logs: trajectories with torques.
         joint_types: "revolute" or "prismatic" for each joint.
-        drives: input matrix and speeds of the drives.
+        drives: input matrix, and matrix from joint speeds to motor speeds.
         chain: chain of the arm's bodies.
-        preprocessing: filter and gap of the samples.
+        preprocessing: filter, and shortest gap [s] at which recordings are split; its torque delay is ignored.
     """
     collected = DriveLog(joint_types, drives, preprocessing)
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
@@ -91,7 +91,10 @@ def find_torque_delay(
 
 
 def delay_of(problem: DriveProblem) -> TorqueDelay:
-    """Return the delay of the torques or, if a coupling of motors explains the logs better, the coupling instead."""
+    """Return the delay of the torques in a `DriveProblem`; the result contains a coupling of motors instead, if found.
+
+    Both are detected by the decrease of the torque residual of least squares.
+    """
     late, samples = _likely_delay(problem), problem.samples
     if late.delay:
         # The delay is removed before couplings are searched: an uncorrected delay may be mistaken for a coupling.

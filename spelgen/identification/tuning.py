@@ -56,7 +56,7 @@ class LogGeometryTuning:
     # [1] Constant added to a joint's relative residual variance: errors of friction models are 2 % of the torque.
     error_floor: float = 4e-4
     # Smallest cost decrease of an accepted hypothesis. On recorded arms the largest decrease of a wrong hypothesis
-    # is 16.
+    # is 17.
     needed: float = 20.0
     # Smallest cost decrease without hysteresis of a hypothesis that is accepted for its decrease with hysteresis.
     slight: float = 3.0

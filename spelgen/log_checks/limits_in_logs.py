@@ -40,7 +40,7 @@ class FlatTops(NamedTuple):
 
     @classmethod
     def of(cls, q: np.ndarray, tau: np.ndarray) -> FlatTops:
-        """Return the flat bottoms and tops of one trajectory with positions q and torques tau, (T, n) each."""
+        """Return the constant extreme values of positions q and torques tau of one trajectory, (T, n) each."""
         return cls(flat_tops(q)[0], *flat_tops(tau))
 
     @classmethod
@@ -77,7 +77,8 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     """Return an error that names the joints whose torques were logged as magnitudes; [] if there are none.
 
     The torques get the signs of the model's torques, and the model is fitted again, in a few alternations. A joint is
-    named if this lowers its residual much. A joint whose load always has the same direction keeps its torques.
+    named if this lowers its residual much, and if both signs occur: the load of a joint with only one sign may indeed
+    have always the same direction.
     """
     problem = problem.thinned(GEOMETRY.confirming_samples)
     signals = problem.unchanged.signals(problem.samples)

@@ -72,8 +72,8 @@ class JointReport:
         steps: quantisation step of each signal; None for signals that are not quantised in most trajectories.
         velocity_factor: ratio of dq/dt to qd, by least squares.
         velocity_correlation: correlation of dq/dt and qd.
-        gravity: contribution of gravity to the torque.
-        following: tracking of the command of a joint under a position servo.
+        gravity: correlation and ratio of the torque and the URDF's gravity torque.
+        following: lag and errors with which the position tracks the command; None for logs of torques.
     """
 
     name: str
@@ -197,8 +197,8 @@ def joint_report(
 ) -> JointReport:
     """Return the statistics of the joint number `index` over all trajectories, without gravity and tracking.
 
-    measured: statistics of each trajectory. products: (2n, 2n) Gram matrix of the increments of the integrals of qd and
-    of q, summed over all trajectories, see `velocity_products`.
+    measured: statistics of each trajectory. products: (2n, 2n) sum of the results of `velocity_products` for all
+    trajectories, from which qd is compared with dq/dt.
     """
     low, high, noise, steps = {}, {}, {}, {}
     for name in measured[0].signals:

@@ -32,7 +32,8 @@ class RobotCheckTuning:
     # [1] The torque contains gravity if its correlation with the URDF's gravity torque is above this number, and does
     # not if the magnitude of the correlation is below 1 minus this number. In between nothing is concluded.
     seen: float = 0.7
-    # [1] Gravity is visible if its standard deviation is at least this fraction of the torque's, in logs of a UR10e.
+    # [1] Gravity is visible in logged torques if its standard deviation is at least this fraction of the standard
+    # deviation of the torque. The fraction was chosen on logs of a UR10e.
     visible: float = 0.2
     # [1] Gravity of the URDF shows the unit of a joint's torque if it varies by this fraction of the variation at the
     # joint with the largest gravity. A payload may multiply the gravity of a joint with less, such as a wrist.
@@ -195,12 +196,13 @@ def torque_factors(
 
 
 def rounded_factor(factor: float) -> float:
-    """Return a rounded factor on torques: 0.001, from mNm to Nm, if it is near; else with one or two digits.
+    """Return a factor on torques, rounded for a message; its sign remains.
 
-    One digit is enough if it changes the factor by less than 10 %.
+    A factor near 0.001 becomes 0.001, the factor from mNm to Nm. Any other factor is rounded to one digit if this
+    changes it by less than 10 %, otherwise to two digits.
     """
     if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
-        # 0.001 is used within 50 %, since the factor is only as exact as the masses of the URDF
+        # The bound is wide, since the factor is only as exact as the masses of the URDF.
         return float(np.copysign(1e-3, factor))
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")

@@ -79,7 +79,7 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     steps. They are normalised, so that white noise has the same standard deviation in them as in the signal. The median
     of their magnitudes is robust against outliers.
     """
-    times = sliding_window_view(t, 4)  # times: (T - 3, 4)
+    times = sliding_window_view(t, 4)  # times: (T - 3, 4), the times of each four successive samples
     distances = times[:, :, None] - times[:, None, :] + np.eye(4)
     weights = 1.0 / distances.prod(axis=2)
     weights /= np.linalg.norm(weights, axis=1, keepdims=True)
@@ -91,14 +91,16 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def quantisation_step(values: np.ndarray) -> float:
     """Return the quantisation step of a signal (T,); NaN if the signal is constant or not quantised."""
     differences = np.diff(np.unique(values))
-    # A level counts as a multiple of the step within 5 % of a step; up to 5 % of the levels may be other values.
+    # A difference of two levels counts as a multiple of the step if it deviates from one by less than 5 % of a step. Up
+    # to 5 % of the differences may be no multiples. Both bounds are `tolerance`.
     tolerance = 0.05
-    # a grid is not determined by two or three levels
+    # Two or three levels are multiples of some step by chance.
     if len(differences) < 3:
         return float("nan")
     smallest = np.quantile(differences, tolerance)
     step = float(np.median(differences[differences <= 1.5 * smallest]))
-    # `near`: differences in steps, below 100: over more levels the error of the step grows to a fraction of a step
+    # `near`: differences below 100 steps, divided by the step. In larger differences, the error of the estimated step
+    # is multiplied by more than 100 and may reach a considerable fraction of a step.
     near = differences[differences < 100 * step] / step
     is_whole = np.abs(near - np.round(near)) < tolerance
     is_grid = len(near) > 2 and is_whole.mean() > 1 - tolerance

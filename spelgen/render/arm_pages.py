@@ -85,7 +85,8 @@ def motion_page(excitation: Excitation, arm: Arm) -> str:
     """Return the page about a proposed motion of `arm`, including the approach to its first position."""
     motion = excitation.approach.then(excitation.motion)
     # Charts subsample their lines, but the animation shows every point. Therefore the motion is subsampled here.
-    step = -(-len(motion.t) // (2 * TUNING.points))  # `step` is rounded up.
+    # `step` is rounded up, so that at most 2 * TUNING.points points remain.
+    step = -(-len(motion.t) // (2 * TUNING.points))
     t, q, qd = (x[::step] for x in (motion.t, motion.q, motion.qd))
     drawn = AnimatedMotion("motion", "approach and motion", t.round(3), q.round(4))
     rows = [

@@ -51,7 +51,7 @@ def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
         distance = None if example.error is None else 1000 * example.error
         off = f"{number(distance)} {thousandths(spec.joint_types)} off"
         return f"{which} log replayed: {example.trajectory}, {off}"
-    start = f"{example.trajectory}, {example.start:.3g} s into it"
+    start = f"{example.trajectory}, from t = {example.start:g} s"
     return f"{which} prediction: {start}, relative error {number(example.error)}"
 
 
