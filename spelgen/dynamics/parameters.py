@@ -150,14 +150,14 @@ def friction_factor(model: object, q: Tensor) -> Tensor:
 
 
 class _Caller(nn.Module):
-    """Module that calls a function of its model, since `functional_call` only calls modules."""
+    """Module that calls a given function with its model as argument, since `functional_call` can only call modules."""
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()
         self.model = model
 
     def forward(self, function: Callable[..., Result]) -> Result:
-        """Return the value of ``function`` at the model of this module."""
+        """Return function(model)."""
         return function(self.model)
 
 

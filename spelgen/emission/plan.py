@@ -101,7 +101,10 @@ def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
 
 
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
-    """Return an ``OutputSpec`` for each learned function of M: its joints, its matrix in M, mean and scale."""
+    """Return an ``OutputSpec`` for each learned function of M: its joints, its matrix in M, mean and scale.
+
+    structure: terms of M. sizes: nominal means and standard deviations of the functions.
+    """
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
         joints = output.joints
@@ -113,7 +116,10 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
-    """Return a ``ConstantSpec`` for each trained constant of M: its matrix in M, initial value and scale."""
+    """Return a ``ConstantSpec`` for each trained constant of M: its matrix in M, initial value and scale.
+
+    structure: terms of M. sizes: nominal values of the constants.
+    """
     values = zip(structure.constants, sizes.constants, sizes.constant_scales, strict=True)
     return tuple(
         ConstantSpec(_entries(constant.basis), initial, scale) for constant, initial, scale in values

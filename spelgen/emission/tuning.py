@@ -7,8 +7,8 @@ from dataclasses import dataclass
 class ModelTuning:
     """Constants for untrained models: initial drives, servos and friction, and numbers of hidden units of networks."""
 
-    # [1] Lower bound of the eigenvalues of M, divided by the smallest eigenvalue of the nominal M over the joint
-    # ranges; both are relative to the mean of the nominal M.
+    # [1] Lower bound of the eigenvalues of a trained M, divided by the smallest eigenvalue of the nominal M at random
+    # positions. These eigenvalues are generalised ones, relative to the mean of the nominal M.
     margin: float = 0.1
     # [1] Typical friction, divided by the effort limit of the drive: gears lose some per cent of the torque.
     friction_of_effort: float = 0.02

@@ -115,7 +115,7 @@ class Collisions:
         return np.array([result.min_distance for result in self._found.distanceResults])
 
     def contact(self, motion: Motion) -> Contact | None:
-        """Return the first contact of a motion; None if there is none.
+        """Return the first distance of a motion that is below the clearance; None if there is none.
 
         Distances are computed at selected positions of the motion. From one selected position to the next, a distance
         changes by at most 1.5 times the clearance. Between two selected positions it therefore differs by at most 0.75

@@ -165,10 +165,10 @@ def torque_factors(
 ) -> list[np.ndarray]:
     """Return candidates for factors (n,) on the torques of n joints that correct a wrong unit of torques.
 
-    A candidate is the inverse ratio of the gravity in the logged torques to the gravity torque of the URDF; it is
-    negative if the torques have the opposite sense as well. There is one candidate for each joint whose ratio is above
-    five or below a fifth, which wrong inertials do not explain (all other joints have the factor 1), and one candidate
-    with the same factor for all joints if their median ratio is such.
+    Let r be the gravity in a joint's logged torques divided by the gravity torque of the URDF; r is negative if the
+    torques have the opposite sense. If |r| is above five or below a fifth, wrong inertials do not explain it. For each
+    joint with such an r there is a candidate with the factor 1 / r for this joint and 1 for all others. If the median
+    of r over the joints is above five or below a fifth, there is also a candidate with 1 / median for all joints.
 
     Args:
         joints: the joints with their fits of gravity.

@@ -203,10 +203,11 @@ class DenseIntermediates(NamedTuple):
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
-    """Return lower triangular C, (3 n, 3 n), with C C^T the nominal inverse of the matrix of ``DenseMass``.
+    """Return lower triangular C, (3 n, 3 n), with C C^T the inverse of a nominal large matrix.
 
-    That matrix has a row for the x, y and z axis of each joint. The block of the z axes is the nominal M. A
-    row of an x or y axis has only a diagonal entry, equal to the diagonal entry of the same joint's z axis.
+    The large matrix of ``DenseMass`` has a row for the x, y and z axis of each joint. The block of the z
+    axes is the nominal M. A row of an x or y axis has only a diagonal entry, equal to the diagonal entry of
+    the same joint's z axis.
 
     Args:
         joints: joints of the arm, whose nominal armature is added to M.
