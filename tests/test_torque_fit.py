@@ -325,7 +325,7 @@ def test_a_fit_that_the_logs_do_not_support_is_discarded(emitted):
     solution = fit_torque(found, logs)
     assert solution.comparison.discarded > solution.comparison.fit
     assert solution.steps == 0 and torch.equal(found.bodies.raw, before)
-    # the covariance is that of the prior: an inertial parameter has the default standard deviation
+    # the covariance is the prior's: an inertial parameter has the default standard deviation
     bodies = ParameterVector(found).mask("bodies")
     torch.testing.assert_close(
         solution.covariance[bodies][:, bodies], GaussianPrior().bodies ** 2 * torch.eye(30).double()

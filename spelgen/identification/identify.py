@@ -15,6 +15,7 @@ from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import body_chain, regressor
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import base_parameters
+from spelgen.identification.drive_hints import friction_compensated
 from spelgen.identification.identification import Identification, LeastSquares
 from spelgen.identification.intervals import BLOCKS, jackknife_covariance, student_scale
 from spelgen.identification.least_squares import Solution, deviations, solve
@@ -82,15 +83,6 @@ def identify_by(
     equations = _Equations(arm.chain, [replace(x, tau=x.tau @ drives.inputs.T) for x in samples], drives)
     solved = map(equations.solved, methods)
     return [replace(x, diagnostics=(*notes, *_negative_friction(x)), torque_delay=delay) for x in solved]
-
-
-def friction_compensated(values: str) -> Diagnostic:
-    """Return the warning about drives that compensate friction. values: friction or compensation per joint."""
-    message = (
-        f"the measured torque decreases with velocity, as if the drive compensated friction: {values}; check the "
-        "signs of the torques, and whether the controller subtracts friction"
-    )
-    return Diagnostic("warning", "friction-compensated", "logs", None, message)
 
 
 def _negative_friction(result: Identification) -> Iterator[Diagnostic]:

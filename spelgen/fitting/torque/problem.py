@@ -76,7 +76,7 @@ class NoiseEstimator:
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
-        """Return the largest noise (n,) [Nm, N], at most that of a model that predicts a constant torque."""
+        """Return the largest noise (n,) [Nm, N], at most the noise of a model that predicts a constant torque."""
         return torch.minimum(self.max_error, self.torque_std) * self.correlation_length.sqrt()
 
     def estimate(

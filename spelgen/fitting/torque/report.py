@@ -16,7 +16,7 @@ from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.torque.fit import FitComparison, TorqueSolution
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
-from spelgen.identification.identify import friction_compensated
+from spelgen.identification.drive_hints import friction_compensated
 from spelgen.runtime.motors import MotorInputs
 
 TERM_NAMES = {
