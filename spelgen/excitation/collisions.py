@@ -207,7 +207,8 @@ class Collisions:
         """
         neighbour = {}
         for index, body in enumerate(chain.bodies):
-            # The shapes of a body and of its parent overlap. A parent without a shape is replaced by its own parent.
+            # Shapes of a body and its parent overlap at the joint, so this pair is not checked. If the parent has no
+            # shape, the next ancestor with a shape is used.
             parent = body.parent
             while parent >= 0 and parent not in self._bodies:
                 parent = chain.bodies[parent].parent

@@ -45,7 +45,7 @@ class FlatTops(NamedTuple):
 
     @classmethod
     def joined(cls, trajectories: Sequence[FlatTops]) -> FlatTops:
-        """Return the lowest flat bottoms and the highest flat tops of several trajectories.
+        """Return the extreme values at which signals stay (flat bottoms and tops), joined over several trajectories.
 
         The fractions of the samples at them (`shares`) are means over the trajectories.
         """

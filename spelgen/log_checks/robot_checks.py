@@ -35,8 +35,9 @@ class RobotCheckTuning:
     # [1] Gravity is visible in logged torques if its standard deviation is at least this fraction of the standard
     # deviation of the torque. The fraction was chosen on logs of a UR10e.
     visible: float = 0.2
-    # [1] Gravity of the URDF shows the unit of a joint's torque if it varies by this fraction of the variation at the
-    # joint with the largest gravity. A payload may multiply the gravity of a joint with less, such as a wrist.
+    # [1] The unit of a joint's torque is checked only if its gravity torque, by the URDF, varies by at least this
+    # fraction of the variation at the joint with the largest gravity. At other joints, such as wrists, a payload may
+    # multiply the gravity torque.
     loaded: float = 0.01
     # [1] A column of the regressor is linearly dependent on others if the norm of its residual after projection onto
     # them is below this fraction of its norm.

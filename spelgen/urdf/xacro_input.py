@@ -30,7 +30,7 @@ def expand(path: Path, max_bytes: int) -> tuple[bytes, tuple[str, ...]]:
     """
     # With the option -P of Python, modules in the current folder cannot shadow the package.
     command = [sys.executable, "-P", "-X", "utf8", "-m", "spelgen.urdf.xacro_input", str(path)]
-    # The output of xacro is a file and not a pipe, because output of any size would fill the memory of this process.
+    # xacro writes to a file: a pipe would be read into the memory of this process, and the output may be very large.
     with tempfile.TemporaryFile() as output:
         try:
             run = subprocess.run(
