@@ -51,10 +51,10 @@ class Coupling:
 
 
 def friction_compensated(values: str) -> Diagnostic:
-    """Return the warning about drives that compensate friction. values: friction or compensation per joint."""
+    """Return the warning about torques that decrease with velocity. values: friction or compensation per joint."""
     message = (
-        f"the measured torque decreases with velocity, as if the drive compensated friction: {values}; check the "
-        "signs of the torques, and whether the controller subtracts friction"
+        f"the measured torque decreases with velocity: {values}; friction falls with speed (Stribeck effect), or the "
+        "drive compensates friction: check the signs of the torques, and whether the controller subtracts friction"
     )
     return Diagnostic("warning", "friction-compensated", "logs", None, message)
 
