@@ -11,7 +11,6 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.runtime.networks import MaskedMLP, MaskedNetwork
@@ -142,24 +141,21 @@ def friction_factor(model: object, q: Tensor) -> Tensor:
     return model.residuals.at(q, model.prepare().residual).friction
 
 
-class _Caller(nn.Module):
-    """Module that calls a function of its model, since `functional_call` only calls modules."""
-
-    def __init__(self, model: nn.Module) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, function: Callable[..., Result]) -> Result:
-        """Return function(model)."""
-        return function(self.model)
-
-
 def evaluate_with(model: Model, parameters: NamedTensors, function: Callable[[Model], Result]) -> Result:
     """Return function(model), evaluated with the given parameters in place of the model's own values.
 
     The result is differentiable with respect to the given parameters. Parameters that are not given keep their values.
     """
-    named = {f"model.{name}": tensor for name, tensor in parameters.items()}
-    # Models have no tied weights, and the search for them takes longer than most of the functions.
-    result: Result = functional_call(_Caller(model), named, (function,), tie_weights=False)
-    return result
+    # `torch.func.functional_call` does the same, but takes longer than most of the functions.
+    replaced = []
+    for name, tensor in parameters.items():
+        path, _, key = name.rpartition(".")
+        module = model.get_submodule(path)
+        tensors = module._parameters if key in module._parameters else module._buffers
+        replaced.append((tensors, key, tensors[key]))
+        tensors[key] = tensor
+    try:
+        return function(model)
+    finally:
+        for tensors, key, own in replaced:
+            tensors[key] = own
