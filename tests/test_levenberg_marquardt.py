@@ -63,10 +63,15 @@ def test_a_fit_is_resumed_from_any_of_its_states():
 
 
 def test_an_ascent_direction_ends_the_solver():
-    """With the sign of the step wrong no damping lowers the cost, until the step is negligible."""
+    """With the sign of the step wrong no damping lowers the cost, until the step is negligible.
+
+    Small dampings, all of which give the same step, are tried once.
+    """
+    tried = []
 
     class Ascending(Rosenbrock):
         def candidates(self, x, step):
+            tried.append(step)
             yield x - step
 
     problem = Ascending()
@@ -74,6 +79,7 @@ def test_an_ascent_direction_ends_the_solver():
         first = replace(first_state(problem), damping=damping)
         result = levenberg_marquardt(problem, first, max_steps=5)
         assert result.termination is termination and result.state is first
+    assert all((after - before).norm() > 0.01 * before.norm() for before, after in pairwise(tried))
 
 
 def test_systems_of_a_batch_have_their_own_damping():
