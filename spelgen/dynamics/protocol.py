@@ -68,7 +68,7 @@ def residual_terms(model: object) -> ResidualTerms | None:
 
 def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
     """Return True if friction depends on the deflections z of bristles (friction state)."""
-    if isinstance(dynamics, RigidBodyDynamics):  # isinstance of a protocol takes ten times as long
+    if isinstance(dynamics, PortHamiltonian | VelocityState):  # isinstance of a protocol takes ten times as long
         return dynamics.elements > 0
     return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 
