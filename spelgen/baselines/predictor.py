@@ -81,7 +81,10 @@ def _stepper(
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return the generalised forces M qdd in W windows, (W, n) [Nm, N]. pose: equations of motion at q."""
+        """Return the generalised forces M qdd in W windows, (W, n) [Nm, N], with the disturbance included.
+
+        pose: mass matrix and forces at the positions q. qd, tau: (W, n). z: friction state.
+        """
         added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
         return pose.force(qd, tau, z) + added
 
@@ -238,7 +241,7 @@ class Predictor:
 
 
 def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
-    """Return the predictor of `dynamics`, with the number of integration steps chosen on the probe windows."""
+    """Return the predictor of motion by `dynamics`; the windows `probe` determine its number of integration steps."""
     return Predictor(name, Solver(dynamics, probe), dynamics)
 
 

@@ -175,9 +175,9 @@ def sizes(model: ArmModel) -> Figures:
 def predict_example(
     predictor: Predictor, logs: Sequence[Trajectory], steps: int, decimation: int
 ) -> PredictedMotion | None:
-    """Return the measured and predicted motion in the middle of the first log that is long enough; None without one.
+    """Return the measured motion in the middle of the first log that is long enough, and its prediction.
 
-    The motion has `steps` steps of `decimation` samples.
+    The motion has `steps` steps of `decimation` samples each. None is returned if all logs are shorter.
     """
     span = steps * decimation
     for log in logs:

@@ -83,7 +83,7 @@ class Job(Group):
 
     @property
     def preset(self) -> str:
-        """Return the name of the design; for a YAML file, its name without folder and suffix."""
+        """Return the name of the compared preset or ablation design; for a YAML file, the name of the file."""
         return Path(self.design).stem
 
     @property
@@ -116,7 +116,10 @@ class Job(Group):
         return build(arm, self.named_design, width=self.width, depth=self.depth, seed=self.seed)
 
     def result(self) -> RunResult | None:
-        """Return the stored result if it has the key of this run, a hash of all inputs, else None. Raises RunError."""
+        """Return the result in result.json; None if there is none, or if it is of a run with other inputs.
+
+        The inputs are compared by their hash, `key`. Raises RunError if the file is malformed.
+        """
         path = self.folder / "result.json"
         if not path.is_file():
             return None
@@ -124,7 +127,11 @@ class Job(Group):
         return result if result.key == self.key else None
 
     def config(self, model: ArmModel) -> FitConfig | FitOptions:
-        """Return the configuration of the fit: the same for all models of a simulated arm, else from the settings."""
+        """Return the configuration of the fit of the model.
+
+        On a simulated arm, all models have the same one (see `equal_steps`). On logs of the user, it consists of the
+        training settings of the arm.
+        """
         if self.inputs.truth is not None:
             return self.equal_steps()
         objective = self.training.objective
@@ -197,7 +204,10 @@ def run_job(job: Job) -> RunResult:
 
 
 def _own_checkpoint(job: Job, run: RunFolder) -> bool:
-    """Return True if the run's folder has a checkpoint with the key of the run; one with another key is discarded."""
+    """Return True if the run folder contains an interrupted fit with the same inputs, which can be resumed.
+
+    A fit with other inputs, recognized by its key in job.json (see `Job.key`), is discarded.
+    """
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()
@@ -208,7 +218,10 @@ def _own_checkpoint(job: Job, run: RunFolder) -> bool:
 
 
 def _errors(results: Results) -> Errors:
-    """Return {measure: {predictor: error}}: first the errors of replays, then of horizons, then of torques."""
+    """Return {label of an error measure, with its unit: {predictor: error}}.
+
+    The order is: position errors of replays, relative errors per prediction horizon, nMSE of torques.
+    """
     errors: Errors = {}
     for replay in results.replays:
         measure = f"position RMS, {replay.name} [{thousandths(results.joint_types)}]"

@@ -148,10 +148,11 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
 
 
 def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
-    """Return the expected duration of a run [s]: the median duration of finished runs of the same arm and preset.
+    """Return the expected duration of a run [s].
 
-    If there is no such run, the duration is the number of training steps times the measured duration of a step for a
-    simulated arm, and a constant for logs of the user.
+    It is the median training time of finished runs of the same arm and preset, plus a constant for the evaluation. If
+    there is no such run, the training time of a simulated arm is the number of training steps times the measured
+    duration of a step; for logs of the user, the expected duration is a constant.
     """
     finished = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
     if finished:

@@ -96,7 +96,7 @@ class ExcitationTrajectory:
 
     @property
     def size(self) -> int:
-        """Number of parameters of a motion: 2 H + 2 per joint."""
+        """Number of parameters of a motion: 2 H + 2 per joint, with the number H of harmonics."""
         return self.joints * (2 * self.harmonics + 2)
 
     def motion(self, parameters: np.ndarray, t: np.ndarray) -> Motion:

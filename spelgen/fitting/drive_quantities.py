@@ -83,7 +83,7 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 
     def line_of(model: ArmModel) -> Tensor:
-        """Return viscous and Coulomb friction coefficients, (2, n), of a model with the same bodies."""
+        """Return viscous and Coulomb friction coefficients of `model`, (2, n), for the precomputed load and factor."""
         friction = model.friction
         speed = torch.from_numpy(speeds)[:, None] * friction.speed
         slope, intercept = line @ (factor * friction.prepare().torque(speed[:, None], load)).mean(dim=1)

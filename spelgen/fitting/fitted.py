@@ -190,7 +190,8 @@ class Fit:
         samples = [x for x in samples if len(x.q)]
         if not samples:
             raise LogError(
-                "no motion to judge torques on", expected=f"samples at {SLOWEST:g} Hz or more that move"
+                "no motion for an evaluation of torques",
+                expected=f"samples at {SLOWEST:g} Hz or more that move",
             )
         scores = []
         for x in samples:

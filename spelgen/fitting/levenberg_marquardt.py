@@ -76,8 +76,9 @@ class SolverState(Generic[Parameters]):
 class SolverResult(Generic[Parameters]):
     """Last iterate and reason of termination.
 
-    normal_equations: normal equations at the last iterate if no further step was accepted; if the solver ended right
-    after a step (small decrease, maximum number of steps), at the iterate before this step.
+    normal_equations: the latest computed normal equations. They belong to the last iterate if the solver ended since no
+    step from it was accepted. They belong to the iterate before it if the solver ended directly after an accepted step
+    (small decrease of the cost, maximum number of steps).
     """
 
     state: SolverState[Parameters]

@@ -82,7 +82,7 @@ class Posterior:
         """
 
         def at(x: Tensor) -> Tensor:
-            """Return the value of the function at the K fitted parameters x, (K,)."""
+            """Return the value (...) of `function` for the model with the K fitted parameters x, (K,)."""
             return evaluate_with(self.model, self._vector.unflatten(x), function)
 
         # Step of the central differences, in standard deviations of the fitted parameters: small enough that the

@@ -89,7 +89,10 @@ def _adaptive_step(
     from torchdiffeq import odeint
 
     def rate(t: Tensor, state: Tensor) -> Tensor:
-        """Return d(q, p) / dt, (W, 2 n), of W windows, with t: time divided by the duration of the interval."""
+        """Return the derivative of the state (q, p), (W, 2 n), with respect to t = time / duration of the interval.
+
+        state: (W, 2 n) for W windows. The duration `step` converts the derivative with respect to time.
+        """
         q_now, p_now = state.chunk(2, dim=-1)
         return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
 

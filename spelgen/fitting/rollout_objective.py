@@ -46,7 +46,9 @@ class RolloutObjective(MomentumObjective):
             if samples is not None:
                 self.notes += fit_torques(self.model, samples, TorqueFit())[0]
             else:
-                message = f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
+                message = (
+                    f"no torque fit: no log has a second of motion at {SLOWEST:g} Hz; only windows are fitted"
+                )
                 self.notes.append(Diagnostic("warning", "no-torque-fit", "logs", None, message))
         return super().begin()
 

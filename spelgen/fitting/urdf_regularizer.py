@@ -38,8 +38,9 @@ class UrdfRegularizer(NamedTuple):
     def loss(self, model: ArmModel) -> Tensor:
         """Return the mean squared difference between model and URDF, a dimensionless scalar.
 
-        The loss is the sum of two mean squares: of the difference of W (M - mean M) W^T, and of the gravity torque's
-        difference divided by its scale.
+        The loss is the sum of two terms, averaged over the positions: the squared Frobenius norm of the difference of
+        W (M - mean M) W^T, divided by n, and the mean square over the joints of the difference of the gravity torque,
+        divided by `gravity_scale`.
         """
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale

@@ -13,7 +13,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, TUNING, shows_accelerations
 
-FREQUENCY = 100.0  # [Hz] common sample rate, twelve times the default cutoff of the low-pass filter
+FREQUENCY = 100.0  # [Hz] common rate of all samples, twelve times the default cutoff of the low-pass filter
 # [s] Shorter gap-free pieces are omitted: more than a fifth of them would be filter transients.
 SHORTEST = 1.0
 # [s] Shorter gaps do not cut a recording: the low-pass would remove motion that is fast enough to occur within them.
@@ -80,7 +80,7 @@ def dynamics_samples(
         if not pieces or not shows_accelerations(trajectory.sample_rate):
             continue
         columns = [_columns(piece, pauses, preprocessing.acceleration_cutoff, reach) for piece in pieces]
-        # The arrays of a single piece are not copied, since they may be hours long.
+        # The arrays of a single gap-free piece are not copied, since they may be hours long.
         joined = columns[0]
         if len(columns) > 1:
             joined = list(map(np.concatenate, zip(*columns, strict=True)))
@@ -147,5 +147,5 @@ def _columns(
 
 
 def is_moving(qd: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of the samples at which any joint moves."""
+    """Return a mask (T,) of the samples at which any joint moves: a velocity in qd (T, n) exceeds 0.02 rad/s or m/s."""
     return np.asarray((np.abs(qd) > SAMPLES.moving).any(axis=1))

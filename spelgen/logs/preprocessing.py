@@ -42,8 +42,8 @@ class Preprocessing:
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
         """Return the options with cutoff and decimation chosen for windows of logs with these sample rates [Hz].
 
-        The record of a training run contains the resolved options. The cutoff remains None for logs whose rate is too
-        low for the default filter.
+        The record of a training run contains the resolved options, in which an absent torque delay is 0. The cutoff
+        remains None, no filter, for logs whose rate is too low for the default filter.
         """
         rates = list(rates)
         cutoff, decimation = self.cutoff, self.decimation or 1
@@ -57,7 +57,7 @@ class Preprocessing:
 
     @property
     def acceleration_cutoff(self) -> float | None:
-        """Cutoff [Hz] of the low-pass filter for samples with accelerations; None: no filter."""
+        """Cutoff [Hz] of the low-pass filter for `DynamicsSamples`, which contain accelerations; None: no filter."""
         if self.cutoff is None:
             return TUNING.automatic_cutoff
         return self.cutoff or None
@@ -69,7 +69,7 @@ class Preprocessing:
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """List with one remark, the cutoff, if the logs are filtered, else []; the options must be ``resolved``."""
+        """One remark that states the cutoff if the logs are filtered, else none; the options must be ``resolved``."""
         if not self.cutoff:
             return []
         message = f"q, qd and tau filtered at {self.cutoff:g} Hz, zero phase"

@@ -84,10 +84,10 @@ def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarra
 
 
 def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
-    """Return the desired motion of each trajectory, as `settings.tracking` specifies.
+    """Return the desired motion of each trajectory, (T, n) each: random motions of the kind in `settings.tracking`.
 
-    The first motions are the same for any number of trajectories. Raises SettingsError if sines exceed a joint's range,
-    or if a joint has no range.
+    The motions are exciting trajectories or sines. The first motions are the same for any number of trajectories.
+    Raises SettingsError if sines exceed a joint's range, or if a joint has no range.
 
     Args:
         arm: The arm.

@@ -101,9 +101,8 @@ def _after_dry_friction(
 
     Args:
         qd: Velocity (n,) without dry friction [rad/s, m/s].
-        inverse: Inverse of the mass matrix plus the implicit part of the damping, (n, n).
-        lower: Lower bounds of the impulses, given by Coulomb friction, (n,) [Nm s, N s].
-        upper: Upper bounds of the impulses, given by Coulomb friction, (n,) [Nm s, N s].
+        inverse: Inverse of M + h D / 2, (n, n), with the step length h and the damping coefficients D.
+        lower, upper: Bounds of the impulses, (n,) [Nm s, N s]: the step length h times Coulomb friction.
     """
     impulse = np.zeros_like(qd)
     for _ in range(TUNING.friction_sweeps):

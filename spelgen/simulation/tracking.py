@@ -97,8 +97,8 @@ def record(
 
         M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
 
-    with the position error e = q* - q. For a joint that viscous friction makes slower than omega, a stiffness
-    viscous * omega is added.
+    with the position error e = q* - q. At a joint with viscous > M_jj omega, where friction would slow the decay of e
+    down, the torque viscous omega e is added.
 
     Args:
         dynamics: The arm, with friction.
@@ -164,7 +164,7 @@ def _samples_of_a_tick(settings: Settings) -> int:
     count = round(sample_rate / control_rate)
     if count < 1 or abs(count * control_rate - sample_rate) > 1e-9 * sample_rate:
         raise SettingsError(
-            f"{control_rate:g} Hz beside samples at {sample_rate:g} Hz", element="tracking.control_rate",
+            f"{control_rate:g} Hz with samples at {sample_rate:g} Hz", element="tracking.control_rate",
             expected="a rate of which simulation.sample_rate is a multiple",
         )  # fmt: skip
     return count

@@ -69,7 +69,8 @@ class AsBuiltTuning:
     viscous: tuple[float, float] = (0.3, 1.0)
     # [1] Armature, divided by the mean diagonal entry of M.
     armature: tuple[float, float] = (0.02, 0.2)
-    # [1/s] Typical acceleration of a joint divided by its typical speed, for the typical rigid-body torque.
+    # [1/s] Typical acceleration of a joint divided by its typical speed. The typical rigid-body torque contains the
+    # inertia torque at this acceleration.
     acceleration: float = 2.0
     # [1] Number of random positions at which torques and M are computed to scale friction and armature.
     positions: int = 50

@@ -70,7 +70,8 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         candidate_errors = problem.residual(candidate)
         candidate_costs = problem.joint_costs(candidate, candidate_errors)
         better = active & (candidate_costs < costs)
-        # The fit of a joint ends if a step lowers the joint's cost only by little, or not at all with a damping >= 1.
+        # The fit of a joint ends after a step that lowers the joint's cost by less than `min_decrease`, or after a step
+        # with a damping of at least 1 that does not lower it: with more damping, the decrease would be negligible.
         active &= torch.where(better, costs - candidate_costs >= TUNING.min_decrease, damping < 1.0)
         x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
         errors = torch.where(better, candidate_errors, errors)

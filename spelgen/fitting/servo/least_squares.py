@@ -2,8 +2,11 @@
 
 The initial guess is the linear least-squares solution for the command error u - q, the commanded minus the measured
 position. At a joint with a position servo,
-kp (u - q) = kd qd + M qdd + gravity + friction. The command error is therefore linear in the ratios of the parameters
-to kp. The gravity torque is computed with the URDF's masses: its coefficient is 1 / kp.
+
+    kp (u - q) = kd qd + M qdd + gravity + friction.
+
+The command error is therefore linear in the ratios of the parameters to kp. The gravity torque is computed with the
+URDF's masses: its coefficient is 1 / kp.
 """
 
 from functools import lru_cache
@@ -114,7 +117,10 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
         column = slice(joint, joint + 1)
 
         def residual(x: np.ndarray, column: slice = column) -> np.ndarray:
-            """Return the position errors of one joint after the burn-in, as a vector, for its unknowns x (4,)."""
+            """Return the position errors [rad, m] of one joint after the burn-in, as a vector over all windows.
+
+            x: (4,) log frequency, log damping ratio, delay and offset of the joint's servo.
+            """
             u = commands(x[2])[..., column] + x[3]
             predicted = linear_response(
                 q[:, 0, column], qd[:, 0, column], u, dt, np.exp(x[:1]), np.exp(x[1:2])

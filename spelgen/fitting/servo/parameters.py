@@ -58,6 +58,8 @@ class ServoParameters:
 class ParameterMap:
     """The map between `ServoParameters` and the tensors of a model, and the prior of the k = p n + r + 1 parameters.
 
+    There are p parameters for each of n joints, r coordinates of the body parameters, and the delay.
+
     Attributes:
         names: names of the p rows of `ServoParameters.joints`; a parameter with K values per joint has K rows of the
             same name.

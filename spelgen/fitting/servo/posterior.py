@@ -39,9 +39,10 @@ class ServoPosterior(Posterior):
 
     @property
     def scale_joint(self) -> str | None:
-        """Name of the joint whose kp divides the base parameters; None if a kp is known.
+        """Name of the joint to whose kp the base parameters are given as ratios; None if a kp is known.
 
-        The ratios to kp of this joint have the smallest errors (median of the relative standard deviations).
+        Of all joints, this joint gives ratios with the smallest median of the relative standard deviations. If a kp is
+        known, the base parameters themselves are determined, and no ratios are needed.
         """
         return None if self._scale_index is None else self.model.joint_names[self._scale_index]
 
@@ -56,7 +57,7 @@ class ServoPosterior(Posterior):
 
     @property
     def base_units(self) -> str:
-        """Units of the base parameters, with the name of the joint whose kp divides them, for the title of a table."""
+        """Units of the base parameters for the title of a table; for ratios to a kp, with the name of its joint."""
         units = super().base_units
         return units if self.scale_joint is None else f"{units}; ratios to kp of {self.scale_joint}"
 
@@ -102,7 +103,7 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _scale_index(self) -> int | None:
-        """Index of the joint whose kp divides the base parameters (`scale_joint`); None if a kp is known."""
+        """Index of `scale_joint`, to whose kp the base parameters are given as ratios; None if a kp is known."""
         if not self.model.servo.trained.all():
             return None
         ratios = map(self._ratios, range(self.model.n))

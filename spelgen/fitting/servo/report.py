@@ -104,8 +104,8 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # The step is an estimate of the integration error. The step is added to the covariance as an error of one standard
-    # deviation.
+    # The last solver step estimates the integration error of x. It counts as an error of one standard deviation, so its
+    # outer product is added to the covariance.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
@@ -120,9 +120,10 @@ def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
 def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
     """Return a mask (m,) of m parameters, True for parameters that the logs distinguish from all other parameters.
 
-    A parameter is distinguished if an upper bound of its variance inflation factor is below
-    `ServoTuning.variance_inflation`. Example: dead zone and dry friction of a joint without gravity load are not
-    distinguished, since the derivatives of the errors with respect to both are proportional.
+    A parameter is distinguished if its variance inflation factor is below `ServoTuning.variance_inflation`: the
+    posterior variance of the parameter, divided by its variance if all other parameters were known. Example: dead zone
+    and dry friction of a joint without gravity load are not distinguished, since the derivatives of the errors with
+    respect to both are proportional.
 
     Args:
         blocks: normal equations of B blocks with respect to all k parameters, (B, k, k) and (B, k).

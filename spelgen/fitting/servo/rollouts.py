@@ -47,7 +47,7 @@ class ServoRollouts:
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
-        """Return the rollouts for the load of the model's bodies, with current parameters, along measured motion."""
+        """Return the rollouts for the measured motion of `windows`, with the model's current parameters as x0."""
         q = windows.q.flatten(0, 1)
         parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()
@@ -55,7 +55,7 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Return the rollouts for the load of the bodies with parameters x along ``motion``; set the model to x."""
+        """Return the rollouts with ``motion`` as the fixed motion and x as x0; the model's parameters are set to x."""
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
         return replace(self, motion=motion, load=load, inertial=inertial)
@@ -74,11 +74,12 @@ class ServoRollouts:
         return self.windows.motion(q[0], qd[0])
 
     def jacobian(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return the derivatives of the residual at x with respect to joint parameters and to shared parameters.
+        """Return the derivatives of the `residual` (W, K', n) at x with respect to joint and to shared parameters.
 
         Returns:
             (p, W, K', n), with respect to the p parameters of the same joint; zero for parameters that no joint fits.
-            (r + 1, W, K', n), with respect to the r coordinates of the bodies and to the delay.
+            (r + 1, W, K', n), with respect to the r coordinates of the body parameters and to the delay, which all
+                joints share.
         """
         # rows: indices of the parameters that are fitted at one joint or more
         rows = x.active.any(dim=1).nonzero().squeeze(-1)
@@ -107,7 +108,7 @@ class ServoRollouts:
         return q[:, :, first:] - self.windows.q[:, first:]
 
     def _rollout_at(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return the predicted positions and velocities for parameters x, (1, W, K, n) each [rad, m, s]."""
+        """Return the predicted positions [rad, m] and velocities [rad/s, m/s] for x, (1, W, K, n) each."""
         commands = self.windows.commands(x.delay)
         return self._rollout(x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
 

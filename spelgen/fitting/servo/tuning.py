@@ -85,8 +85,8 @@ class ServoTuning:
 
     # [1] Half the initial dead zone, as a fraction of the static error.
     dead_zone_fraction: float = 0.25
-    # [1] Largest number of Levenberg-Marquardt steps of the fit of a single joint with, and of the one without a dead
-    # zone.
+    # [1] Largest number of Levenberg-Marquardt steps, rejected steps included, of each fit of a single joint: the fit
+    # with a dead zone and the fit without.
     joint_steps: int = 6
     # [1] Smallest significance of a selected dead zone, in standard deviations.
     significance: float = 4.0
@@ -98,7 +98,7 @@ class ServoTuning:
     # [1] Smallest number of logs for which each log is one block of the jackknife. Logs are not divided then, since
     # halves of one motion are not independent.
     min_logs: int = 3
-    # [1] Smallest number of blocks if there are fewer logs than `min_logs`; the logs are then divided into segments.
+    # [1] If there are fewer logs than `min_logs`, the logs are divided into at least this number of blocks in total.
     min_blocks: int = 6
     # [1] Variance inflation factor above which a parameter is not distinguished from others; on SO-101 arms, the factor
     # is below 30 or above 90.

@@ -80,9 +80,10 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
 
 
 def _products(jacobian: TorqueJacobian, x: torch.Tensor) -> torch.Tensor:
-    """Return the Gram matrix of [J, residual] of each joint, (n, K + 1, K + 1), at the K parameters x (K,).
+    """Return the Gram matrix of the columns [J, residual] of each joint, (n, K + 1, K + 1), at parameters x (K,).
 
-    J is the Jacobian of the torque with respect to theta (see `TorqueJacobian.joint_rows`).
+    J (T, K) is the Jacobian of the modelled torque with respect to theta, which is x with inertial parameters in place
+    of log-Cholesky parameters (see `TorqueJacobian.joint_rows`). residual: torque residual (T,) of the joint.
     """
     products = torch.zeros(jacobian.model.n, len(x) + 1, len(x) + 1).double()
     for joint, columns, of_joint, residual in concatenate_blocks(jacobian.joint_rows(x), len(products)):

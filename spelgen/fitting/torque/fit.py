@@ -189,7 +189,10 @@ def _not_behind_regression(
     other = torch.from_numpy(regression.held_out) + negligible
 
     def behind(fit: _StagedFit) -> bool:
-        """Return True if the held-out error of the regression is significantly smaller (t test, p = 0.01)."""
+        """Return True if the regression has a significantly smaller held-out error than `fit`.
+
+        The errors of the blocks are compared by a t test (p = 0.01).
+        """
         if len(blocks) == 1:
             return False
         standard_errors = float(stdtrit(len(blocks) - 1, 0.99))

@@ -124,9 +124,10 @@ class TorqueJacobian:
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 
     def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
-        """Return initial / current motor gain per joint, (..., n) [1]: `logged_scale` with derivatives by autograd.
+        """Return the initial divided by the current motor gain of each joint, (..., n) [1]; 1 for fixed gains.
 
-        parameters: one set of parameters by name, or a batch (...) of sets.
+        Unlike `logged_scale`, the result can be differentiated by autograd with respect to the gains in `parameters`:
+        {name: values}, or values of a batch (...) of sets.
         """
         ones = torch.ones(self.model.n).double()
         # A gain is joint torque / logged torque; the parameters are the logarithms of the gains.

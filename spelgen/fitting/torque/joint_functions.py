@@ -104,9 +104,11 @@ class JointFunction:
         return friction * log_factor.nan_to_num().expm1()
 
     def target(self, torque_residual: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Return the torque (T,) [Nm, N] with which this residual term would explain a torque residual (T, n) best.
+        """Return the torque (T,) [Nm, N] to which the torque of this residual term is fitted.
 
-        noise: (n,) standard deviations of the torque noise [Nm, N], which weight the joints.
+        At each sample it is the torque of the term that minimizes the squared torque residual (n,) of all joints, with
+        the weights 1 / noise^2. torque_residual: (T, n) [Nm, N]. noise: (n,) standard deviations of the torque noise
+        [Nm, N].
         """
         # The target is a weighted least-squares solution over the joints, since the friction of a coupled drive acts on
         # several joints.
@@ -118,7 +120,8 @@ class JointFunction:
     ) -> BayesianRidge:
         """Return the Bayesian ridge fit of the weights to a target torque (T,) [Nm, N] at the samples `rows`.
 
-        The samples of one visit of a position count as one independent error (see ``visit_length``).
+        The number of samples that count as one independent error is ``correlation_length``, or ``visit_length`` if this
+        is larger: while the joint remains near a position, the error of a function of position remains constant.
         """
         samples = append_target(self.features[rows], target[rows])
         # The error of a function of position is constant during a visit of a position, however long the visit lasts.
@@ -129,8 +132,8 @@ class JointFunction:
 class ProjectedTerms(NamedTuple):
     """Position-dependent residual torques whose weights a fit eliminates by variable projection.
 
-    candidates: the residual terms, each of one joint. terms: {joint: `LinearTerms`}; the features of a joint are the
-    columns of all its residual terms, concatenated in the order of the candidates.
+    candidates: the residual terms; each acts on one joint, and a joint may have several. terms: {joint: `LinearTerms`
+    of the joint}, whose features are the columns of all residual terms of the joint, in the order of the candidates.
     """
 
     terms: dict[int, LinearTerms]

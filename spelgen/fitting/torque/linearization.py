@@ -44,7 +44,10 @@ class LinearTerms:
 
     @cached_property
     def ridge(self) -> torch.Tensor:
-        """Matrix (F^T F + D)^-1 F^T, (P, T), which maps a torque residual (T,) to the weights (P,)."""
+        """Matrix (F^T F + D)^-1 F^T, (P, T), which maps a torque residual (T,) to the weights (P,).
+
+        F (T, P) are the features, D is the diagonal matrix of the penalty.
+        """
         # The ridge matrix is cached, so that the small matrix (P, P) is factorized once for all columns of the
         # Jacobian.
         gram = self.features.mT @ self.features + self.penalty.diag()
@@ -83,7 +86,11 @@ class RigidProjection(NamedTuple):
     posterior_gain: tuple[torch.Tensor, ...]
 
     def orthogonalize(self, joint: int, torque: torch.Tensor) -> torch.Tensor:
-        """Return the part (T, P) of P torques (T, P) on a joint that rigid-body and friction model cannot absorb."""
+        """Return the residuals (T, P) of P torques on a joint, `torque` (T, P), after projection onto the model.
+
+        If such a torque were added to the measured torque, this would be the torque residual of a refit of the
+        rigid-body and friction parameters.
+        """
         jacobian = self.jacobian[joint]
         return torque - jacobian @ (self.posterior_gain[joint] @ (jacobian.mT @ torque))
 

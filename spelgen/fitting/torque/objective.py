@@ -197,7 +197,7 @@ def fit_torques(
             penalty = lambda: config.urdf_weight * regularizer.loss(model)  # noqa: E731
         steps = fit_networks(model, samples, config.weight_decay, penalty, config.evaluations)
     message = (
-        f"{FITTED.get(config.adapt or '', 'fitted')} to the torques of {samples.original_count} samples, those of "
+        f"{FITTED.get(config.adapt or '', 'fitted')} to the torques of {samples.original_count} samples, "
         f"validation included, in {steps} steps"
     )
     return [Diagnostic("info", "torque-fit", "logs", None, message), *notes], solution

@@ -113,13 +113,15 @@ def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
 
 
 def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float) -> None:
-    """Multiply trained motor gains by factors from the samples, where their initial values are far off.
+    """Correct initial values of trained motor gains that are wrong by a large factor.
 
-    Settings without `gear` have the initial gain 1, but a current in A may have a gain of 100 Nm/A. The rigid-body
-    torque of the initial parameters is regressed on the torque of the initial gain, per joint, together with friction
-    and an offset. Joints without a significant slope have the median slope of the others.
+    Settings without `gear` have the initial gain 1, but a current in A may have a gain of 100 Nm/A. For each joint, the
+    measured torque (logged torque times initial gain) is regressed on the rigid-body torque of the initial parameters,
+    together with friction and an offset. The gain is divided by the coefficient of the rigid-body torque. Joints
+    without a significant coefficient have the median coefficient of the others.
 
-    deviation: prior standard deviation of the logarithm of a gain. Slopes within three deviations change nothing.
+    deviation: prior standard deviation of the logarithm of a gain. A gain is changed only if the logarithm of the
+    coefficient exceeds three standard deviations.
     """
     inputs, (q, qd, qdd, *_) = model.inputs, samples.columns
     if not isinstance(inputs, MotorInputs) or inputs.raw_gains is None:
@@ -196,7 +198,9 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
     factor, factor_change = perturbed.real, perturbed.imag / epsilon
     relative = torch.linalg.solve_triangular(factor, factor_change, upper=True)
     added = relative + relative.mT
-    if not added.isfinite().all():  # an overflow: the solver rejects this step because of its cost
+    # After an overflow, the fraction cannot be computed. The whole step is returned; the solver rejects it because of
+    # its cost.
+    if not added.isfinite().all():
         return raw + step
     min_eigenvalue = torch.linalg.eigvalsh(added)[:, 0]
     fraction = (TUNING.body_step / (-min_eigenvalue).clamp(min=1e-12)).clamp(max=1.0)
@@ -283,7 +287,8 @@ def prior_covariance(
 ) -> torch.Tensor:
     """Return the prior covariance (K, K) of the flattened parameters.
 
-    parameters: {name: values}, K values in total. groups: {name: parameter group}.
+    parameters: {name: values}, K values in total. groups: {name: parameter group}. widths: prior standard deviations of
+    the groups, and of the factors common to all joints.
     """
     count = sum(x.numel() for x in parameters.values())
     matrix, friction, first = torch.zeros(count, count).double(), torch.zeros(count).double(), 0
@@ -293,8 +298,9 @@ def prior_covariance(
         option = width_option(groups[name])
         matrix[rows, rows] = torch.full((len(rows),), deviations[option]).double().square()
         if option in SHARED:
-            # The parameters of all joints have a common factor. Bristle fractions have one parameter per joint and
-            # bristle, (n, elements): each bristle has its own common factor.
+            # The parameters are logarithms: the logarithm of the factor common to all joints adds its variance to all
+            # entries. Bristle fractions have one parameter per joint and bristle, (n, bristles): there is a separate
+            # common factor for bristle 1 of all joints, bristle 2 of all joints, and so on.
             for of_joints in rows.view(len(x), -1).mT:
                 matrix[of_joints[:, None], of_joints] += deviations[SHARED[option]] ** 2
         if groups[name] in ("sizes", "effects"):

@@ -66,7 +66,7 @@ class NoiseEstimator:
 
     @property
     def errors(self) -> torch.Tensor:
-        """Number of independent errors per joint, (n,)."""
+        """Number of independent torque errors in all samples, per joint, (n,)."""
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
@@ -83,8 +83,8 @@ class NoiseEstimator:
             effective_parameters: (n,) number of parameters that each joint's torque determines. Each parameter reduces
                 the degrees of freedom of the residual by one independent error.
         """
-        # At least one independent error remains. Otherwise the difference could be negative, since
-        # `TorqueProblem.updated` assigns an equal share of the parameters to each joint.
+        # The degrees of freedom (independent errors minus parameters) are at least one. They could be negative
+        # otherwise, since `TorqueProblem.updated` assigns an equal share of the parameters to each joint.
         fraction = (self.errors - effective_parameters).clamp(min=1.0) / self.errors
         rms = (squared_residual / self.count / fraction).sqrt()
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
@@ -149,11 +149,12 @@ class TorqueProblem:
         return self.noise_estimator.correlation_length
 
     def with_least_squares_noise(self, x: torch.Tensor) -> TorqueProblem:
-        """Return the problem with the noise of unconstrained least squares, linearized at x (K,).
+        """Return the problem with the noise that is estimated from the residual of unconstrained least squares.
 
-        Noise estimated from the residual of a poor initial guess would be too large, and the fit would stop early. The
-        residual of unconstrained least squares is a lower bound of the noise: except for the linearization of friction,
-        no physically consistent x has a smaller residual.
+        The torque is linearized at x (K,) and fitted by least squares in the inertial, drive and friction parameters,
+        without a prior and without physical consistency of the bodies. If friction were linear in its parameters, no x
+        could have a smaller residual, so this noise is a lower bound. Noise estimated from the residual of a poor
+        initial guess would be too large, and the fit would stop early.
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
@@ -252,7 +253,10 @@ class TorqueEstimate:
     covariance: torch.Tensor
 
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
-        """Return the estimate with the same x, but for other samples, residual terms or friction forms."""
+        """Return the estimate with the same x and another Jacobian: for other samples or changed residual terms.
+
+        The squared residual is recomputed with the model's current choice of the friction state per joint.
+        """
         state = replace(self.state, residual=jacobian.squared_residual(self.state.x))
         return replace(self, problem=replace(self.problem, jacobian=jacobian), state=state)
 
@@ -264,24 +268,26 @@ class TorqueEstimate:
     def on_segments(self, samples: TorqueSamples) -> TorqueEstimate:
         """Return the estimate with the same x on segments of consecutive samples, and with the current covariance.
 
-        The problem of the estimate may have subsampled samples, whose correlation cannot be estimated. The noise is
-        converted to the sample interval of the segments.
+        The estimate may belong to subsampled samples, from which the correlation time of the torque errors cannot be
+        estimated. The segments have a duration of `TUNING.segment` and are cut from `samples`. The noise is converted
+        to the sample interval of the segments.
         """
         jacobian = TorqueJacobian(
             self.problem.jacobian.model, samples.segments(TUNING.segment, TUNING.initial_samples)
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
-        # The weight of an independent error, (correlation length) / noise^2, must be the same for both sample
-        # intervals.
+        # noise^2 / (correlation length) is the mean squared residual (see `NoiseEstimator`), which does not depend on
+        # the sample interval.
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
     def linearize(self) -> tuple[ResidualSamples, RigidProjection]:
-        """Return the torque residual, and the projection of joint torques onto the rigid-body and friction model.
+        """Return the torque residual at the estimate, and a `RigidProjection` for torques of residual terms.
 
-        The covariance must be current (see `with_current_covariance`). With the covariance for a larger noise, the
-        projection would remove too much of a torque.
+        The projection computes the part of a joint torque that the rigid-body and friction model would absorb. The
+        posterior covariance of the parameters must be current (see `with_current_covariance`): with the covariance for
+        a larger noise, this part would be too large.
         """
         jacobian, x = self.problem.jacobian, self.state.x
         projection = jacobian.rigid_projection(x, self.problem.noise, self.covariance)

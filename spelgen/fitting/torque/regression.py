@@ -56,7 +56,10 @@ def best_regression(model: ArmModel, blocks: Sequence[TorqueSamples], torque_std
 def _regression(
     model: ArmModel, blocks: Sequence[TorqueSamples], torque_std: np.ndarray, friction: FrictionModel
 ) -> Regression:
-    """Return the ridge regression for a friction model; other arguments: see `best_regression`."""
+    """Return the ridge regression of the joint torques on inertial parameters, armatures, friction and offsets.
+
+    friction: friction model, with or without a friction state. model, blocks, torque_std: see `best_regression`.
+    """
     motors, reach = motors_of(model).numpy(), bristle_reach(model).values
 
     def columns(x: SampleBlock) -> np.ndarray:
@@ -81,10 +84,10 @@ def _regression(
     grams, total = (gram / np.outer(scale, scale) for gram in (grams, total))
 
     def solution(gram: np.ndarray, penalty: float) -> np.ndarray:
-        """Return (..., K + 1): the weights of the K scaled columns, then -1 as the weight of the torque.
+        """Return the vector (w, -1), (..., K + 1), with the ridge solution w of the K scaled columns of the regressor.
 
-        gram: (..., K + 1, K + 1) Gram matrix of columns and torque. The quadratic form of a Gram matrix with the
-        returned vector is the squared residual.
+        gram: (..., K + 1, K + 1), G = A^T A of A = [scaled columns, torque]. A (w, -1) is the residual, so the squared
+        residual is (w, -1)^T G (w, -1).
         """
         normal = gram[..., :-1, :-1] + penalty * np.eye(len(length))
         weights = np.linalg.solve(normal, gram[..., :-1, -1:])[..., 0]
@@ -111,9 +114,10 @@ def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) ->
     """
     with torch.no_grad():
         body = pseudo_inertia(torch.tensor([DEFAULT_BODY]).double())
-        # relative: C^-1 J, with the factor C of a body and the pseudo-inertia J
+        # The pseudo-inertia of a body is C S C^T with the constant factor C, and its log-Cholesky parameters are the
+        # Cholesky factor of S. Here, `relative` becomes C^-1 body, then S = C^-1 body C^-T.
         relative = torch.linalg.solve(model.bodies.factors, body)
-        relative = torch.linalg.solve(model.bodies.factors, relative.mT)  # relative: C^-1 J C^-T
+        relative = torch.linalg.solve(model.bodies.factors, relative.mT)
         model.bodies.raw.copy_(log_cholesky_parameters(upper_cholesky((relative + relative.mT) / 2)))
         inputs = torch.linalg.pinv(model.input_matrix(samples.columns.q[:1])[0])
     torque = torch.from_numpy(regression.torque(samples.columns)) @ inputs.mT

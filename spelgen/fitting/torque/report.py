@@ -53,7 +53,8 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
         yield _warning(
             "friction-compensated",
             "the measured torque decreases with velocity, as if the drive compensated friction: "
-            f"{joints} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts",
+            f"{joints} Nm s/rad (N s/m) are added; check the signs of the torques, and whether the controller "
+            "subtracts friction",
         )
     if residual_terms(model) is not None:
         yield Diagnostic("info", "residuals", "model", None, _selected_terms(samples, solution, names))

@@ -65,7 +65,10 @@ def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
 
 
 def _gap(correlation_length: float) -> int:
-    """Return the number of samples between fitted and held-out samples."""
+    """Return the number of omitted samples between fitted and held-out samples: `SELECTION.gap` correlation lengths.
+
+    correlation_length: number of samples per independent error.
+    """
     return round(SELECTION.gap * correlation_length)
 
 
@@ -200,8 +203,8 @@ def _blocks(count: int) -> list[slice]:
 def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Yield two masks (T,) per fold: the held-out samples, and the fitted samples.
 
-    recordings: (T,), index of the recording of each sample. gap: number of unused samples at both ends of a held-out
-    block of a single recording.
+    Several recordings are held out whole. A single recording is divided into blocks, and the `gap` samples before and
+    after a held-out block are in neither mask. recordings: (T,), index of the recording of each sample.
     """
     # Whole recordings are held out if possible: they differ in day, load and motion, so their errors differ more than
     # the errors of blocks of one recording.

@@ -186,7 +186,10 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
 
 
 def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
-    """Return a refit in which some friction coefficients are negligible. indices: their indices in x (K,)."""
+    """Return a refit of all parameters without some friction coefficients; indices: their indices in x (K,).
+
+    The initial values and the prior means of these coefficients, which are logarithms, become `NEGLIGIBLE`.
+    """
     problem, x, mean = estimate.problem, estimate.state.x.clone(), estimate.problem.prior.mean.clone()
     # The prior mean of the removed coefficients is changed, too: otherwise the prior would restore the coefficients.
     mean[indices] = x[indices] = NEGLIGIBLE
