@@ -13,7 +13,7 @@ from spelgen.arm.arm import Chain, Coordinate, make_arm
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_constraint import body_constraint
 from spelgen.dynamics.body_regressor import about_center, quaternion
-from spelgen.dynamics.tip import link_poses, tip_frame
+from spelgen.dynamics.tip_frame import link_poses, tip_frame
 from spelgen.emission.assemble import ArmModel
 from spelgen.emission.build import build
 from spelgen.exporting.describe import Trained
